@@ -1,0 +1,200 @@
+"""Pinhole cameras in OpenCV convention, and paths between key cameras.
+
+Conventions are those of :mod:`mitsplat.splats`: x right, y down, z forward in the camera; pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """OpenCV camera: intrinsics [px], lens distortion and pose.
+
+    Attributes:
+        width, height: Image size [px].
+        fx, fy: Focal lengths [px].
+        cx, cy: Principal point [px], pixel centres at +0.5 (the middle of an image is ``width / 2``).
+        world_from_camera: Rigid transform of camera coordinates to world coordinates [m], shape (4, 4).
+        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole.
+        near: Nearest depth at which anything is seen [m].
+
+    Raises:
+        ValueError: If a size is below 1, a focal length is not positive, the pose is not rigid, or the number of
+            distortion coefficients is not 0, 4, 5 or 8.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: FloatArray
+    distortion: tuple[float, ...] = ()
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera size must be at least 1x1 (got {self.width}x{self.height})")
+        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+            raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
+        if not self.near > 0:
+            raise ValueError(f"near must be > 0 (got {self.near})")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError(f"distortion takes 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
+        pose = np.array(self.world_from_camera, dtype=np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError("world_from_camera must be a finite 4x4 matrix")
+        rotation = pose[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5 or np.linalg.det(rotation) < 0:
+            raise ValueError("world_from_camera must be a rotation and a translation, without scale or mirror")
+        pose.flags.writeable = False
+        object.__setattr__(self, "world_from_camera", pose)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: npt.ArrayLike,
+        target: npt.ArrayLike,
+        *,
+        up: npt.ArrayLike = (0.0, 0.0, 1.0),
+        width: int,
+        height: int,
+        fov_x: float,
+        distortion: Sequence[float] = (),
+        near: float = 0.01,
+    ) -> Camera:
+        """Camera at ``eye`` [m] that looks at ``target`` [m] with a horizontal field of view ``fov_x`` [degrees].
+
+        Raises:
+            ValueError: If ``eye`` equals ``target`` or ``fov_x`` is not between 0 and 180.
+        """
+        if not 0.0 < fov_x < 180.0:
+            raise ValueError(f"fov_x must be between 0 and 180 degrees (got {fov_x})")
+        focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x))
+        return cls(
+            width=width,
+            height=height,
+            fx=float(focal),
+            fy=float(focal),
+            cx=0.5 * width,
+            cy=0.5 * height,
+            world_from_camera=look_at_pose(eye, target, up),
+            distortion=tuple(float(c) for c in distortion),
+            near=near,
+        )
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """Intrinsic matrix K for pixel centres at +0.5, shape (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def camera_from_world(self) -> FloatArray:
+        """Extrinsics: rigid inverse of ``world_from_camera``, shape (4, 4)."""
+        rotation, centre = self.world_from_camera[:3, :3], self.world_from_camera[:3, 3]
+        inverse = np.eye(4)
+        inverse[:3, :3] = rotation.T
+        inverse[:3, 3] = -rotation.T @ centre
+        return inverse
+
+    @property
+    def centre(self) -> FloatArray:
+        """Centre of projection in the world [m], shape (3,)."""
+        return self.world_from_camera[:3, 3]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera sampled on another pixel grid that covers the same image."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def project(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Pixel positions (N, 2), lens distortion included, and depths along z [m] (N,) of world points (N, 3).
+
+        A point at or behind the camera plane has pixel position NaN.
+        """
+        pose = self.camera_from_world
+        local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
+        depth = local[:, 2]
+        front = depth > 0
+        pixels = np.full((len(local), 2), np.nan)
+        if not self.distortion:
+            pixels[front] = local[front, :2] / depth[front, None] * (self.fx, self.fy) + (self.cx, self.cy)
+        elif front.any():
+            import cv2
+
+            projected, _ = cv2.projectPoints(
+                local[front], np.zeros(3), np.zeros(3), self.intrinsics, np.array(self.distortion)
+            )
+            pixels[front] = projected.reshape(-1, 2)
+        return pixels, depth
+
+    def ray_slopes(self, pixels: npt.ArrayLike) -> FloatArray:
+        """Undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
+        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.distortion or not len(slopes):
+            return slopes
+        import cv2
+
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+        undistorted = cv2.undistortPointsIter(
+            slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), np.eye(3), np.eye(3), criteria
+        )
+        return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+
+
+def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+    """``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that looks at ``target`` [m].
+
+    When the view is along ``up`` the image's upper edge points along +y of the world.
+    """
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    forward = target - eye
+    distance = np.linalg.norm(forward)
+    if not distance > 0:
+        raise ValueError(f"a camera must look at a point other than its own position (got {eye.tolist()} twice)")
+    forward = forward / distance
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(up))):
+        right = np.cross(forward, (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = eye
+    return pose
+
+
+def interpolate_poses(key_poses: Sequence[npt.ArrayLike], times: npt.ArrayLike) -> FloatArray:
+    """Poses (M, 4, 4) along a smooth path through ``key_poses`` (K, 4, 4) at ``times`` (M,) in [0, 1].
+
+    Positions follow a natural cubic spline and orientations a rotation spline (SciPy), keys evenly spaced in time.
+    """
+    keys = np.asarray(key_poses, dtype=np.float64).reshape(-1, 4, 4)
+    times = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, 1.0)
+    poses = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
+    if len(keys) == 1:
+        poses[:] = keys[0]
+        return poses
+    knots = np.linspace(0.0, 1.0, len(keys))
+    poses[:, :3, 3] = CubicSpline(knots, keys[:, :3, 3], bc_type="natural")(times)
+    poses[:, :3, :3] = RotationSpline(knots, Rotation.from_matrix(keys[:, :3, :3]))(times).as_matrix()
+    return poses

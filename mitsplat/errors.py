@@ -1,0 +1,7 @@
+"""What mitsplat raises when its input, not its code, is at fault."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad input: one sentence that names file or place, rule and value. The command line exits with status 2."""

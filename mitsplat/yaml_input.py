@@ -1,0 +1,260 @@
+"""YAML files to pydantic models, with errors of one sentence: file, line, key path, rule and value received."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq, TaggedScalar
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from mitsplat.errors import InputError
+
+Model = TypeVar("Model", bound=BaseModel)
+KeyPath = tuple[str | int, ...]
+
+MAX_DEPTH = 32
+"""Deeper nesting is an alias that contains itself."""
+
+RULES = {
+    "missing": "is required",
+    "greater_than": "must be > {gt:g}",
+    "greater_than_equal": "must be >= {ge:g}",
+    "less_than": "must be < {lt:g}",
+    "less_than_equal": "must be <= {le:g}",
+    "finite_number": "must be finite",
+    "literal_error": "must be {expected}",
+    "union_tag_invalid": "must be one of {expected_tags}",
+    "union_tag_not_found": "is required",
+    "model_type": "must be a mapping of keys to values",
+    "model_attributes_type": "must be a mapping of keys to values",
+    "tuple_type": "must be a list",
+    "list_type": "must be a list",
+    "too_short": "must have at least {min_length} items",
+    "too_long": "must have at most {max_length} items",
+    "string_type": "must be text",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "bool_type": "must be true or false",
+}
+"""Our wording of pydantic's error types; any other type keeps pydantic's message."""
+
+
+class FieldError(ValueError):
+    """A rule between several fields of one model is broken; ``key`` is the field to point the user at.
+
+    Raise it in a model validator, where pydantic alone would only know the model.
+    """
+
+    def __init__(self, key: str | KeyPath, rule: str) -> None:
+        super().__init__(rule)
+        self.key: KeyPath = (key,) if isinstance(key, str) else key
+
+
+class _Finding(NamedTuple):
+    """One broken rule, ready to be told."""
+
+    path: KeyPath
+    rule: str
+    line: int | None
+    missing: bool
+
+
+def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, Any] | None = None) -> Model:
+    """Read a YAML 1.2 file into ``model``; types are checked strictly (no text for numbers) and no code is run.
+
+    Args:
+        path: The file.
+        model: The pydantic model that states its rules.
+        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+
+    Raises:
+        InputError: If the file cannot be read, is not YAML, repeats a key or breaks a rule of ``model``.
+    """
+    path = Path(path)
+    tree = _parse(path)
+    overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
+    data = _plain(tree, (), tree, path)
+    for keys, value in overridden.items():
+        _set(data, keys, value)
+    try:
+        # Strict JSON mode is what YAML means: lists fill tuples, whole numbers fill floats, nothing else is converted.
+        return model.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        findings = [_finding(details, model, data, tree, overridden) for details in error.errors()]
+    # A misspelt key also leaves its proper name missing: tell the cause, not the consequence.
+    first = min(findings, key=lambda finding: (finding.missing, finding.line or 0))
+    raise InputError(_sentence(path, first.line, first.path, first.rule))
+
+
+def _parse(path: Path) -> CommentedMap:
+    """The file's mapping, still with line numbers."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: must be UTF-8 text ({error.reason} at byte {error.start})") from None
+    try:
+        tree = YAML(typ="rt", pure=True).load(text)
+    except DuplicateKeyError as error:
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
+        problem = str(error.problem).partition(" with value")[0]
+        raise InputError(_sentence(path, line, (), f"keys must be unique ({problem})")) from None
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise InputError(_sentence(path, mark.line + 1 if mark else None, (), f"not YAML: {error.problem}")) from None
+    except (YAMLError, ValueError) as error:  # ValueError: a date or number that cannot be
+        raise InputError(_sentence(path, None, (), f"not YAML: {str(error).splitlines()[0]}")) from None
+    if not isinstance(tree, CommentedMap):
+        raise InputError(f"{path}: must be a mapping of keys to values (got {_shown(tree)})")
+    return tree
+
+
+def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path) -> Any:
+    """The node as built-in dicts, lists and scalars; refuses what JSON cannot hold."""
+    if len(keys) > MAX_DEPTH:
+        raise InputError(_sentence(path, _line(tree, keys), keys[:1], f"must not nest deeper than {MAX_DEPTH} levels"))
+    tag = getattr(node, "tag", None)
+    if isinstance(node, TaggedScalar) or (tag is not None and tag.value is not None):
+        raise InputError(_sentence(path, _line(tree, keys), keys, f"must not have a YAML tag (got {tag})"))
+    if isinstance(node, Mapping):
+        for key in node:
+            if not isinstance(key, str):
+                raise InputError(_sentence(path, _line(tree, keys), keys, f"keys must be text (got {_shown(key)})"))
+        return {str(key): _plain(value, (*keys, key), tree, path) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_plain(value, (*keys, position), tree, path) for position, value in enumerate(node)]
+    if node is None or isinstance(node, bool):
+        return node
+    for scalar in (int, float, str):
+        if isinstance(node, scalar):
+            return scalar(node)
+    return str(node)
+
+
+def _set(data: dict[str, Any], keys: tuple[str, ...], value: Any) -> None:
+    """Replace one value of nested mappings, making those that are absent."""
+    for key in keys[:-1]:
+        inner = data.get(key)
+        if not isinstance(inner, dict):
+            inner = data[key] = {}
+        data = inner
+    data[keys[-1]] = value
+
+
+def _finding(
+    details: ErrorDetails,
+    model: type[BaseModel],
+    data: dict[str, Any],
+    tree: CommentedMap,
+    overridden: Mapping[tuple[str, ...], Any],
+) -> _Finding:
+    """Pydantic's account of one error in terms of the file."""
+    kind, context, location = details["type"], details.get("ctx", {}), details["loc"]
+    keys = _file_path(location, data, keep_last=kind == "missing")
+    value: Any = details["input"]
+    cause = context.get("error")
+    if isinstance(cause, FieldError):
+        keys += cause.key
+    if kind.startswith("union_tag"):
+        keys += (str(context["discriminator"]).strip("'"),)
+        value = context.get("tag")
+    rule = RULES[kind].format(**context) if kind in RULES else str(details["msg"])
+    if kind == "value_error":
+        rule = str(cause)
+    elif kind == "extra_forbidden":
+        rule = _unknown_key(str(keys[-1]), list(_schema_at(model, location[:-1]).get("properties", {})))
+    elif kind == "union_tag_not_found":
+        rule += f", one of {', '.join(_schema_at(model, location)['discriminator']['mapping'])}"
+    elif kind == "missing" and isinstance(location[-1], int):
+        rule = f"must have {_schema_at(model, location[:-1])['minItems']} items (got {location[-1]})"
+    elif kind != "missing":
+        rule = f"{rule.replace('Input should', 'must')} (got {_shown(value)})"
+    overlaps = [min(len(keys), len(override)) for override in overridden]
+    from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))
+    return _Finding(keys, rule, _line(tree, keys) if from_file else None, kind == "missing")
+
+
+def _file_path(location: KeyPath, data: Any, *, keep_last: bool) -> KeyPath:
+    """Pydantic's location less the names of union members, which the user never wrote."""
+    keys: list[str | int] = []
+    for position, part in enumerate(location):
+        last = position == len(location) - 1
+        if isinstance(data, dict):
+            if part == data.get("kind") and not last:
+                continue
+            if part in data:
+                keys, data = [*keys, part], data[str(part)]
+            elif last and keep_last:
+                keys.append(part)
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            keys, data = [*keys, part], data[part]
+    return tuple(keys)
+
+
+def _line(tree: Any, keys: KeyPath) -> int:
+    """Line (from 1) of the deepest part of ``keys`` that the file has."""
+    line = int(tree.lc.line)
+    for key in keys:
+        try:
+            if isinstance(tree, CommentedMap):
+                line = tree.lc.key(key)[0]
+            elif isinstance(tree, CommentedSeq):
+                line = tree.lc.item(key)[0]
+            tree = tree[key]
+        except (KeyError, IndexError, TypeError):
+            break
+    return line + 1
+
+
+def _schema_at(model: type[BaseModel], location: KeyPath) -> dict[str, Any]:
+    """The part of the model's JSON Schema that pydantic's ``location`` points at, or {}."""
+    root = model.model_json_schema()
+
+    def resolved(schema: dict[str, Any]) -> dict[str, Any]:
+        while "$ref" in schema or "anyOf" in schema:
+            # The options of anyOf are an optional value and null, in this order.
+            schema = root["$defs"][schema["$ref"].rpartition("/")[2]] if "$ref" in schema else schema["anyOf"][0]
+        return schema
+
+    schema = resolved(root)
+    for part in location:
+        members = schema.get("discriminator", {}).get("mapping", {})
+        if part in members:
+            schema = {"$ref": members[part]}
+        elif isinstance(part, int):
+            items = schema.get("prefixItems", [])
+            schema = items[part] if part < len(items) else schema.get("items", {})
+        else:
+            schema = schema.get("properties", {}).get(part, {})
+        schema = resolved(schema)
+    return schema
+
+
+def _unknown_key(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
+    return f"is not a known key ({hint})"
+
+
+def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
+    place = str(path) if line is None else f"{path}:{line}"
+    shown = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).lstrip(".")
+    return f"{place}: {shown}: {rule}" if shown else f"{place}: {rule}"
+
+
+def _shown(value: Any) -> str:
+    """The value as the file would write it, shortened."""
+    text = "nothing" if value is None else json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."

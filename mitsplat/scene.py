@@ -1,206 +1,360 @@
-"""Scene files: YAML to :class:`SceneSpec`, with errors that name file, line, key, rule and value."""
+"""A scene ready to be settled and rendered, and the plan of each of its frames.
+
+(seed, frame index) decide a plan entirely: every random value has a stream of its own, named by its purpose, so that
+adding one never shifts another, and any worker may plan any frame in any order.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.spatial.transform import Rotation
 
-Vec3 = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
+from mitsplat.assets import Asset
+from mitsplat.camera import Camera, interpolate_poses, look_at_pose
+from mitsplat.errors import InputError
+from mitsplat.spec import (
+    AreaLight,
+    Box,
+    CameraHemisphere,
+    CameraOrbit,
+    CameraPath,
+    CameraSpec,
+    Composite,
+    Enclosure,
+    EnvironmentLight,
+    Intrinsics,
+    LightKey,
+    LightSpec,
+    ObjectSpec,
+    Output,
+    PointLight,
+    PoseKey,
+    Randomise,
+    Region,
+    SceneSpec,
+    Settle,
+    Shape,
+    SpotLight,
+)
+from mitsplat.yaml_input import key_place, load_yaml
 
+__all__ = [
+    "AreaLight",
+    "Box",
+    "CameraHemisphere",
+    "CameraOrbit",
+    "CameraPath",
+    "CameraSpec",
+    "Composite",
+    "Enclosure",
+    "EnvironmentLight",
+    "FramePlan",
+    "Intrinsics",
+    "LightKey",
+    "LightSpec",
+    "ObjectSpec",
+    "Output",
+    "PointLight",
+    "PoseKey",
+    "Randomise",
+    "Region",
+    "Scene",
+    "SceneSpec",
+    "Settle",
+    "Shape",
+    "SpotLight",
+    "layout_of",
+    "load_scene",
+    "plan_frame",
+    "random_stream",
+    "scene_json_schema",
+]
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Box(_Strict):
-    """A box, axes along the world's before ``rotate``."""
-
-    size: tuple[Positive, Positive, Positive] = Field(description="Full edge lengths [m].")
-    position: Vec3 = Field((0, 0, 0), description="Centre [m].")
-    rotate: Vec3 = Field((0, 0, 0), description="Euler angles about x, y, z (extrinsic) [degrees].")
-
-
-class Shape(_Strict):
-    """A simple shape: visible (rendered), a collider, or both. Neither visible nor collider is an error."""
-
-    name: str
-    box: Box | None = None
-    mesh: str | None = Field(None, description="Mesh file relative to the scene file [m].")
-    visible: bool = False
-    collider: bool = True
-    colour: tuple[float, float, float] = Field((0.6, 0.6, 0.6), description="Diffuse sRGB-encoded reflectance.")
-    friction: float = Field(0.6, ge=0)
-
-
-class ObjectSpec(_Strict):
-    """Objects of one class."""
-
-    asset: str = Field(description="Asset folder relative to the scene file.")
-    count: int | tuple[int, int] = Field(1, description="How many per layout, or an inclusive range.")
-    scale: Positive = Field(1.0, description="Uniform scale applied to the asset.")
-    class_name: str | None = Field(None, description="Class, if other than the asset's.")
-
-
-class Region(_Strict):
-    """Axis-aligned box from whose inside objects are dropped [m]."""
-
-    min: Vec3
-    max: Vec3
-
-
-class Settle(_Strict):
-    max_time: Positive = Field(6.0, description="Simulated seconds within which a layout must come to rest.")
-    attempts: int = Field(5, ge=1, description="Redraws before a layout is given up.")
-    timestep: Positive = Field(0.002, description="[s]")
-
-
-class Intrinsics(_Strict):
-    """Either ``fov_x`` or ``fx`` (with ``fy, cx, cy``); pixel centres at +0.5."""
-
-    fov_x: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view [degrees].")
-    fx: Positive | None = None
-    fy: Positive | None = None
-    cx: float | None = None
-    cy: float | None = None
-    distortion: tuple[float, ...] = ()
-    near: Positive = 0.01
-
-
-class PoseKey(_Strict):
-    eye: Vec3
-    target: Vec3
-    up: Vec3 = (0, 0, 1)
-
-
-class CameraPath(_Strict):
-    kind: Literal["path"] = "path"
-    keys: list[PoseKey] = Field(min_length=1)
-    intrinsics: Intrinsics = Intrinsics(fov_x=60)
-    jitter: float = Field(0.0, ge=0, description="Random displacement of the eye, 1 sigma [m].")
+FloatArray = npt.NDArray[np.float64]
 
 
-class CameraOrbit(_Strict):
-    kind: Literal["orbit"] = "orbit"
-    target: Vec3
-    radius: Positive
-    height: float
-    start: float = Field(0.0, description="First azimuth [degrees], 0 along +x.")
-    sweep: float = Field(360.0, description="Azimuth swept over all views [degrees].")
-    intrinsics: Intrinsics = Intrinsics(fov_x=60)
-    jitter: float = Field(0.0, ge=0)
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene file with everything that it refers to.
+
+    Attributes:
+        spec: What the file says, its enclosure written out as shapes.
+        path: The scene file.
+        environment: The surroundings, or None.
+        assets: Asset of each entry of ``spec.objects``, with its scale and class name applied.
+        shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
+        class_names: Sorted; the position in it is the class index.
+    """
+
+    spec: SceneSpec
+    path: Path
+    environment: Asset | None
+    assets: tuple[Asset, ...]
+    shape_meshes: tuple[trimesh.Trimesh, ...]
+    class_names: tuple[str, ...]
+
+    @property
+    def num_frames(self) -> int:
+        """Layouts times views; frames of one layout are neighbours."""
+        return self.spec.output.layouts * self.spec.output.views
 
 
-class CameraHemisphere(_Strict):
-    kind: Literal["hemisphere"] = "hemisphere"
-    target: Vec3
-    radius: tuple[Positive, Positive]
-    elevation: tuple[float, float] = Field((25.0, 80.0), description="Range above the horizon [degrees].")
-    azimuth: tuple[float, float] = (0.0, 360.0)
-    roll: tuple[float, float] = (0.0, 0.0)
-    target_jitter: float = Field(0.0, ge=0, description="Random displacement of the target, 1 sigma [m].")
-    intrinsics: Intrinsics = Intrinsics(fov_x=60)
+@dataclass(frozen=True, eq=False)
+class FramePlan:
+    """Everything about a frame but where its objects came to rest.
+
+    Attributes:
+        index: Index of the frame.
+        layout, view: Index of its layout, and of the view in it.
+        split: Split that the whole layout belongs to.
+        camera: Where the image is taken from.
+        lights: Lights as they are in this frame: paths and random factors applied.
+        draws: Random values by name: exposure [stops], hue [degrees], saturation, white_balance [K], noise.
+        seed: Seed of the pixel noise.
+    """
+
+    index: int
+    layout: int
+    view: int
+    split: Literal["train", "val"]
+    camera: Camera
+    lights: tuple[LightSpec, ...]
+    draws: dict[str, float]
+    seed: int
 
 
-CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read a scene file and every asset and mesh that it names.
+
+    Args:
+        path: The YAML file.
+        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+
+    Raises:
+        InputError: If the file or something that it names is missing or breaks a rule.
+    """
+    path = Path(path)
+    spec = load_yaml(path, SceneSpec, overrides=overrides)
+    if spec.enclosure is not None:
+        walls = _enclosure_walls(spec.enclosure, spec.region)
+        spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
+    folder = path.parent
+    for position, light in enumerate(spec.lights):
+        if isinstance(light, EnvironmentLight) and light.image is not None and not (folder / light.image).is_file():
+            place = key_place(path, ("lights", position, "image"))
+            raise InputError(f"{place}: must be an image file (got {light.image})")
+    loaded: dict[tuple[str, float], Asset] = {}
+    assets = []
+    for position, entry in enumerate(spec.objects):
+        key = (entry.asset, entry.scale)
+        if key not in loaded:
+            loaded[key] = _scaled(Asset.load(folder / entry.asset), entry.scale)
+            _check_fit(loaded[key], spec.region, key_place(path, ("objects", position, "asset")))
+        assets.append(replace(loaded[key], class_name=entry.class_name or loaded[key].class_name))
+    return Scene(
+        spec=spec,
+        path=path,
+        environment=None if spec.environment is None else Asset.load(folder / spec.environment),
+        assets=tuple(assets),
+        shape_meshes=tuple(_shape_mesh(shape, path, position) for position, shape in enumerate(spec.shapes)),
+        class_names=tuple(sorted({asset.class_name for asset in assets})),
+    )
 
 
-class LightKey(_Strict):
-    """State of a light at one time of its path; unset values keep the light's own."""
-
-    position: Vec3
-    intensity: Positive | None = None
-
-
-class AreaLight(_Strict):
-    """A rectangle that emits from its front."""
-
-    kind: Literal["area"] = "area"
-    position: Vec3
-    target: Vec3 = (0, 0, 0)
-    size: tuple[Positive, Positive] = (0.5, 0.5)
-    radiance: Positive = Field(10.0, description="[W/(m^2 sr)], relative units.")
-    colour: Vec3 = (1, 1, 1)
-    path: list[LightKey] = []
+def layout_of(scene: Scene, index: int) -> int:
+    """Layout that frame ``index`` shows."""
+    if not 0 <= index < scene.num_frames:
+        raise InputError(f"{scene.path}: frame must be in 0 to {scene.num_frames - 1} (got {index})")
+    return index // scene.spec.output.views
 
 
-class SpotLight(_Strict):
-    kind: Literal["spot"] = "spot"
-    position: Vec3
-    target: Vec3 = (0, 0, 0)
-    cone: float = Field(30.0, gt=0, lt=90, description="Half angle of the cone [degrees].")
-    intensity: Positive = Field(10.0, description="[W/sr]")
-    colour: Vec3 = (1, 1, 1)
-    path: list[LightKey] = []
+def plan_frame(scene: Scene, index: int) -> FramePlan:
+    """The plan of frame ``index``, from (seed, index) alone."""
+    spec, layout = scene.spec, layout_of(scene, index)
+    view = index - layout * spec.output.views
+    time = view / max(1, spec.output.views - 1)
+    ranges = spec.randomise
+    return FramePlan(
+        index=index,
+        layout=layout,
+        view=view,
+        split=_split(layout, spec.output),
+        camera=_camera(spec, view, index),
+        lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
+        draws={
+            name: float(random_stream(spec.seed, name, index).uniform(*getattr(ranges, name)))
+            for name in ("exposure", "hue", "saturation", "white_balance", "noise")
+        },
+        seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
+    )
 
 
-class PointLight(_Strict):
-    kind: Literal["point"] = "point"
-    position: Vec3
-    intensity: Positive = Field(10.0, description="[W/sr]")
-    colour: Vec3 = (1, 1, 1)
-    path: list[LightKey] = []
+def random_stream(seed: int, purpose: str, index: int) -> np.random.Generator:
+    """Random numbers for one purpose in one frame or layout, independent of those for every other."""
+    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), index]))
 
 
-class EnvironmentLight(_Strict):
-    """A constant sky, or an equirectangular image (z up)."""
-
-    kind: Literal["environment"] = "environment"
-    radiance: Positive = Field(1.0, description="Radiance, or the factor on the image.")
-    colour: Vec3 = (1, 1, 1)
-    image: str | None = Field(None, description="HDR or EXR file relative to the scene file.")
-    rotate_z: float = Field(0.0, description="[degrees]")
+def scene_json_schema() -> dict[str, Any]:
+    """JSON Schema of a scene file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
 
 
-LightSpec = Annotated[AreaLight | SpotLight | PointLight | EnvironmentLight, Field(discriminator="kind")]
-
-Range = tuple[float, float]
-
-
-class Randomise(_Strict):
-    """Drawn anew for every frame from (seed, frame); a range of equal ends fixes the value."""
-
-    exposure: Range = Field((0.0, 0.0), description="Stops.")
-    hue: Range = Field((0.0, 0.0), description="Shift [degrees].")
-    saturation: Range = (1.0, 1.0)
-    white_balance: Range = Field((6504.0, 6504.0), description="Correlated colour temperature [K].")
-    noise: Range = Field((0.0, 0.0), description="Read noise, 1 sigma of the encoded range [0, 1].")
-    light_intensity: Range = Field((1.0, 1.0), description="Factor on every light, per layout.")
-
-
-class Composite(_Strict):
-    shadow: Literal["traced", "image", "none"] = "traced"
-    highlight: bool = True
-    tone: Literal["neutral", "filmic"] = "neutral"
+def _enclosure_walls(enclosure: Enclosure, region: Region) -> list[Shape]:
+    """The enclosure as five invisible boxes: walls from its floor up to the region's top, and a lid."""
+    low, high = np.array(region.min) - enclosure.margin, np.array(region.max) + enclosure.margin
+    low[2], high[2] = enclosure.floor, region.max[2]
+    middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
+    walls = []
+    for name, axis, side in (("-x", 0, -1), ("+x", 0, 1), ("-y", 1, -1), ("+y", 1, 1), ("lid", 2, 1)):
+        position = middle.copy()
+        position[axis] += side * (size[axis] + thickness) / 2
+        extents = size + 2 * thickness
+        extents[axis] = thickness
+        extents[2] = thickness if name == "lid" else size[2]
+        box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
+        walls.append(Shape(name=f"enclosure {name}", box=box))
+    return walls
 
 
-class Output(_Strict):
-    width: int = Field(1280, ge=1, le=16384)
-    height: int = Field(720, ge=1, le=16384)
-    layouts: int = Field(4, ge=1)
-    views: int = Field(10, ge=1, description="Views per layout.")
-    formats: list[Literal["yolo", "coco", "bop", "exr"]] = ["yolo"]
-    image: Literal["png", "jpg"] = "png"
-    jpeg_quality: int = Field(95, ge=1, le=100)
-    validation: float = Field(0.2, ge=0, le=1, description="Share of layouts that go to the validation split.")
-    min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels are dropped.")
-    min_fragment: int = Field(8, ge=1, description="Connected parts with fewer pixels are dropped.")
+def _scaled(asset: Asset, scale: float) -> Asset:
+    """The asset made larger by ``scale`` about its origin, of the same density."""
+    if scale == 1.0:
+        return asset
+    matrix = np.diag([scale, scale, scale, 1.0])
+    return replace(
+        asset,
+        splats=asset.splats.transformed(matrix),
+        mesh=None if asset.mesh is None else asset.mesh.copy().apply_transform(matrix),
+        pieces=tuple(piece.copy().apply_transform(matrix) for piece in asset.pieces),
+        mass=None if asset.mass is None else asset.mass * scale**3,
+    )
 
 
-class SceneSpec(_Strict):
-    """A scene file. Lengths in metres, angles in degrees, z up."""
+def _check_fit(asset: Asset, region: Region, place: str) -> None:
+    """Refuse an object that physics cannot move, or that could not lie in the region on any side."""
+    if asset.mesh is None:
+        raise InputError(f"{place}: asset {asset.name!r} must have a mesh to be dropped")
+    footprint = np.sort(asset.mesh.extents)[1:]
+    space = np.sort(np.subtract(region.max, region.min)[:2])
+    if (footprint > space).any():
+        raise InputError(
+            f"{place}: asset {asset.name!r} must fit into the region of {space[0]:g} x {space[1]:g} m "
+            f"(it measures {footprint[0]:.3g} x {footprint[1]:.3g} m)"
+        )
 
-    name: str
-    environment: str | None = Field(None, description="Asset folder relative to the scene file.")
-    shapes: list[Shape] = []
-    objects: list[ObjectSpec] = []
-    region: Region
-    settle: Settle = Settle()
-    camera: CameraSpec
-    lights: list[LightSpec] = []
-    randomise: Randomise = Randomise()
-    composite: Composite = Composite()
-    output: Output = Output()
-    quality: Literal["fast", "balanced", "exact"] = "balanced"
-    seed: int = Field(0, ge=0)
+
+def _shape_mesh(shape: Shape, path: Path, position: int) -> trimesh.Trimesh:
+    """The shape in world space."""
+    if shape.box is not None:
+        transform = np.eye(4)
+        transform[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
+        transform[:3, 3] = shape.box.position
+        box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
+        return box
+    file = path.parent / str(shape.mesh)
+    place = key_place(path, ("shapes", position, "mesh"))
+    if not file.is_file():
+        raise InputError(f"{place}: must be a mesh file (got {shape.mesh})")
+    try:
+        mesh = trimesh.load_mesh(file)
+    except (ValueError, IndexError, KeyError, NotImplementedError) as error:  # what trimesh's readers raise
+        raise InputError(f"{place}: {shape.mesh} cannot be read as a mesh ({error})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{place}: {shape.mesh} must contain triangles")
+    return mesh
+
+
+def _split(layout: int, output: Output) -> Literal["train", "val"]:
+    """Validation layouts are spread evenly; both splits get one where two layouts or more are to be shared."""
+    count = round(output.layouts * output.validation)
+    if output.layouts > 1 and 0 < output.validation < 1:
+        count = min(max(count, 1), output.layouts - 1)
+    chosen = (layout + 1) * count // output.layouts > layout * count // output.layouts
+    return "val" if chosen else "train"
+
+
+def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> LightSpec:
+    """Light ``position`` at ``time`` in [0, 1] of its path, times the layout's random factor."""
+    light = spec.lights[position]
+    strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
+    state: dict[str, Any] = {strength: getattr(light, strength)}
+    if not isinstance(light, EnvironmentLight) and light.path:
+        times = np.linspace(0.0, 1.0, len(light.path))
+        strengths = [key.intensity or state[strength] for key in light.path]
+        positions = np.array([key.position or light.position for key in light.path])
+        state = {
+            strength: float(np.interp(time, times, strengths)),
+            "position": tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3)),
+            "path": (),
+        }
+    factors = random_stream(spec.seed, f"light intensity {position}", layout)
+    state[strength] *= float(factors.uniform(*spec.randomise.light_intensity))
+    return light.model_copy(update=state)
+
+
+def _camera(spec: SceneSpec, view: int, index: int) -> Camera:
+    """Camera of frame ``index``, which is ``view`` of its layout."""
+    camera, views = spec.camera, spec.output.views
+    if isinstance(camera, CameraHemisphere):
+        pose = _hemisphere_pose(camera, spec.seed, index)
+    else:
+        if isinstance(camera, CameraOrbit):
+            pose = _orbit_pose(camera, view, views)
+        else:
+            keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
+            pose = interpolate_poses(keys, view / max(1, views - 1))[0]
+        pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
+    return _camera_at(pose, camera.intrinsics, spec.output)
+
+
+def _camera_at(pose: FloatArray, intrinsics: Intrinsics, output: Output) -> Camera:
+    width, height = intrinsics.size or (output.width, output.height)
+    if intrinsics.fov_x is not None:
+        fx = 0.5 * width / float(np.tan(0.5 * np.radians(intrinsics.fov_x)))
+    else:
+        fx = float(intrinsics.fx or 0.0)
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fx if intrinsics.fy is None else intrinsics.fy,
+        cx=width / 2 if intrinsics.cx is None else intrinsics.cx,
+        cy=height / 2 if intrinsics.cy is None else intrinsics.cy,
+        world_from_camera=pose,
+        distortion=intrinsics.distortion,
+        near=intrinsics.near,
+    )
+    return camera.resized(output.width, output.height)
+
+
+def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> FloatArray:
+    """A full circle ends one step before its start; a part of one ends at its end."""
+    steps = views if abs(camera.sweep) == 360 else max(1, views - 1)
+    azimuth = np.radians(camera.start + camera.sweep * view / steps)
+    offset = (camera.radius * np.cos(azimuth), camera.radius * np.sin(azimuth), camera.height)
+    return look_at_pose(np.add(camera.target, offset), camera.target)
+
+
+def _hemisphere_pose(camera: CameraHemisphere, seed: int, index: int) -> FloatArray:
+    def draw(name: str, low: float, high: float) -> float:
+        return float(random_stream(seed, f"camera {name}", index).uniform(low, high))
+
+    radius = draw("radius", *camera.radius)
+    azimuth, roll = np.radians(draw("azimuth", *camera.azimuth)), np.radians(draw("roll", *camera.roll))
+    # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
+    sine = draw("elevation", *np.sin(np.radians(camera.elevation)))
+    cosine = np.sqrt(1.0 - sine * sine)
+    jitter = camera.target_jitter * random_stream(seed, "camera target", index).standard_normal(3)
+    target = np.add(camera.target, jitter)
+    eye = target + radius * np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
+    pose = look_at_pose(eye, target)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll).as_matrix()
+    return pose

@@ -35,6 +35,7 @@ RULES = {
     "union_tag_not_found": "is required",
     "model_type": "must be a mapping of keys to values",
     "model_attributes_type": "must be a mapping of keys to values",
+    "dict_type": "must be a mapping of keys to values",
     "tuple_type": "must be a list",
     "list_type": "must be a list",
     "too_short": "must have at least {min_length} items",
@@ -93,6 +94,12 @@ def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, A
     # A misspelt key also leaves its proper name missing: tell the cause, not the consequence.
     first = min(findings, key=lambda finding: (finding.missing, finding.line or 0))
     raise InputError(_sentence(path, first.line, first.path, first.rule))
+
+
+def key_place(path: str | Path, keys: KeyPath) -> str:
+    """Where the file says ``keys``, as errors begin: ``scene.yaml:41: objects[2].asset``."""
+    path = Path(path)
+    return _place(path, _line(_parse(path), keys), keys)
 
 
 def _parse(path: Path) -> CommentedMap:
@@ -248,10 +255,14 @@ def _unknown_key(key: str, known: list[str]) -> str:
     return f"is not a known key ({hint})"
 
 
-def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
+def _place(path: Path, line: int | None, keys: KeyPath) -> str:
     place = str(path) if line is None else f"{path}:{line}"
     shown = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).lstrip(".")
-    return f"{place}: {shown}: {rule}" if shown else f"{place}: {rule}"
+    return f"{place}: {shown}" if shown else place
+
+
+def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
+    return f"{_place(path, line, keys)}: {rule}"
 
 
 def _shown(value: Any) -> str:

@@ -1,0 +1,363 @@
+"""The scene file's models: what may be written, in which units, under which rules.
+
+Lengths are metres, angles degrees, z is up; conventions are those of :mod:`mitsplat.splats`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, model_validator
+
+from mitsplat.yaml_input import FieldError
+
+
+class StrictModel(BaseModel):
+    """Immutable, without unknown keys, infinities or NaN."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+    if bounds[0] > bounds[1]:
+        raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
+    return bounds
+
+
+def _count_range(count: Any) -> Any:
+    """One number n as (n, n); a list as a tuple, since strict mode takes nothing else from here on."""
+    if isinstance(count, int) and not isinstance(count, bool):
+        if count < 1:
+            raise ValueError(f"must be >= 1 (got {count})")
+        return (count, count)
+    return tuple(count) if isinstance(count, list) else count
+
+
+def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(colour):
+        raise ValueError("must not be black (got [0, 0, 0])")
+    return colour
+
+
+Vec3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(_ordered)]
+CountRange = Annotated[
+    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
+    AfterValidator(_ordered),
+    BeforeValidator(_count_range, json_schema_input_type=int | tuple[int, int]),
+]
+Elevation = Annotated[float, Field(ge=-90, le=90)]
+Kelvin = Annotated[float, Field(ge=1667, le=25000)]
+EmittedColour = Annotated[
+    tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
+    AfterValidator(_some_colour),
+    Field(description="Linear RGB factor on the emission."),
+]
+
+
+class Box(StrictModel):
+    """A box, its axes along the world's before ``rotate``."""
+
+    size: tuple[Positive, Positive, Positive] = Field(description="Full edge lengths [m].")
+    position: Vec3 = Field((0, 0, 0), description="Centre [m].")
+    rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
+
+
+class Shape(StrictModel):
+    """A box or a mesh that is rendered, collides, or both."""
+
+    name: str = Field(min_length=1, description="Name, unique among the shapes.")
+    box: Box | None = Field(None, description="The shape as a box.")
+    mesh: str | None = Field(None, description="Or as a mesh file, relative to the scene file, in world space [m].")
+    visible: bool = Field(False, description="Whether it is rendered.")
+    collider: bool = Field(True, description="Whether objects rest on it and bounce off it.")
+    colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
+    friction: NonNegativeFloat = Field(0.6, description="Coulomb friction coefficient.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Shape:
+        if (self.box is None) == (self.mesh is None):
+            raise FieldError("name", f"shape {self.name!r} must have either a box or a mesh")
+        if not (self.visible or self.collider):
+            raise FieldError("visible", f"shape {self.name!r} must be visible, a collider, or both")
+        return self
+
+
+class Region(StrictModel):
+    """Axis-aligned box from whose inside objects are dropped."""
+
+    min: Vec3 = Field(description="Lower corner [m].")
+    max: Vec3 = Field(description="Upper corner [m].")
+
+    @model_validator(mode="after")
+    def _check(self) -> Region:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if not low < high:
+                raise FieldError("max", f"must be above min along {axis} (got {high:g}, min is {low:g})")
+        return self
+
+
+class Enclosure(StrictModel):
+    """Four invisible walls around the drop region, and a lid on it, that keep objects in."""
+
+    margin: NonNegativeFloat = Field(0.0, description="Distance of the walls outside the region's sides [m].")
+    floor: float = Field(0.0, description="Height of the walls' lower edge [m].")
+    thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")
+
+
+class ObjectSpec(StrictModel):
+    """Objects of one asset."""
+
+    asset: str = Field(description="Asset folder, relative to the scene file.")
+    count: CountRange = Field((1, 1), description="How many in each layout: a number or an inclusive range.")
+    scale: Positive = Field(1.0, description="Uniform scale applied to the asset.")
+    class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
+
+
+class Settle(StrictModel):
+    """How objects are dropped."""
+
+    max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
+    attempts: int = Field(5, ge=1, description="Redraws before a layout is given up.")
+    timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
+
+
+class Intrinsics(StrictModel):
+    """OpenCV intrinsics, pixel centres at +0.5: either ``fov_x``, or ``fx`` with what else was calibrated."""
+
+    fov_x: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view [degrees].")
+    fx: Positive | None = Field(None, description="Focal length along x [px].")
+    fy: Positive | None = Field(None, description="Focal length along y [px]; fx if absent.")
+    cx: float | None = Field(None, description="Principal point [px]; the image's middle if absent.")
+    cy: float | None = Field(None, description="Principal point [px]; the image's middle if absent.")
+    size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
+        None, description="Width and height that fx, fy, cx and cy refer to [px]; the output's if absent."
+    )
+    distortion: tuple[float, ...] = Field(
+        (), description="OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole."
+    )
+    near: Positive = Field(0.01, description="Nearest depth at which anything is seen [m].")
+
+    @model_validator(mode="after")
+    def _check(self) -> Intrinsics:
+        if (self.fov_x is None) == (self.fx is None):
+            raise FieldError((), "must have either fov_x or fx")
+        for key in ("fy", "cx", "cy", "size"):
+            if self.fx is None and getattr(self, key) is not None:
+                raise FieldError(key, "needs fx")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise FieldError("distortion", f"must have 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
+        return self
+
+
+class Viewpoint(StrictModel):
+    """What every kind of camera has."""
+
+    intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor.")
+
+
+class PoseKey(StrictModel):
+    """One pose on a camera path."""
+
+    eye: Vec3 = Field(description="Centre of projection [m].")
+    target: Vec3 = Field(description="Point in the middle of the view [m].")
+    up: Vec3 = Field((0, 0, 1), description="Direction that points up in the image.")
+
+    @model_validator(mode="after")
+    def _check(self) -> PoseKey:
+        if self.eye == self.target:
+            raise FieldError("target", f"must differ from eye (got {list(self.target)})")
+        if not any(self.up):
+            raise FieldError("up", "must not be zero (got [0, 0, 0])")
+        return self
+
+
+class CameraPath(Viewpoint):
+    """Views evenly spaced in time on a smooth path through key poses, the same in every layout."""
+
+    kind: Literal["path"] = Field("path", description="A path through key poses.")
+    keys: tuple[PoseKey, ...] = Field(min_length=1, description="Key poses, evenly spaced in time.")
+    jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
+
+
+class CameraOrbit(Viewpoint):
+    """Views evenly spaced on a horizontal circle, the same in every layout."""
+
+    kind: Literal["orbit"] = Field("orbit", description="A horizontal circle.")
+    target: Vec3 = Field(description="Point in the middle of every view; the circle is centred above it [m].")
+    radius: Positive = Field(description="Radius of the circle [m].")
+    height: float = Field(description="Height of the circle above the target [m].")
+    start: float = Field(0.0, description="First azimuth, 0 along +x, counter-clockwise from above [degrees].")
+    sweep: float = Field(360.0, ge=-360, le=360, description="Azimuth swept over a layout's views [degrees].")
+    jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
+
+
+class CameraHemisphere(Viewpoint):
+    """Views drawn at random, uniform by area on spheres around a target."""
+
+    kind: Literal["hemisphere"] = Field("hemisphere", description="Random views around a target.")
+    target: Vec3 = Field(description="Point in the middle of the views [m].")
+    radius: PositiveRange = Field(description="Range of distances from the target [m].")
+    elevation: Annotated[tuple[Elevation, Elevation], AfterValidator(_ordered)] = Field(
+        (25.0, 80.0), description="Range above the horizon [degrees]."
+    )
+    azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
+    roll: Range = Field((0.0, 0.0), description="Range of rotations about the line of sight [degrees].")
+    target_jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the target, 1 sigma [m].")
+
+
+CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]
+
+
+class LightKey(StrictModel):
+    """State of a light at one time of its path; what is absent stays as the light itself has it."""
+
+    position: Vec3 | None = Field(None, description="Position [m].")
+    intensity: Positive | None = Field(None, description="Intensity [W/sr], or an area light's radiance [W/(m^2 sr)].")
+
+    @model_validator(mode="after")
+    def _check(self) -> LightKey:
+        if self.position is None and self.intensity is None:
+            raise FieldError((), "must have a position, an intensity or both")
+        return self
+
+
+class LocalLight(StrictModel):
+    """What every light at a place has."""
+
+    position: Vec3 = Field(description="Position [m].")
+    colour: EmittedColour = (1, 1, 1)
+    path: tuple[LightKey, ...] = Field(
+        (), description="Keys evenly spaced over a layout's views, linear in between; empty for a light at rest."
+    )
+
+
+class AimedLight(LocalLight):
+    """What every light that faces something has."""
+
+    target: Vec3 = Field((0, 0, 0), description="Point that it faces [m].")
+
+    @model_validator(mode="after")
+    def _check(self) -> AimedLight:
+        for position in (self.position, *(key.position for key in self.path)):
+            if position == self.target:
+                raise FieldError("target", f"must differ from the light's positions (got {list(self.target)})")
+        return self
+
+
+class AreaLight(AimedLight):
+    """A rectangle that emits from the face turned to its target."""
+
+    kind: Literal["area"] = Field("area", description="A rectangle.")
+    size: tuple[Positive, Positive] = Field((0.5, 0.5), description="Width and height [m].")
+    radiance: Positive = Field(10.0, description="Emitted radiance [W/(m^2 sr)].")
+
+
+class SpotLight(AimedLight):
+    """A point that emits into a cone."""
+
+    kind: Literal["spot"] = Field("spot", description="A cone.")
+    cone: float = Field(30.0, gt=0, lt=90, description="Half angle of the cone [degrees].")
+    intensity: Positive = Field(10.0, description="Radiant intensity [W/sr].")
+
+
+class PointLight(LocalLight):
+    """A point that emits in all directions."""
+
+    kind: Literal["point"] = Field("point", description="A point.")
+    intensity: Positive = Field(10.0, description="Radiant intensity [W/sr].")
+
+
+class EnvironmentLight(StrictModel):
+    """A constant sky, or an equirectangular image of it (z up)."""
+
+    kind: Literal["environment"] = Field("environment", description="A sky all around.")
+    radiance: Positive = Field(1.0, description="Radiance [W/(m^2 sr)], or the factor on the image.")
+    colour: EmittedColour = (1, 1, 1)
+    image: str | None = Field(None, description="HDR or EXR file, relative to the scene file.")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+
+
+LightSpec = Annotated[AreaLight | SpotLight | PointLight | EnvironmentLight, Field(discriminator="kind")]
+
+
+class Randomise(StrictModel):
+    """Ranges drawn from uniformly, anew for every frame unless stated; a range of equal ends fixes the value."""
+
+    exposure: Range = Field((0.0, 0.0), description="Exposure [stops].")
+    hue: Range = Field((0.0, 0.0), description="Hue shift [degrees].")
+    saturation: NonNegativeRange = Field((1.0, 1.0), description="Factor on saturation.")
+    white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(_ordered)] = Field(
+        (6504.0, 6504.0), description="Correlated colour temperature that is shown as white [K]."
+    )
+    noise: NonNegativeRange = Field((0.0, 0.0), description="Read noise, 1 sigma of the encoded range [0, 1].")
+    light_intensity: PositiveRange = Field((1.0, 1.0), description="Factor on each light, drawn once for a layout.")
+
+
+class Composite(StrictModel):
+    """How layers become a picture."""
+
+    shadow: Literal["traced", "image", "none"] = Field(
+        "traced", description="Shadow rays, the image-space approximation, or no shadow."
+    )
+    highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")
+    tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
+
+
+class Output(StrictModel):
+    """What is written."""
+
+    width: int = Field(1280, ge=1, le=16384, description="Image width [px].")
+    height: int = Field(720, ge=1, le=16384, description="Image height [px].")
+    layouts: int = Field(4, ge=1, description="How many times the objects are dropped.")
+    views: int = Field(10, ge=1, description="Images of each layout.")
+    formats: tuple[Literal["yolo", "coco", "bop", "exr"], ...] = Field(
+        ("yolo",), min_length=1, description="Label formats, and exr for every layer."
+    )
+    image: Literal["png", "jpg"] = Field("png", description="Image file format.")
+    jpeg_quality: int = Field(95, ge=1, le=100, description="Quality of jpg images.")
+    validation: Unit = Field(
+        0.2, description="Share of layouts for validation; between 0 and 1, two layouts or more fill both splits."
+    )
+    min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels are not labelled.")
+    min_fragment: int = Field(8, ge=1, description="Connected parts with fewer pixels are dropped from a mask.")
+
+
+class SceneSpec(StrictModel):
+    """A scene file. Lengths in metres, angles in degrees, z up; paths are relative to the file."""
+
+    name: str = Field(min_length=1, description="Name of the dataset.")
+    environment: str | None = Field(None, description="Asset folder of the surroundings, relative to the scene file.")
+    shapes: tuple[Shape, ...] = Field((), description="Tabletop, walls and other things that do not move.")
+    objects: tuple[ObjectSpec, ...] = Field((), description="What is dropped and labelled.")
+    region: Region = Field(description="Where objects are dropped from.")
+    enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
+    settle: Settle = Field(Settle(), description="How objects come to rest.")
+    camera: CameraSpec = Field(description="Where images are taken from.")
+    lights: tuple[LightSpec, ...] = Field((), description="Light sources.")
+    randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
+    composite: Composite = Field(Composite(), description="How layers become a picture.")
+    output: Output = Field(Output(), description="What is written.")
+    quality: Literal["fast", "balanced", "exact"] = Field("balanced", description="Rendering preset.")
+    seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
+
+    @model_validator(mode="after")
+    def _check(self) -> SceneSpec:
+        seen: set[str] = set()
+        for position, shape in enumerate(self.shapes):
+            if shape.name in seen:
+                raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
+            seen.add(shape.name)
+        skies = [position for position, light in enumerate(self.lights) if isinstance(light, EnvironmentLight)]
+        if len(skies) > 1:
+            raise FieldError(("lights", skies[1], "kind"), "must not be a second environment light")
+        if self.enclosure is not None and self.enclosure.floor >= self.region.max[2]:
+            raise FieldError(
+                ("enclosure", "floor"),
+                f"must be below the region's top at {self.region.max[2]:g} m (got {self.enclosure.floor:g})",
+            )
+        return self

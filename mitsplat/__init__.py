@@ -1,0 +1,81 @@
+"""mitsplat: labelled training images of robot workcells from Gaussian splats, settled parts and traced light.
+
+Conventions (frames, units, colour) are stated in :mod:`mitsplat.splats`. Importing this package points Dr.Jit at a
+usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the current and every
+later variant; heavy modules load when a name that needs them is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from mitsplat.llvm import use_bundled_llvm
+
+use_bundled_llvm()
+
+import mitsuba as _mi  # noqa: E402 - after Dr.Jit was told which LLVM to load
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Asset": "assets",
+    "Camera": "camera",
+    "Frame": "frame",
+    "InputError": "errors",
+    "Labels": "label",
+    "Layers": "render",
+    "Layout": "settle",
+    "Quality": "quality",
+    "Scene": "scene",
+    "SceneSpec": "scene",
+    "Splats": "splats",
+    "bake_asset": "bake",
+    "load_scene": "scene",
+    "render_frame": "frame",
+    "render_splats": "render",
+    "settle_layout": "settle",
+    "write_dataset": "dataset",
+}
+
+__all__ = sorted(_HOME)  # noqa: PLE0605 - one table says name and home
+
+if TYPE_CHECKING:
+    from mitsplat.assets import Asset as Asset
+    from mitsplat.bake import bake_asset as bake_asset
+    from mitsplat.camera import Camera as Camera
+    from mitsplat.dataset import write_dataset as write_dataset
+    from mitsplat.errors import InputError as InputError
+    from mitsplat.frame import Frame as Frame
+    from mitsplat.frame import render_frame as render_frame
+    from mitsplat.label import Labels as Labels
+    from mitsplat.quality import Quality as Quality
+    from mitsplat.render import Layers as Layers
+    from mitsplat.render import render_splats as render_splats
+    from mitsplat.scene import Scene as Scene
+    from mitsplat.scene import SceneSpec as SceneSpec
+    from mitsplat.scene import load_scene as load_scene
+    from mitsplat.settle import Layout as Layout
+    from mitsplat.settle import settle_layout as settle_layout
+    from mitsplat.splats import Splats as Splats
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"mitsplat.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'mitsplat' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
+def _register_plugins(_old: str | None = None, new: str | None = None) -> None:
+    from mitsplat.plugins import register
+
+    register(new)
+
+
+_mi.detail.add_variant_callback(_register_plugins)
+if _mi.variant():
+    _register_plugins(None, _mi.variant())

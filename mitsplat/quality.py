@@ -1,0 +1,60 @@
+"""Presets that trade speed against accuracy in the splat renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mitsplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What the renderer computes for one ray; every field that is cheaper is also less exact.
+
+    Attributes:
+        order: Gaussians of a pixel are blended in the order of their centres' depth, sorted per tile (``tile``), or
+            in the order of their peaks along the ray itself, sorted per ray (``ray``).
+        alpha_min: A Gaussian is cut where its opacity along a ray falls below this value. 1/255 is what 3DGS trains with.
+        transmittance_min: A ray ends when less than this share of the light behind would still be seen.
+        sh_degree: Highest spherical-harmonic band that is evaluated.
+        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered).
+    """
+
+    order: Literal["tile", "ray"] = "tile"
+    alpha_min: float = 1.0 / 255.0
+    transmittance_min: float = 1e-3
+    sh_degree: int = 3
+    samples: int = 1
+
+    def __post_init__(self) -> None:
+        if self.order not in ("tile", "ray"):
+            raise InputError(f"quality: order must be 'tile' or 'ray' (got {self.order!r})")
+        if not 0.0 < self.alpha_min < 1.0:
+            raise InputError(f"quality: alpha_min must be between 0 and 1 (got {self.alpha_min})")
+        if not 0.0 <= self.transmittance_min < 1.0:
+            raise InputError(f"quality: transmittance_min must be in [0, 1) (got {self.transmittance_min})")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise InputError(f"quality: sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
+        if not 1 <= self.samples <= 8:
+            raise InputError(f"quality: samples must be from 1 to 8 (got {self.samples})")
+
+
+PRESETS: dict[str, Quality] = {
+    "fast": Quality(transmittance_min=1e-2, sh_degree=2),
+    "balanced": Quality(),
+    "exact": Quality(order="ray", alpha_min=1e-5, transmittance_min=1e-6),
+}
+
+
+def resolve_quality(quality: str | Quality) -> Quality:
+    """A preset by name, or the value itself.
+
+    Raises:
+        InputError: If no preset has that name.
+    """
+    if isinstance(quality, Quality):
+        return quality
+    if quality not in PRESETS:
+        raise InputError(f"quality must be one of {', '.join(sorted(PRESETS))} (got {quality!r})")
+    return PRESETS[quality]

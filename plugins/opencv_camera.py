@@ -1,0 +1,103 @@
+"""The sensor plugin ``opencv_camera``: a pinhole with OpenCV intrinsics and lens distortion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.errors import InputError
+from mitsplat.plugins.rays import View
+
+
+class OpenCVCamera(mi.Sensor):
+    r"""OpenCV camera (:monosp:`opencv_camera`)
+
+    .. pluginparameters::
+
+     * - fx, fy
+       - |float|
+       - Focal lengths [px].
+
+     * - cx, cy
+       - |float|
+       - Principal point [px], pixel centres at +0.5. (Default: middle of the film)
+
+     * - distortion
+       - |string|
+       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``. (Default: none)
+
+     * - to_world
+       - |transform|
+       - Pose in Mitsuba's camera axes (x left, y up, z forward), as ``lookat`` gives it. (Default: none)
+
+     * - near_clip
+       - |float|
+       - Nearest visible depth [m]. (Default: 0.01)
+
+    Rays are generated through the distorted lens itself, so nothing is warped afterwards; other integrators can use
+    the sensor too.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.world_from_mitsuba = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64).reshape(4, 4)
+        width, height = self.film().size()
+        self.fx, self.fy = _positive(props, "fx", None), _positive(props, "fy", None)
+        self.cx = _number(props, "cx", width / 2)
+        self.cy = _number(props, "cy", height / 2)
+        self.near = _positive(props, "near_clip", 0.01)
+        text = props.get("distortion", "")
+        try:
+            self.distortion = tuple(float(v) for v in str(text).replace(",", " ").split())
+        except ValueError:
+            raise InputError(f"sensor 'opencv_camera': 'distortion' must be numbers (got {text!r})") from None
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise InputError(f"sensor 'opencv_camera': 'distortion' takes 0, 4, 5 or 8 numbers (got {len(self.distortion)})")
+
+    def view(self, samples: int = 1) -> View:
+        """What the splat renderer needs of this camera."""
+        width, height = (int(n) for n in self.film().size())
+        flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+        pose = self.world_from_mitsuba @ flip
+        return View(width, height, self.fx, self.fy, self.cx, self.cy, pose, self.distortion, self.near, samples)
+
+    def sample_ray(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> tuple[Any, Any]:
+        width, height = self.film().size()
+        u, v = self.view().slopes(position.x * width, position.y * height)
+        ray = dr.zeros(mi.Ray3f, dr.width(position))
+        to_world = mi.Transform4f(mi.Matrix4f(self.world_from_mitsuba.tolist()))
+        ray.o = to_world @ mi.Point3f(0, 0, 0)
+        ray.d = dr.normalize(to_world @ mi.Vector3f(-u, -v, 1))
+        ray.time = time
+        ray.wavelengths = wavelength
+        ray.maxt = dr.inf
+        return ray, mi.Color3f(1)
+
+    def sample_ray_differential(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> Any:
+        ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
+        return mi.RayDifferential3f(ray), weight
+
+    def to_string(self) -> str:
+        return f"OpenCVCamera[fx = {self.fx}, fy = {self.fy}, cx = {self.cx}, cy = {self.cy}, distortion = {self.distortion}]"
+
+
+def _number(props: mi.Properties, name: str, default: float | None) -> float:
+    value = props[name] if name in props else default
+    if value is None:
+        raise InputError(f"sensor 'opencv_camera': {name!r} is missing")
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"sensor 'opencv_camera': {name!r} must be a number (got {value!r})")
+    return float(value)
+
+
+def _positive(props: mi.Properties, name: str, default: float | None) -> float:
+    value = _number(props, name, default)
+    if not value > 0:
+        raise InputError(f"sensor 'opencv_camera': {name!r} must be > 0 (got {value})")
+    return value
+
+
+mi.register_sensor("opencv_camera", lambda props: OpenCVCamera(props))

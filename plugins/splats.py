@@ -1,0 +1,149 @@
+"""The shape plugin ``splats``: Gaussians with a proxy mesh, carried to the integrator ``splat_proxy``."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.errors import InputError
+from mitsplat.splats import Splats
+
+
+class SplatsShape(mi.Mesh):
+    r"""Gaussian splats (:monosp:`splats`)
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - Splat file: 3DGS ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or ``.sog``.
+
+     * - proxy
+       - |string|
+       - Mesh in the splats' own frame that stands for them where light is traced: it receives and casts shadows.
+         (Default: none)
+
+     * - to_world
+       - |transform|
+       - Rigid transform with uniform scale. (Default: none)
+
+     * - instance
+       - |int|
+       - Id in the instance image; 0 is the environment. (Default: 0)
+
+     * - dynamic
+       - |bool|
+       - Whether the shadow of the proxy is missing in what was captured and has to be added. (Default: true for an
+         instance above 0)
+
+     * - capture_light
+       - |string|
+       - ``uniform``: captured under even light from all sides, and relit by the scene's emitters. ``scene``: captured
+         under the scene's own light, and only shadowed. (Default: ``uniform`` for an instance above 0, else ``scene``)
+
+     * - roughness
+       - |float|
+       - GGX roughness of the highlight, in (0, 1]. (Default: 0.4)
+
+     * - specular
+       - |float|
+       - Specular reflectance at normal incidence of the highlight, in [0, 1]. (Default: 0)
+
+    The shape only carries its data: rays never meet it, and other integrators see nothing. Shapes of one file share one
+    copy.
+
+    .. tabs::
+
+        .. code-tab:: xml
+
+            <shape type="splats">
+                <string name="filename" value="nut/splats.ply"/>
+                <string name="proxy" value="nut/mesh.ply"/>
+                <integer name="instance" value="1"/>
+                <transform name="to_world"><translate z="0.01"/></transform>
+            </shape>
+    """
+
+    def __init__(self, props: mi.Properties, splats: Splats | None = None, proxy: trimesh.Trimesh | None = None) -> None:
+        super().__init__("splats", 3, 1, props=props)
+        # One triangle without area: Mitsuba asks for a mesh, and no ray can meet this one.
+        params = mi.traverse(self)
+        params["vertex_positions"] = mi.Float([0.0] * 9)
+        params["faces"] = mi.UInt32([0, 0, 0])
+        params.update()
+
+        filename, proxy_file = _typed(props, "filename", str, ""), _typed(props, "proxy", str, "")
+        if splats is None:
+            if not filename:
+                raise InputError("shape 'splats': 'filename' is missing")
+            splats = _load_splats(*_stamp(filename))
+        if proxy is None and proxy_file:
+            proxy = _load_mesh(*_stamp(proxy_file))
+        self.splats = splats
+        self.proxy = proxy
+        self.world_from_splats = _matrix(props)
+        self.instance = _typed(props, "instance", int, 0)
+        if not 0 <= self.instance < 65536:
+            raise InputError(f"shape 'splats': 'instance' must be from 0 to 65535 (got {self.instance})")
+        self.dynamic = _typed(props, "dynamic", bool, self.instance > 0)
+        self.capture_light = _typed(props, "capture_light", str, "uniform" if self.instance else "scene")
+        if self.capture_light not in ("uniform", "scene"):
+            raise InputError(f"shape 'splats': 'capture_light' must be 'uniform' or 'scene' (got {self.capture_light!r})")
+        self.roughness = _typed(props, "roughness", float, 0.4)
+        if not 0 < self.roughness <= 1:
+            raise InputError(f"shape 'splats': 'roughness' must be in (0, 1] (got {self.roughness})")
+        self.specular = _typed(props, "specular", float, 0.0)
+        if not 0 <= self.specular <= 1:
+            raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
+
+    def to_string(self) -> str:
+        return f"SplatsShape[count = {len(self.splats)}, instance = {self.instance}, proxy = {self.proxy is not None}]"
+
+
+def _typed(props: mi.Properties, name: str, kind: type, default: Any) -> Any:
+    """A parameter of the stated type: ``props.get`` alone would accept a string for a number."""
+    if name not in props:
+        return default
+    value = props[name]
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        raise InputError(f"shape 'splats': {name!r} must be a {kind.__name__} (got {value!r})")
+    return value
+
+
+def _matrix(props: mi.Properties) -> np.ndarray:
+    if "to_world" not in props:
+        return np.eye(4)
+    matrix = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    gram = matrix[:3, :3].T @ matrix[:3, :3]
+    scale = np.trace(gram) / 3
+    if np.linalg.det(matrix[:3, :3]) <= 0 or np.abs(gram - scale * np.eye(3)).max() > 1e-4 * scale:
+        raise InputError("shape 'splats': 'to_world' must be a rotation, a translation and a uniform scale")
+    return matrix
+
+
+def _stamp(filename: str) -> tuple[Path, int]:
+    path = mi.file_resolver().resolve(filename)
+    path = Path(str(path)).resolve()
+    if not path.is_file():
+        raise InputError(f"shape 'splats': no such file: {path}")
+    return path, path.stat().st_mtime_ns
+
+
+@lru_cache(maxsize=64)
+def _load_splats(path: Path, _modified: int) -> Splats:
+    return Splats.load(path)
+
+
+@lru_cache(maxsize=64)
+def _load_mesh(path: Path, _modified: int) -> trimesh.Trimesh:
+    return trimesh.load_mesh(path, process=False)
+
+
+mi.register_shape("splats", lambda props: SplatsShape(props))

@@ -1,0 +1,353 @@
+"""From clouds of Gaussians to depth-sorted lists per image tile, all on the device.
+
+1. *Cull and bound* every Gaussian of every placement (one kernel): exact screen box of its cut-off ellipsoid.
+2. *Sort* the visible ones by depth; compute view records in that order (one kernel).
+3. *Pair* each with the tiles that its cut-off ellipse really meets, and sort the pairs by tile; the sort is stable, so
+   every tile's list stays in depth order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.plugins.gaussian import (
+    LOG2_E_HALF,
+    RECORD,
+    Cloud,
+    aligned,
+    conic_touches_rectangle,
+    ellipse_bounds,
+    evaluate_sh,
+    general_response,
+    project_gaussian,
+    rotation_axes,
+)
+from mitsplat.plugins.rays import View
+
+PLACEMENT = 32
+"""Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
+cloud's frame as a sum of two floats (3 + 3), padding. Two floats keep the difference exact far from the origin."""
+
+BOUNDS = 8
+"""Floats per visible Gaussian for pairing: u0, v0 and the cut-off conic about them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A cloud in the world.
+
+    Attributes:
+        cloud: Index of the cloud.
+        world_from_cloud: Rotation, translation and uniform scale, shape (4, 4).
+        instance: Instance id; 0 is the environment.
+    """
+
+    cloud: int
+    world_from_cloud: np.ndarray
+    instance: int
+
+
+@dataclass(frozen=True, eq=False)
+class CloudSet:
+    """Several clouds in one set of device arrays, so that one kernel serves every placement of a scene."""
+
+    counts: tuple[int, ...]
+    first: tuple[int, ...]
+    geometry: Any
+    scales: Any
+    sh: Any
+    sh_count: int
+    sh_stride: int
+
+
+def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
+    """Concatenate clouds on the device; SH are padded with zeros to the largest degree present."""
+    counts = tuple(c.count for c in clouds)
+    first = tuple(int(i) for i in np.concatenate([[0], np.cumsum(counts)[:-1]]))
+    if len(clouds) == 1:
+        (c,) = clouds
+        return CloudSet(counts, first, c.geometry, c.scales, c.sh, c.sh_count, c.sh_stride)
+    total = sum(counts)
+    stride = max(c.sh_stride for c in clouds)
+    geometry, scales = dr.empty(mi.Float, 8 * total), dr.empty(mi.Float, 4 * total)
+    sh = dr.zeros(mi.Float, stride * total)
+    for start, c in zip(first, clouds, strict=True):
+        for target, source, width in ((geometry, c.geometry, 8), (scales, c.scales, 4)):
+            dr.scatter(target, source, dr.arange(mi.UInt32, c.count * width) + start * width)
+        i = dr.arange(mi.UInt32, c.count * c.sh_stride)
+        dr.scatter(sh, c.sh, (i // c.sh_stride + start) * stride + i % c.sh_stride)
+    dr.eval(geometry, scales, sh)
+    return CloudSet(counts, first, geometry, scales, sh, max(c.sh_count for c in clouds), stride)
+
+
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """Depth-sorted Gaussians of every tile.
+
+    Attributes:
+        records: View records in depth order, see :data:`mitsplat.plugins.gaussian.RECORD`.
+        near: Coefficients of :func:`mitsplat.plugins.gaussian.general_response`, 16 floats each, of the Gaussians that
+            reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
+        entries: Record numbers, tile after tile.
+        start, stop: Range of each tile in ``entries``.
+        visible, pairs: Number of records and of entries.
+    """
+
+    records: Any
+    near: Any | None
+    entries: Any
+    start: Any
+    stop: Any
+    visible: int
+    pairs: int
+
+
+def bin_gaussians(
+    clouds: CloudSet, placements: Sequence[Placement], view: View, *, alpha_min: float, sh_degree: int
+) -> TileLists:
+    """Tile lists of all placements seen by one camera."""
+    tiles = view.tiles_x * view.tiles_y
+    table, owner, local = _placement_table(clouds, placements, view)
+    total = dr.width(local)
+    if total == 0:
+        return _empty(tiles)
+    source = _Source(clouds, table)
+    cut = dr.opaque(mi.Float, alpha_min)
+
+    depth, visible = source.cull(owner, local, view, cut)
+    index = dr.compress(visible)
+    count = dr.width(index)
+    if count == 0:
+        return _empty(tiles)
+    index = dr.gather(mi.UInt32, index, dr.argsort(dr.gather(mi.Float, depth, index)))
+    owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
+    dr.eval(owner, local)
+
+    records, near, bounds, box, candidates = source.records(owner, local, view, cut, sh_degree)
+    entries, start, stop = _pair(bounds, box, candidates, view, tiles)
+    return TileLists(records, near, entries, start, stop, count, dr.width(entries))
+
+
+def _empty(tiles: int) -> TileLists:
+    zeros = dr.zeros(mi.UInt32, tiles)
+    dr.eval(zeros)
+    return TileLists(dr.zeros(mi.Float, RECORD), None, dr.zeros(mi.UInt32, 1), zeros, zeros, 0, 0)
+
+
+def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
+    """Placement rows on the device, and for every Gaussian of every placement its row and its number in the clouds."""
+    rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
+    counts = [clouds.counts[p.cloud] for p in placements]
+    for row, placement in zip(rows, placements, strict=False):
+        matrix = np.asarray(placement.world_from_cloud, dtype=np.float64)
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+        camera_from_cloud = view.world_from_camera[:3, :3].T @ (matrix[:3, :3] / scale)
+        centre = np.linalg.solve(matrix[:3, :3], view.world_from_camera[:3, 3] - matrix[:3, 3])
+        coarse = centre.astype(np.float32)
+        row[:9] = camera_from_cloud.ravel()
+        row[9] = scale
+        row[10] = placement.instance
+        row[12:15] = coarse
+        row[16:19] = centre - coarse
+    total = int(sum(counts))
+    if len(placements) == 1:
+        local = dr.arange(mi.UInt32, total) + dr.opaque(mi.UInt32, clouds.first[placements[0].cloud])
+        return aligned(rows), dr.zeros(mi.UInt32, total), local
+    ends = np.cumsum(counts)
+    begins = ends - counts
+    number = dr.arange(mi.UInt32, total)
+    owner = dr.zeros(mi.UInt32, total)
+    shift = np.array([clouds.first[p.cloud] for p in placements], dtype=np.int64) - begins
+    marks = dr.zeros(mi.UInt32, total)
+    inner = [int(b) for b, n in zip(begins, counts, strict=True) if 0 < b < total and n]
+    if inner:
+        # Placements without Gaussians share a start with the next one: count each start as often as it occurs.
+        starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
+        dr.scatter(marks, mi.UInt32(repeats.astype(np.uint32)), mi.UInt32(starts.astype(np.uint32)))
+        owner = dr.cumsum(marks)
+    offsets = mi.Int32(shift.astype(np.int32))
+    local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, offsets, owner))
+    dr.eval(owner, local)
+    return aligned(rows), owner, local
+
+
+class _Source:
+    """Gaussians of placements as the projection kernels read them."""
+
+    def __init__(self, clouds: CloudSet, table: Any) -> None:
+        self.clouds, self.table = clouds, table
+
+    def load(self, owner: Any, local: Any) -> dict[str, Any]:
+        row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PLACEMENT, dr.width(owner)))
+        packet = dr.gather(mi.ArrayXf, self.clouds.geometry, local, shape=(8, dr.width(local)))
+        sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, shape=(4, dr.width(local)))
+        mean = mi.Vector3f(*[packet[i] - row[12 + i] - row[16 + i] for i in range(3)])
+        return {
+            "mean": mean,
+            "axes": rotation_axes([packet[4 + i] for i in range(4)]),
+            "sigma": [sigma[i] for i in range(3)],
+            "right": mi.Vector3f(row[0], row[1], row[2]),
+            "down": mi.Vector3f(row[3], row[4], row[5]),
+            "forward": mi.Vector3f(row[6], row[7], row[8]),
+            "scale": row[9],
+        } | {"opacity": packet[3], "instance": row[10]}
+
+    def bounds(self, g: dict[str, Any], view: View, cut: Any) -> tuple[Any, ...]:
+        """Response, squared cut-off, whether the plane z = 0 is near, visibility and slope box of Gaussians."""
+        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
+        k2 = 2 * dr.log(g["opacity"] / cut)
+        k = dr.safe_sqrt(k2)
+        reach = [
+            g["scale"] * k * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(g["axes"], g["sigma"], strict=True)]))
+            for v in (g["right"], g["down"], g["forward"])
+        ]
+        centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
+        response = project_gaussian(**shape)
+        du0, du1, dv0, dv1, ellipse = ellipse_bounds(response.cutoff(k2))
+        near = ~ellipse | (centre[2] - reach[2] < view.near_plane)
+        farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
+
+        # Slopes of the part of the ellipsoid's box beyond the near plane: loose, but only few Gaussians need it.
+        def slopes(axis: int) -> tuple[Any, Any]:
+            lo, hi = centre[axis] - reach[axis], centre[axis] + reach[axis]
+            return (
+                lo / dr.select(lo < 0, view.near_plane, farthest),
+                hi / dr.select(hi > 0, view.near_plane, farthest),
+            )
+
+        (near_u0, near_u1), (near_v0, near_v1) = slopes(0), slopes(1)
+        box = (
+            dr.select(near, near_u0, response.u0 + du0),
+            dr.select(near, near_u1, response.u0 + du1),
+            dr.select(near, near_v0, response.v0 + dv0),
+            dr.select(near, near_v1, response.v0 + dv1),
+        )
+        visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
+        return response, k2, near, visible, box
+
+    def cull(self, owner: Any, local: Any, view: View, cut: Any) -> tuple[Any, Any]:
+        g = self.load(owner, local)
+        response, _, _, visible, box = self.bounds(g, view, cut)
+        x0, x1, y0, y1 = view.tile_box(*box)
+        visible &= (x1 > x0) & (y1 > y0)
+        # Depth first as the sort key; Gaussians behind the camera that still reach in front of it come first.
+        depth = dr.maximum(response.depth, 0.0)
+        dr.eval(depth, visible)
+        return depth, visible
+
+    def records(self, owner: Any, local: Any, view: View, cut: Any, sh_degree: int) -> tuple[Any, ...]:
+        count = dr.width(local)
+        g = self.load(owner, local)
+        response, k2, near, _, box = self.bounds(g, view, cut)
+        colour = self.colour(g["mean"], local, sh_degree)
+        order = dr.arange(mi.UInt32, count)
+        near_rows = None
+        near_index = dr.compress(near)
+        near_number = dr.zeros(mi.UInt32, count)
+        conic = response.cutoff(k2)
+        u0, v0 = response.u0, response.v0
+        if dr.width(near_index) > 0:
+            near_rows, near_cut = self.near_rows(near_index, owner, local, cut)
+            dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
+            u0, v0 = dr.select(near, 0.0, u0), dr.select(near, 0.0, v0)
+            row = dr.gather(mi.ArrayXf, near_cut, near_number, near, shape=(8, count))
+            conic = tuple(dr.select(near, row[i], c) for i, c in enumerate(conic))  # type: ignore[assignment]
+        scaled = LOG2_E_HALF
+        record = [
+            dr.select(near, mi.Float(near_number), response.u0),
+            response.v0,
+            dr.select(near, -1.0, response.a * scaled),
+            response.b2 * scaled,
+            response.c * scaled,
+            dr.log2(g["opacity"]),
+            *colour,
+            response.depth,
+            response.e,
+            response.f,
+            response.g,
+            response.h,
+            response.i,
+            g["instance"],
+        ]
+        records, bounds = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, BOUNDS * count)
+        dr.scatter(records, mi.ArrayXf(record), order)
+        dr.scatter(bounds, mi.ArrayXf([u0, v0, *conic]), order)
+        x0, x1, y0, y1 = view.tile_box(*box)
+        candidates = (x1 - x0) * (y1 - y0)
+        tile_box = dr.empty(mi.UInt32, 4 * count)
+        dr.scatter(tile_box, mi.ArrayXu([x0, y0, x1 - x0, y1 - y0]), order)
+        dr.eval(records, bounds, tile_box, candidates)
+        return records, near_rows, bounds, tile_box, candidates
+
+    def near_rows(self, index: Any, owner: Any, local: Any, cut: Any) -> tuple[Any, Any]:
+        """General responses of Gaussians at the camera's plane, and their cut-off conics padded to 8 floats."""
+        count = dr.width(index)
+        g = self.load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
+        k2 = 2 * dr.log(g.pop("opacity") / cut)
+        g.pop("instance")
+        c = general_response(**g)
+        rows, cuts = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, 8 * count)
+        order = dr.arange(mi.UInt32, count)
+        zero = dr.zeros(mi.Float, count)
+        dr.scatter(rows, mi.ArrayXf([*[x * LOG2_E_HALF for x in c[:6]], *c[6:], zero]), order)
+        dr.scatter(cuts, mi.ArrayXf([*[n - k2 * d for n, d in zip(c[:6], c[6:12], strict=True)], zero, zero]), order)
+        dr.eval(rows, cuts)
+        return rows, cuts
+
+    def colour(self, mean: Any, local: Any, sh_degree: int) -> list[Any]:
+        clouds = self.clouds
+        bands = min(clouds.sh_count, (sh_degree + 1) ** 2)
+        floats = -(-3 * bands // 4) * 4
+        base = local * (clouds.sh_stride // 4)
+        packets = [
+            dr.gather(mi.Array4f, clouds.sh, base + j) for j in range(floats // 4)
+        ]
+
+        def coefficient(k: int) -> list[Any]:
+            return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]
+
+        return evaluate_sh(dr.normalize(mean), coefficient, bands)
+
+
+def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tuple[Any, Any, Any]:
+    """Sorted (tile, Gaussian) pairs: record number per entry, and each tile's range."""
+    count = dr.width(candidates)
+    offset = dr.prefix_sum(candidates)
+    total = int((dr.gather(mi.UInt32, offset, count - 1) + dr.gather(mi.UInt32, candidates, count - 1))[0])
+    marks = dr.zeros(mi.UInt32, total)
+    dr.scatter(marks, mi.UInt32(1), offset, offset > 0)
+    rank = dr.cumsum(marks)
+    cell = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, offset, rank)
+    x0, y0, width, _ = dr.gather(mi.ArrayXu, box, rank, shape=(4, total))
+    # Lanes past the end of the arrays compute too, on zeros: an integer division by zero would end the process.
+    row = cell // dr.maximum(width, 1)
+    tile = (y0 + row) * view.tiles_x + x0 + (cell - row * width)
+    u0, v0, *conic = dr.gather(mi.ArrayXf, bounds, rank, shape=(BOUNDS, total))
+    lo_u, hi_u, lo_v, hi_v = view.tile_slopes(tile)
+    meets = conic_touches_rectangle(tuple(conic), lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
+    dr.eval(tile, rank, meets)
+    kept = dr.compress(meets)
+    pairs = dr.width(kept)
+    start, stop = dr.zeros(mi.UInt32, tiles), dr.zeros(mi.UInt32, tiles)
+    if pairs == 0:
+        dr.eval(start, stop)
+        return dr.zeros(mi.UInt32, 1), start, stop
+    tile, rank = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, rank, kept)
+    dr.eval(tile, rank)
+    order = dr.argsort(tile)
+    tile, entries = dr.gather(mi.UInt32, tile, order), dr.gather(mi.UInt32, rank, order)
+    dr.eval(tile, entries)
+    i = dr.arange(mi.UInt32, pairs)
+    last = pairs - 1
+    first_of_tile = (i == 0) | (tile != dr.gather(mi.UInt32, tile, dr.maximum(i, 1) - 1))
+    last_of_tile = (i == last) | (tile != dr.gather(mi.UInt32, tile, dr.minimum(i + 1, last)))
+    dr.scatter(start, i, tile, first_of_tile)
+    dr.scatter(stop, i + 1, tile, last_of_tile)
+    dr.eval(start, stop)
+    return entries, start, stop

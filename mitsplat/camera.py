@@ -156,8 +156,8 @@ class Camera:
         import cv2
 
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-        undistorted = cv2.undistortPointsIter(
-            slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), np.eye(3), np.eye(3), criteria
+        undistorted = cv2.undistortPoints(
+            slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria
         )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 

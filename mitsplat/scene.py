@@ -6,8 +6,10 @@ adding one never shifts another, and any worker may plan any frame in any order.
 
 from __future__ import annotations
 
+import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +19,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.assets import Asset
+from mitsplat.assets import Asset, read_mesh
 from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.spec import (
@@ -149,22 +151,23 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
     folder = path.parent
     for position, light in enumerate(spec.lights):
         if isinstance(light, EnvironmentLight) and light.image is not None and not (folder / light.image).is_file():
-            place = key_place(path, ("lights", position, "image"))
-            raise InputError(f"{place}: must be an image file (got {light.image})")
-    loaded: dict[tuple[str, float], Asset] = {}
-    assets = []
-    for position, entry in enumerate(spec.objects):
-        key = (entry.asset, entry.scale)
-        if key not in loaded:
-            loaded[key] = _scaled(Asset.load(folder / entry.asset), entry.scale)
-            _check_fit(loaded[key], spec.region, key_place(path, ("objects", position, "asset")))
-        assets.append(replace(loaded[key], class_name=entry.class_name or loaded[key].class_name))
+            with _blaming(path, "lights", position, "image"):
+                raise InputError(f"{folder / light.image}: no such file")
+    environment = None
+    if spec.environment is not None:
+        with _blaming(path, "environment"):
+            environment = Asset.load(folder / spec.environment)
+    assets = _load_objects(spec, path)
+    shape_meshes = []
+    for position, shape in enumerate(spec.shapes):
+        with _blaming(path, "shapes", position, "mesh"):
+            shape_meshes.append(_shape_mesh(shape, folder))
     return Scene(
         spec=spec,
         path=path,
-        environment=None if spec.environment is None else Asset.load(folder / spec.environment),
-        assets=tuple(assets),
-        shape_meshes=tuple(_shape_mesh(shape, path, position) for position, shape in enumerate(spec.shapes)),
+        environment=environment,
+        assets=assets,
+        shape_meshes=tuple(shape_meshes),
         class_names=tuple(sorted({asset.class_name for asset in assets})),
     )
 
@@ -186,7 +189,7 @@ def plan_frame(scene: Scene, index: int) -> FramePlan:
         index=index,
         layout=layout,
         view=view,
-        split=_split(layout, spec.output),
+        split=_split(layout, spec.output.validation),
         camera=_camera(spec, view, index),
         lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
         draws={
@@ -224,61 +227,63 @@ def _enclosure_walls(enclosure: Enclosure, region: Region) -> list[Shape]:
     return walls
 
 
-def _scaled(asset: Asset, scale: float) -> Asset:
-    """The asset made larger by ``scale`` about its origin, of the same density."""
-    if scale == 1.0:
-        return asset
-    matrix = np.diag([scale, scale, scale, 1.0])
-    return replace(
-        asset,
-        splats=asset.splats.transformed(matrix),
-        mesh=None if asset.mesh is None else asset.mesh.copy().apply_transform(matrix),
-        pieces=tuple(piece.copy().apply_transform(matrix) for piece in asset.pieces),
-        mass=None if asset.mass is None else asset.mass * scale**3,
-    )
+@contextmanager
+def _blaming(path: Path, *keys: str | int) -> Iterator[None]:
+    """Begin the sentence of an InputError with the key of the scene file that led to it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{key_place(path, keys)}: {error}") from error
 
 
-def _check_fit(asset: Asset, region: Region, place: str) -> None:
-    """Refuse an object that physics cannot move, or that could not lie in the region on any side."""
+def _load_objects(spec: SceneSpec, path: Path) -> tuple[Asset, ...]:
+    """Asset of each entry; entries that differ in nothing but count and class share its arrays."""
+    loaded: dict[tuple[str, float], Asset] = {}
+    assets = []
+    for position, entry in enumerate(spec.objects):
+        key = (entry.asset, entry.scale)
+        if key not in loaded:
+            with _blaming(path, "objects", position, "asset"):
+                asset = Asset.load(path.parent / entry.asset)
+                loaded[key] = asset if entry.scale == 1.0 else asset.scaled(entry.scale)
+                _check_fit(loaded[key], spec.region)
+        assets.append(replace(loaded[key], class_name=entry.class_name or loaded[key].class_name))
+    return tuple(assets)
+
+
+def _check_fit(asset: Asset, region: Region) -> None:
+    """Refuse an object that physics cannot move, or that could not lie in the region on its largest side."""
     if asset.mesh is None:
-        raise InputError(f"{place}: asset {asset.name!r} must have a mesh to be dropped")
+        raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
     footprint = np.sort(asset.mesh.extents)[1:]
     space = np.sort(np.subtract(region.max, region.min)[:2])
     if (footprint > space).any():
         raise InputError(
-            f"{place}: asset {asset.name!r} must fit into the region of {space[0]:g} x {space[1]:g} m "
+            f"asset {asset.name!r} must fit into the region of {space[0]:.3g} x {space[1]:.3g} m "
             f"(it measures {footprint[0]:.3g} x {footprint[1]:.3g} m)"
         )
 
 
-def _shape_mesh(shape: Shape, path: Path, position: int) -> trimesh.Trimesh:
+def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
     """The shape in world space."""
-    if shape.box is not None:
-        transform = np.eye(4)
-        transform[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
-        transform[:3, 3] = shape.box.position
-        box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
-        return box
-    file = path.parent / str(shape.mesh)
-    place = key_place(path, ("shapes", position, "mesh"))
-    if not file.is_file():
-        raise InputError(f"{place}: must be a mesh file (got {shape.mesh})")
-    try:
-        mesh = trimesh.load_mesh(file)
-    except (ValueError, IndexError, KeyError, NotImplementedError) as error:  # what trimesh's readers raise
-        raise InputError(f"{place}: {shape.mesh} cannot be read as a mesh ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{place}: {shape.mesh} must contain triangles")
-    return mesh
+    if shape.box is None:
+        return read_mesh(folder / str(shape.mesh))
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
+    transform[:3, 3] = shape.box.position
+    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
+    return box
 
 
-def _split(layout: int, output: Output) -> Literal["train", "val"]:
-    """Validation layouts are spread evenly; both splits get one where two layouts or more are to be shared."""
-    count = round(output.layouts * output.validation)
-    if output.layouts > 1 and 0 < output.validation < 1:
-        count = min(max(count, 1), output.layouts - 1)
-    chosen = (layout + 1) * count // output.layouts > layout * count // output.layouts
-    return "val" if chosen else "train"
+def _split(layout: int, validation: float) -> Literal["train", "val"]:
+    """Split of a layout, the same however many follow it: the second layout is the first for validation.
+
+    Among the first n >= 2 layouts, floor(1 + (n - 2) ``validation``) are for validation.
+    """
+    if validation == 1.0:
+        return "val"
+    before, after = (max(0, math.floor(1.0 + (count - 2) * validation)) for count in (layout, layout + 1))
+    return "val" if after > before else "train"
 
 
 def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> LightSpec:

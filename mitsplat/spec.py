@@ -321,7 +321,7 @@ class Output(StrictModel):
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")
     jpeg_quality: int = Field(95, ge=1, le=100, description="Quality of jpg images.")
     validation: Unit = Field(
-        0.2, description="Share of layouts for validation; between 0 and 1, two layouts or more fill both splits."
+        0.2, description="Share of layouts for validation; the second layout is the first of them."
     )
     min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels are not labelled.")
     min_fragment: int = Field(8, ge=1, description="Connected parts with fewer pixels are dropped from a mask.")

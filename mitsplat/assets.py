@@ -1,14 +1,95 @@
-"""Assets on disk: one object or one environment, as splats with an aligned proxy mesh."""
+"""Assets on disk: one object or one environment, as splats with an aligned proxy mesh.
+
+A folder holds ``asset.yaml`` (:class:`AssetSpec` lists its keys) and the files that it names::
+
+    name: hammer
+    class: hammer
+    splats: hammer.splat    # any format of mitsplat.formats
+    mesh: hull              # or a mesh file in the same units and axes
+    up: -y                  # axis of the files that points up
+    size: 0.2               # longest extent [m]; or units: metres per file unit
+    mass: 0.5
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+import numpy as np
+import numpy.typing as npt
 import trimesh
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from ruamel.yaml import YAML
+from scipy.spatial import QhullError
 
-from mitsplat.splats import Splats
+from mitsplat.errors import InputError
+from mitsplat.splats import FloatArray, Splats
+from mitsplat.yaml_input import FieldError, key_place, load_yaml
+
+Positive = Annotated[float, Field(gt=0)]
+
+_FILE = "asset.yaml"
+_Z_UP_FROM = {
+    "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+}
+"""The smallest rotation that takes each axis to +z."""
+
+_SPZ_UNITS = 1e-3
+"""Metres per unit of ``.spz`` assets: the format holds no scale below 4.5e-5 units, a coarse 45 um in metres."""
+
+_MESH_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, RuntimeError),
+    *(MemoryError, EOFError, ImportError, struct.error),
+)
+"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish."""
+
+_OPAQUE = 0.5
+_OFF_BY = 0.05
+"""Share of an asset's size by which its splats, mesh and pieces may differ unnoticed."""
+
+
+class AssetSpec(BaseModel):
+    """Keys of ``asset.yaml``. Files are inside its folder and share units and axes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+    name: str = Field(min_length=1, description="Name of the asset, unique in a scene.")
+    class_name: str | None = Field(None, alias="class", min_length=1, description="Class to learn; else the name.")
+    kind: Literal["object", "environment"] = "object"
+    splats: str = Field(description="Splat file.")
+    mesh: str | None = Field(None, description="Mesh file, or 'hull': the convex hull of the opaque splats.")
+    pieces: str | None = Field(None, description="Mesh file whose connected parts are convex pieces of the mesh.")
+    units: Positive | None = Field(
+        None, description="Metres per unit of the files; 1 if neither this nor size is given."
+    )
+    size: Positive | None = Field(None, description="Longest extent [m], instead of units.")
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field("z", description="Axis of the files that points up.")
+    density: Positive | None = Field(None, description="[kg/m^3]; 1000 if neither this nor mass is given.")
+    mass: Positive | None = Field(None, description="[kg], instead of density.")
+    friction: float = Field(0.5, ge=0, description="Coulomb friction coefficient.")
+    roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of the highlight.")
+    specular: float = Field(0.04, ge=0, le=1, description="Specular reflectance at normal incidence.")
+    capture_light: Literal["uniform", "scene"] = "uniform"
+
+    @model_validator(mode="after")
+    def _check(self) -> AssetSpec:
+        if self.units is not None and self.size is not None:
+            raise FieldError("size", "must not be given together with units")
+        if self.mass is not None and self.density is not None:
+            raise FieldError("mass", "must not be given together with density")
+        if self.kind == "object" and self.mesh is None:
+            raise FieldError("mesh", "an object needs a mesh: a file, or 'hull' for the convex hull of its splats")
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,3 +126,214 @@ class Asset:
     specular: float = 0.04
     capture_light: Literal["uniform", "scene"] = "uniform"
     folder: Path | None = field(default=None, repr=False)
+
+    @classmethod
+    def load(cls, folder: str | PathLike[str]) -> Asset:
+        """Read an asset folder, converted to metres and z up.
+
+        Raises:
+            InputError: If ``asset.yaml`` or a file that it names is missing or breaks a rule.
+        """
+        folder = Path(folder)
+        spec = load_yaml(folder / _FILE, AssetSpec)
+        splats = Splats.load(_file_inside(folder, "splats", spec.splats))
+        if spec.mesh is None:
+            mesh = None
+        elif spec.mesh == "hull":
+            mesh = _hull(_opaque_core(splats), key_place(folder / _FILE, ("mesh",)))
+        else:
+            mesh = read_mesh(_file_inside(folder, "mesh", spec.mesh))
+        asset = cls(
+            name=spec.name,
+            class_name=spec.class_name or spec.name,
+            splats=splats,
+            mesh=mesh,
+            pieces=() if spec.pieces is None else _read_pieces(_file_inside(folder, "pieces", spec.pieces)),
+            kind=spec.kind,
+            density=1000.0 if spec.density is None else spec.density,
+            mass=spec.mass,
+            friction=spec.friction,
+            roughness=spec.roughness,
+            specular=spec.specular,
+            capture_light=spec.capture_light,
+            folder=folder,
+        )
+        metres_from_file = np.eye(4)
+        metres_from_file[:3, :3] = np.multiply(_Z_UP_FROM[spec.up], _metres_per_unit(spec, asset))
+        return asset if np.array_equal(metres_from_file, np.eye(4)) else asset.transformed(metres_from_file)
+
+    def save(self, folder: str | PathLike[str], *, splats: str = "splats.ply") -> None:
+        """Write the asset as a folder: ``asset.yaml``, splats, ``mesh.ply`` and ``pieces.ply`` (shapes only, float32).
+
+        Args:
+            folder: Made if need be; files of these names in it are replaced.
+            splats: Name of the splat file; its suffix is the format (``.ply``, ``.splat`` or ``.spz``).
+
+        Raises:
+            InputError: If a value breaks a rule of :class:`AssetSpec` or the folder cannot be written.
+        """
+        folder = Path(folder)
+        units = _SPZ_UNITS if splats.lower().endswith(".spz") else 1.0
+        try:
+            spec = AssetSpec(
+                name=self.name,
+                class_name=self.class_name,
+                kind=self.kind,
+                splats=splats,
+                mesh=None if self.mesh is None else "mesh.ply",
+                pieces="pieces.ply" if self.pieces else None,
+                units=units,
+                density=self.density if self.mass is None else None,
+                mass=self.mass,
+                friction=self.friction,
+                roughness=self.roughness,
+                specular=self.specular,
+                capture_light=self.capture_light,
+            )
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"]) or self.kind
+            raise InputError(f"asset {self.name!r} cannot be saved: {key}: {first['msg']}") from error
+        stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            stored.splats.save(folder / splats)
+            if stored.mesh is not None:
+                _joined([stored.mesh]).export(folder / "mesh.ply")
+            if stored.pieces:
+                _joined(stored.pieces).export(folder / "pieces.ply")
+            # Last, so that an interrupted save is not mistaken for an asset.
+            YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), folder / _FILE)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+
+    def transformed(self, matrix: npt.ArrayLike) -> Asset:
+        """The asset's splats, mesh and pieces after a similarity transform (4, 4); mass and density stay.
+
+        Raises:
+            ValueError: If the matrix shears, mirrors or scales unevenly.
+        """
+        matrix = np.asarray(matrix, dtype=np.float64)
+        return replace(
+            self,
+            splats=self.splats.transformed(matrix),
+            mesh=None if self.mesh is None else self.mesh.copy().apply_transform(matrix),
+            pieces=tuple(piece.copy().apply_transform(matrix) for piece in self.pieces),
+        )
+
+    def scaled(self, factor: float) -> Asset:
+        """The asset made larger about its origin, of the same density: a given mass grows with the volume.
+
+        Raises:
+            ValueError: If ``factor`` is not finite and > 0.
+        """
+        if not 0 < factor < np.inf:
+            raise ValueError(f"scale factor must be finite and > 0 (got {factor})")
+        larger = self.transformed(np.diag([factor, factor, factor, 1.0]))
+        return larger if self.mass is None else replace(larger, mass=self.mass * factor**3)
+
+    def check(self) -> tuple[str, ...]:
+        """What is questionable about the asset, a sentence each; nothing of it prevents its use."""
+        if self.mesh is None:
+            return ()
+        findings = []
+        if not self.mesh.is_watertight:
+            findings.append("the mesh is not watertight: mass and inertia come from its convex pieces")
+        size = float(self.mesh.extents.max())
+        bounds = {"pieces": [piece.bounds for piece in self.pieces]}
+        core = _opaque_core(self.splats)
+        bounds["splats"] = [np.stack([core.min(axis=0), core.max(axis=0)])] if len(core) else []
+        for what, boxes in bounds.items():
+            if boxes:
+                joint = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+                offset = float(np.abs(joint - self.mesh.bounds).max())
+                if offset > _OFF_BY * size:
+                    findings.append(f"the bounds of {what} and mesh differ by {offset:.3g} m on {size:.3g} m")
+        return tuple(findings)
+
+
+def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
+    """Read any mesh file that trimesh knows; several parts become one mesh.
+
+    Args:
+        path: The file.
+        merge: Whether vertices at the same place become one, without which an STL is never watertight.
+
+    Raises:
+        InputError: If the file is missing or damaged, or has no triangles or a vertex that is not finite.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(path, process=merge)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except _MESH_ERRORS as error:
+        raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: a mesh must have triangles (got none)")
+    if not np.isfinite(mesh.vertices).all():
+        row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
+        raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
+    return mesh
+
+
+def _file_inside(folder: Path, key: str, name: str) -> Path:
+    """The named file, which must be in ``folder`` also after links and ``..`` are followed."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{key_place(folder / _FILE, (key,))}: must be a file inside the asset's folder (got {name})")
+    if not path.is_file():
+        raise InputError(f"{key_place(folder / _FILE, (key,))}: no such file (got {name})")
+    return path
+
+
+def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:
+    """Scale of an asset that is still in the units of its files."""
+    if spec.size is None:
+        return 1.0 if spec.units is None else spec.units
+    points = _opaque_core(asset.splats) if asset.mesh is None else asset.mesh.vertices
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if not extent > 0:
+        raise InputError(
+            f"{asset.folder}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent (got 0)"
+        )
+    return spec.size / extent
+
+
+def _opaque_core(splats: Splats) -> FloatArray:
+    """Centres (M, 3) of opaque Gaussians, less the floaters: those far outside the bulk of 98 % along an axis."""
+    centres = splats.means[splats.opacities > _OPAQUE]
+    if not len(centres):
+        return centres
+    low, high = np.percentile(centres, (1, 99), axis=0)
+    margin = 0.25 * (high - low)
+    inside = ((centres >= low - margin) & (centres <= high + margin)).all(axis=1)
+    core: FloatArray = centres[inside]
+    return core
+
+
+def _hull(points: npt.NDArray[np.floating], place: str) -> trimesh.Trimesh:
+    """Convex hull of points (N, 3); ``place`` begins the error when they span no volume."""
+    try:
+        hull: trimesh.Trimesh = trimesh.convex.convex_hull(points)
+    except (QhullError, ValueError) as error:
+        raise InputError(f"{place}: a hull needs points that span a volume (got {len(points)} points)") from error
+    return hull
+
+
+def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...]:
+    """Convex hulls of the connected parts of a mesh."""
+    parts = read_mesh(path, merge=False).split(only_watertight=False, repair=False)
+    return tuple(_hull(part.vertices, str(path)) for part in parts)
+
+
+def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """The triangles of all meshes, without colours or textures, and without welding one to another."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return trimesh.Trimesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+        process=False,
+    )

@@ -138,8 +138,8 @@ def _decode_ply(data: bytes) -> Splats:
         return Splats(
             means=_columns(rows, _MEANS),
             quats=_columns(rows, _QUATS),
-            scales=np.exp(_columns(rows, _SCALES).astype(np.float64)),
-            opacities=expit(rows["opacity"].astype(np.float64)),
+            scales=np.exp(_columns(rows, _SCALES).astype(np.float64)).astype(np.float32),
+            opacities=expit(rows["opacity"].astype(np.float64)).astype(np.float32),
             sh=np.concatenate([_columns(rows, _COLOUR)[:, None], higher], axis=1),
         )
 
@@ -193,8 +193,8 @@ def _vertex_rows(
     words = data[start:].split(maxsplit=count * width)[: count * width]
     if len(words) < count * width:
         raise InputError(f"the header promises {count} Gaussians of {width} numbers (got {len(words)} numbers)")
-    table = np.array(words, dtype=np.bytes_).astype(np.float64).reshape(count, width)
-    return np.rec.fromarrays(list(table.T), names=list(row.names or ()))
+    numbers = np.array(words, dtype=np.bytes_).astype(np.float64)
+    return numbers.view([(name, np.float64) for name in row.names or ()])
 
 
 def _columns(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> FloatArray:
@@ -235,13 +235,13 @@ def _decode_splat(data: bytes) -> Splats:
     if len(data) % _SPLAT_ROW.itemsize:
         raise InputError(f"a .splat file must hold {_SPLAT_ROW.itemsize} bytes per Gaussian (got {len(data)} bytes)")
     rows = np.frombuffer(data, _SPLAT_ROW)
-    rgba = rows["rgba"] / 255.0
+    rgba = rows["rgba"].astype(np.float32) / 255.0
     return Splats(
         means=rows["mean"],
-        quats=(rows["quat"][:, [1, 2, 3, 0]] - 128.0) / 128.0,
+        quats=rows["quat"][:, [1, 2, 3, 0]].astype(np.float32) - 128.0,  # normalised by Splats
         scales=rows["scale"],
         opacities=rgba[:, 3],
-        sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
+        sh=(rgba[:, None, :3] - 0.5) / SH_C0,
     )
 
 

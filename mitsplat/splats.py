@@ -154,9 +154,9 @@ class Splats:
         turn = Rotation.from_matrix(rotation)
         sh = np.tensordot(self.sh, sh_rotation(rotation, self.sh_degree).astype(np.float32), axes=([1], [1]))
         return Splats(
-            means=self.means.astype(np.float64) @ (scale * rotation).T + translation,
+            means=(self.means.astype(np.float64) @ (scale * rotation).T + translation).astype(np.float32),
             quats=(turn * Rotation.from_quat(self.quats)).as_quat() if len(self) else self.quats,
-            scales=self.scales.astype(np.float64) * scale,
+            scales=(self.scales.astype(np.float64) * scale).astype(np.float32),
             opacities=self.opacities,
             sh=sh.transpose(0, 2, 1),
         )
@@ -229,7 +229,8 @@ def evaluate_sh(sh: npt.ArrayLike, directions: npt.ArrayLike) -> npt.NDArray[np.
     """
     coefficients = np.asarray(sh, dtype=np.float64)
     basis = sh_basis(directions, int(np.sqrt(coefficients.shape[-2])) - 1)
-    return np.maximum(0.0, 0.5 + np.einsum("...k,...kc->...c", basis, coefficients))
+    colours: npt.NDArray[np.float64] = np.maximum(0.0, 0.5 + np.einsum("...k,...kc->...c", basis, coefficients))
+    return colours
 
 
 def sh_rotation(rotation: npt.ArrayLike, degree: int) -> npt.NDArray[np.float64]:

@@ -196,9 +196,9 @@ def outline(mask: BoolArray) -> FloatArray:
     resampled along the edges and truncated to pixels; ``cv2.fillPoly`` (even-odd, edges painted). Therefore
 
     * vertices are the *centres* of the mask's border pixels and edges run in the eight directions of the grid: at the
-      image's own size every point of an edge truncates to a pixel of the mask, so the mask comes back exactly, and
-      when scaled down no side gains more than half a pixel (vertices on the border pixels' outer edges gain as much
-      or more at every scale);
+      image's own size vertices and edges truncate to pixels of the mask, so the mask comes back exactly (but for a
+      pixel where a resampled point meets the middle of a diagonal step), and when scaled down no side gains more than
+      half a pixel; vertices on the border pixels' outer edges gain as much or more at every scale;
     * holes and separate parts hang on bridges walked there and back. A bridge to a hole runs inside the mask; a
       bridge between parts paints the pixels of the gap, so the bridges are a minimum spanning tree;
     * at its four extremes the polygon reaches out to the pixels' outer edges by spikes without area: the box that

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,7 +21,7 @@ Model = TypeVar("Model", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
-"""Deeper nesting is an alias that contains itself."""
+"""What nests deeper is hostile, or an alias that contains itself."""
 
 RULES = {
     "missing": "is required",
@@ -91,8 +91,7 @@ def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, A
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         findings = [_finding(details, model, data, tree, overridden) for details in error.errors()]
-    # A misspelt key also leaves its proper name missing: tell the cause, not the consequence.
-    first = min(findings, key=lambda finding: (finding.missing, finding.line or 0))
+    first = min(findings, key=lambda finding: (_follows(finding, findings), finding.line or 0))
     raise InputError(_sentence(path, first.line, first.path, first.rule))
 
 
@@ -122,7 +121,9 @@ def _parse(path: Path) -> CommentedMap:
         mark = error.problem_mark or error.context_mark
         raise InputError(_sentence(path, mark.line + 1 if mark else None, (), f"not YAML: {error.problem}")) from None
     except (YAMLError, ValueError) as error:  # ValueError: a date or number that cannot be
-        raise InputError(_sentence(path, None, (), f"not YAML: {str(error).splitlines()[0]}")) from None
+        raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
+    except RecursionError:
+        raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels") from None
     if not isinstance(tree, CommentedMap):
         raise InputError(f"{path}: must be a mapping of keys to values (got {_shown(tree)})")
     return tree
@@ -131,7 +132,7 @@ def _parse(path: Path) -> CommentedMap:
 def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path) -> Any:
     """The node as built-in dicts, lists and scalars; refuses what JSON cannot hold."""
     if len(keys) > MAX_DEPTH:
-        raise InputError(_sentence(path, _line(tree, keys), keys[:1], f"must not nest deeper than {MAX_DEPTH} levels"))
+        raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels")
     tag = getattr(node, "tag", None)
     if isinstance(node, TaggedScalar) or (tag is not None and tag.value is not None):
         raise InputError(_sentence(path, _line(tree, keys), keys, f"must not have a YAML tag (got {tag})"))
@@ -190,7 +191,16 @@ def _finding(
         rule = f"{rule.replace('Input should', 'must')} (got {_shown(value)})"
     overlaps = [min(len(keys), len(override)) for override in overridden]
     from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))
-    return _Finding(keys, rule, _line(tree, keys) if from_file else None, kind == "missing")
+    return _Finding(
+        keys, rule, _line(tree, keys) if from_file else None, kind == "missing" and isinstance(location[-1], str)
+    )
+
+
+def _follows(finding: _Finding, findings: Sequence[_Finding]) -> bool:
+    """Whether it may be the mere consequence of another: a misspelt key, or an item too few for a bad one in a list."""
+    return finding.missing or any(
+        len(finding.path) < len(other.path) and other.path[: len(finding.path)] == finding.path for other in findings
+    )
 
 
 def _file_path(location: KeyPath, data: Any, *, keep_last: bool) -> KeyPath:

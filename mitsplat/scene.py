@@ -276,14 +276,13 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
 
 
 def _split(layout: int, validation: float) -> Literal["train", "val"]:
-    """Split of a layout, the same however many follow it: the second layout is the first for validation.
+    """Split of a layout, the same however many follow it: the second layout is the first of the smaller split.
 
-    Among the first n >= 2 layouts, floor(1 + (n - 2) ``validation``) are for validation.
+    Among the first n layouts, floor(1 + (n - 2) share) belong to the smaller split.
     """
-    if validation == 1.0:
-        return "val"
-    before, after = (max(0, math.floor(1.0 + (count - 2) * validation)) for count in (layout, layout + 1))
-    return "val" if after > before else "train"
+    share = min(validation, 1.0 - validation)
+    before, after = (math.floor(1.0 + (count - 2) * share) for count in (layout, layout + 1))
+    return "val" if (after > before) == (validation <= 0.5) else "train"
 
 
 def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> LightSpec:

@@ -321,7 +321,7 @@ class Output(StrictModel):
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")
     jpeg_quality: int = Field(95, ge=1, le=100, description="Quality of jpg images.")
     validation: Unit = Field(
-        0.2, description="Share of layouts for validation; the second layout is the first of them."
+        0.2, description="Share of layouts for validation; the second layout is the first of the smaller split."
     )
     min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels are not labelled.")
     min_fragment: int = Field(8, ge=1, description="Connected parts with fewer pixels are dropped from a mask.")
@@ -340,8 +340,8 @@ class SceneSpec(StrictModel):
     camera: CameraSpec = Field(description="Where images are taken from.")
     lights: tuple[LightSpec, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
-    composite: Composite = Field(Composite(), description="How layers become a picture.")
-    output: Output = Field(Output(), description="What is written.")
+    composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
+    output: Output = Field(Output(), description="Number, size and formats of the images.")
     quality: Literal["fast", "balanced", "exact"] = Field("balanced", description="Rendering preset.")
     seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
 

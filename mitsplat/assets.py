@@ -192,8 +192,8 @@ class Asset:
             )
         except ValidationError as error:
             first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"]) or self.kind
-            raise InputError(f"asset {self.name!r} cannot be saved: {key}: {first['msg']}") from error
+            rule = ": ".join([*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")])
+            raise InputError(f"asset {self.name!r} cannot be saved: {rule}") from error
         stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -75,6 +75,9 @@ class Shape(StrictModel):
     mesh: str | None = Field(None, description="Or as a mesh file, relative to the scene file, in world space [m].")
     visible: bool = Field(False, description="Whether it is rendered.")
     collider: bool = Field(True, description="Whether objects rest on it and bounce off it.")
+    proxy: bool = Field(
+        False, description="Whether light is traced against it though it is not rendered: a table that only splats show."
+    )
     colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
     friction: NonNegativeFloat = Field(0.6, description="Coulomb friction coefficient.")
 

@@ -17,13 +17,16 @@ from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists
 from mitsplat.quality import Quality
 
+PIXELS_PER_LANE = 8
+"""Pixels of one column that a lane carries, a divisor of the tile's edge."""
+
 SORT_SLOTS = 8
 """Gaussians that the per-ray order collects in one walk over a list."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Image:
-    """What the rays of one view saw, flat and row-major over the (height x width) pixels times samples.
+    """What the rays of one view saw, flat and row-major over height x width pixels.
 
     Attributes:
         rgb: Display-encoded colour, not divided by alpha, three arrays.
@@ -39,6 +42,12 @@ class Image:
     depth: Any
     instance: Any
     share: Any
+
+    @classmethod
+    def empty(cls, count: int) -> Image:
+        """Rays that met nothing."""
+        nothing = dr.zeros(mi.Float, count)
+        return cls([nothing] * 3, nothing, nothing, dr.zeros(mi.UInt32, count), nothing)
 
 
 Pixel = list[Any]
@@ -110,42 +119,63 @@ def _respond(record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared
     return list(zip(result[0::2], result[1::2], strict=True))
 
 
-def march(lists: TileLists, view: View, quality: Quality, *, pixels_per_lane: int, z_max: Any | None = None) -> Image:
-    """Blend every ray of a view front to back.
+def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None = None) -> Image:
+    """Blend every ray of a view front to back, and average the rays of each pixel.
 
     Args:
         lists: Depth-sorted Gaussians per tile.
         view: Camera.
         quality: Order, cut-off and early end.
-        pixels_per_lane: Pixels of one column that a lane carries, a divisor of the tile's edge.
-        z_max: Depth along z [m] of the nearest visible surface per ray, beyond which nothing is seen.
+        z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
     """
     n = view.samples
-    rays_x, rays_y = view.width * n, view.height * n
-    per_lane = pixels_per_lane if quality.order == "tile" else 1
-    lanes_per_tile = TILE * TILE // per_lane
-    columns = TILE // per_lane
-    cells = n * n
-    lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * lanes_per_tile * cells)
-    within, outer = lane % lanes_per_tile, lane // lanes_per_tile
-    cell, tile = (outer % cells, outer // cells) if n > 1 else (mi.UInt32(0), outer)
+    per_lane = PIXELS_PER_LANE if quality.order == "tile" else 1
+    lanes_per_tile, columns = TILE * TILE // per_lane, TILE
+    lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * lanes_per_tile)
+    within, tile = lane % lanes_per_tile, lane // lanes_per_tile
     tile_y = tile // view.tiles_x
-    x = (tile - tile_y * view.tiles_x) * TILE + within // columns
-    y = tile_y * TILE + (within % columns) * per_lane
-    dx, dy = (mi.Float(cell % n) + 0.5) / n, (mi.Float(cell // n) + 0.5) / n
-    slopes = [view.slopes(mi.Float(x) + dx, mi.Float(y + k) + dy) for k in range(per_lane)]
-    us, vs = [s[0] for s in slopes], [s[1] for s in slopes]
-    ray = [((y + k) * n + cell // n) * rays_x + x * n + cell % n for k in range(per_lane)]
+    x = (tile - tile_y * view.tiles_x) * TILE + within % columns
+    y = tile_y * TILE + within // columns * per_lane
+    pixel = [(y + k) * view.width + x for k in range(per_lane)]
     inside = [(x < view.width) & (y + k < view.height) for k in range(per_lane)]
-    far = [dr.gather(mi.Float, z_max, r, m) if z_max is not None else mi.Float(dr.inf) for r, m in zip(ray, inside, strict=True)]
+    far = [
+        dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf) for p, m in zip(pixel, inside, strict=True)
+    ]
     start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
     stop = dr.select(inside[0], stop, start)
 
     walk = _walk_in_tile_order if quality.order == "tile" else _walk_in_ray_order
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end = dr.opaque(mi.Float, quality.transmittance_min)
-    pixels = walk(lists, start, stop, us, vs, far, view, cut, end)
-    return _collect(pixels, ray, inside, rays_x * rays_y)
+    passes = []
+    for i in range(n * n):
+        dx, dy = dr.opaque(mi.Float, (i % n + 0.5) / n), dr.opaque(mi.Float, (i // n + 0.5) / n)
+        slopes = [view.slopes(mi.Float(x) + dx, mi.Float(y + k) + dy) for k in range(per_lane)]
+        pixels = walk(lists, start, stop, [s[0] for s in slopes], [s[1] for s in slopes], far, view, cut, end)
+        passes.append(_collect(pixels, pixel, inside, view.width * view.height))
+        if n > 1:
+            dr.eval(passes[-1])
+    return passes[0] if n == 1 else _average(passes)
+
+
+def _average(passes: list[Image]) -> Image:
+    """Mean of several samples of every pixel; depth and instance are those of the sample nearest to the pixel's centre."""
+    share = 1.0 / len(passes)
+    middle = passes[len(passes) // 2]
+
+    def mean(values: list[Any]) -> Any:
+        total = values[0]
+        for value in values[1:]:
+            total = total + value
+        return total * share
+
+    return Image(
+        rgb=[mean([p.rgb[c] for p in passes]) for c in range(3)],
+        alpha=mean([p.alpha for p in passes]),
+        depth=middle.depth,
+        instance=middle.instance,
+        share=middle.share,
+    )
 
 
 def _walk_in_tile_order(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -62,6 +62,29 @@ class View:
     def tiles_y(self) -> int:
         """Number of tiles along y."""
         return -(-self.height // TILE)
+
+    def sampled(self, samples: int) -> View:
+        """The same view with ``samples`` x ``samples`` rays per pixel."""
+        return self if samples == self.samples else replace(self, samples=samples)
+
+    def rays(self) -> Any:
+        """World-space rays through the pixels' centres, row-major, unit directions, starting at the centre of projection."""
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        row = pixel // self.width
+        u, v = self.slopes(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
+        axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3].T]
+        right, down, forward, centre = axes
+        ray = dr.zeros(mi.Ray3f, dr.width(pixel))
+        ray.d = dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
+        ray.o = mi.Point3f(*centre)
+        ray.maxt = dr.inf
+        dr.eval(ray)
+        return ray
+
+    def cosine(self, rays: Any) -> Any:
+        """Depth along z per unit of distance along each ray."""
+        forward = mi.Vector3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 2]])
+        return dr.dot(rays.d, forward)
 
     def slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Undistorted slopes (u, v) of the rays through pixel positions (x, y) [px]."""

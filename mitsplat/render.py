@@ -1,0 +1,160 @@
+"""Scenes to layers: every path to the renderer, Python, YAML or XML, ends in the integrator plugin ``splat_proxy``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.camera import Camera
+from mitsplat.quality import Quality, resolve_quality
+from mitsplat.splats import Splats
+
+FloatArray = npt.NDArray[np.float32]
+
+VARIANT = "llvm_ad_rgb"
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What the integrator makes of one view, H x W pixels.
+
+    Attributes:
+        rgb: Linear colour with light and highlight applied, multiplied by alpha, (H, W, 3) float32.
+        alpha: Opacity, (H, W) float32.
+        captured: Linear colour before light, multiplied by alpha, (H, W, 3) float32.
+        depth: Depth along the optical axis [m], 0 where nothing is, (H, W) float32.
+        instance: Id that has the largest share of the pixel, 0 for the environment or nothing, (H, W) uint16.
+        proxy_depth: The same depth of the proxy meshes, (H, W) float32.
+        proxy_instance: Id of the nearest proxy mesh, (H, W) uint16.
+        normal: World-space unit normal of the nearest proxy, zero where there is none, (H, W, 3) float32.
+        light: Factor that light and shadow put on the linear colour, (H, W, 3) float32.
+        highlight: Linear colour that was added, (H, W, 3) float32.
+    """
+
+    rgb: FloatArray
+    alpha: FloatArray
+    captured: FloatArray
+    depth: FloatArray
+    instance: npt.NDArray[np.uint16]
+    proxy_depth: FloatArray
+    proxy_instance: npt.NDArray[np.uint16]
+    normal: FloatArray
+    light: FloatArray
+    highlight: FloatArray
+
+
+def ensure_variant() -> None:
+    """Choose ``llvm_ad_rgb`` unless the user has chosen a variant that the plugins can run in."""
+    if mi.variant() is None or mi.variant().startswith("scalar"):
+        mi.set_variant(VARIANT)
+
+
+def make_integrator(
+    *,
+    quality: str | Quality = "balanced",
+    shadow: str = "traced",
+    shadow_samples: int = 8,
+    reference: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> Any:
+    """The integrator ``splat_proxy``, which keeps what it uploaded as long as it sees the same shapes."""
+    ensure_variant()
+    integrator = mi.load_dict(
+        {
+            "type": "splat_proxy",
+            "shadow": shadow,
+            "shadow_samples": shadow_samples,
+            "reference": [float(v) for v in np.asarray(reference)],
+        }
+    )
+    integrator.quality = resolve_quality(quality)
+    return integrator
+
+
+def make_sensor(camera: Camera) -> Any:
+    """A camera as the sensor plugin ``opencv_camera``."""
+    ensure_variant()
+    return mi.load_dict(describe_sensor(camera))
+
+
+def describe_sensor(camera: Camera) -> dict[str, Any]:
+    """Mitsuba's dictionary of a camera."""
+    pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    return {
+        "type": "opencv_camera",
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "distortion": " ".join(repr(float(k)) for k in camera.distortion),
+        "near_clip": camera.near,
+        "to_world": mi.ScalarTransform4f(pose),
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},
+        },
+    }
+
+
+def make_splats_shape(splats: Splats, world_from_splats: npt.ArrayLike | None = None, proxy: Any = None, **properties: Any) -> Any:
+    """The shape plugin ``splats`` around data in memory; ``properties`` are those of the plugin."""
+    ensure_variant()
+    from mitsplat.plugins.splats import SplatsShape
+
+    props = mi.Properties("splats")
+    for name, value in properties.items():
+        props[name] = value
+    if world_from_splats is not None:
+        props["to_world"] = mi.ScalarTransform4f(np.asarray(world_from_splats, dtype=np.float64))
+    return SplatsShape(props, splats=splats, proxy=proxy)
+
+
+def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "balanced") -> Layers:
+    """Render splats alone, with the colours as captured.
+
+    Args:
+        splats: What to render; it becomes instance 1.
+        camera: From where.
+        quality: A preset's name or a :class:`mitsplat.quality.Quality`.
+
+    Raises:
+        InputError: If there is no such preset.
+    """
+    integrator = make_integrator(quality=quality, shadow="none")
+    scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
+    return render_layers(integrator, scene, camera)
+
+
+def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
+    """Run the integrator and bring its layers to the host."""
+    layers = integrator.render_layers(scene, make_sensor(camera), seed=seed)
+    shape = camera.height, camera.width
+
+    def host(channel: Any) -> npt.NDArray[Any]:
+        # What is the same everywhere is one value on the device.
+        return np.broadcast_to(np.array(channel), shape[0] * shape[1]).reshape(shape)
+
+    def one(name: str, dtype: type) -> Any:
+        return host(layers[name]).astype(dtype, copy=False)
+
+    def three(name: str) -> FloatArray:
+        return np.stack([host(channel) for channel in layers[name]], axis=-1)
+
+    return Layers(
+        rgb=three("rgb"),
+        alpha=one("alpha", np.float32),
+        captured=three("captured"),
+        depth=one("depth", np.float32),
+        instance=one("instance", np.uint16),
+        proxy_depth=one("proxy_depth", np.float32),
+        proxy_instance=one("proxy_instance", np.uint16),
+        normal=three("normal"),
+        light=three("light"),
+        highlight=three("highlight"),
+    )

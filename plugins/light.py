@@ -1,0 +1,256 @@
+"""Traced light on splats: irradiance with and without the dynamic occluders, and a highlight.
+
+A splat stores what the camera saw, shadows included. Rendering it among new objects therefore needs no light transport
+from scratch but a factor per visible point x with normal n,
+
+    captured under the scene's light:   ratio = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
+    captured under uniform light:       ratio = E(x, n | static and dynamic occluders) / E_ref
+
+with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first is exactly 1 where no dynamic
+object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance of an unoccluded
+horizontal surface at the scene's reference point: an object taken in a light tent keeps its colours there, and is
+darker where less light arrives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.plugins.rays import View
+
+BLOCK = 8
+"""Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
+that follows averages a stratified set."""
+
+R2 = (0.7548776662466927, 0.5698402909980532)
+"""Additive recurrence of the two-dimensional golden ratio (Roberts 2018, "The unreasonable effectiveness of quasirandom
+sequences")."""
+
+REFERENCE_SAMPLES = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """A proxy surface in world space.
+
+    Attributes:
+        mesh: Surface [m].
+        instance: Instance id, 0 for the environment.
+        dynamic: Whether its shadow is missing in what was captured.
+    """
+
+    mesh: trimesh.Trimesh
+    instance: int
+    dynamic: bool
+
+
+class Proxies:
+    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones."""
+
+    def __init__(self, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> None:
+        """Proxies from meshes, and visible Mitsuba shapes, which are static."""
+        self.static = _TraceScene.build([o for o in occluders if not o.dynamic], visible)
+        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic])
+
+    def nearest(self, ray: Any) -> tuple[Any, Any, Any]:
+        """Distance along a ray (infinite for a miss), normal towards its origin, and instance id of what it meets."""
+        distance, normal, instance = mi.Float(dr.inf), mi.Normal3f(0), mi.UInt32(0)
+        for scene in (self.static, self.dynamic):
+            if scene is None:
+                continue
+            si = scene.scene.ray_intersect(ray)
+            closer = si.t < distance
+            facing = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+            proxy = closer & (si.shape == scene.mesh)
+            number = dr.gather(mi.UInt32, scene.instances, si.prim_index, proxy)
+            instance = dr.select(closer, number, instance)
+            distance, normal = dr.select(closer, si.t, distance), dr.select(closer, facing, normal)
+        return distance, normal, instance
+
+
+@dataclass(frozen=True, eq=False)
+class _TraceScene:
+    """All meshes as one, with the instance id of every triangle."""
+
+    scene: Any
+    mesh: Any
+    instances: Any
+
+    @classmethod
+    def build(cls, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> _TraceScene | None:
+        others = {f"visible_{i}": shape for i, shape in enumerate(visible)}
+        occluders = [o for o in occluders if len(o.mesh.faces)]
+        if not occluders:
+            nothing = mi.UInt32([0])
+            return cls(mi.load_dict({"type": "scene", **others}), mi.ShapePtr(), nothing) if others else None
+        merged = trimesh.util.concatenate([trimesh.Trimesh(o.mesh.vertices, o.mesh.faces, process=False) for o in occluders])
+        mesh = mi.Mesh("proxies", len(merged.vertices), len(merged.faces))
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float(np.asarray(merged.vertices, dtype=np.float32).ravel())
+        params["faces"] = mi.UInt32(np.asarray(merged.faces, dtype=np.uint32).ravel())
+        params.update()
+        instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
+        scene = mi.load_dict({"type": "scene", "mesh": mesh, **others})
+        return cls(scene, mi.ShapePtr(mesh), mi.UInt32(instances.astype(np.uint32)))
+
+
+@dataclass(eq=False)
+class Surface:
+    """Visible points of all pixels, flat and row-major.
+
+    Attributes:
+        position, normal: Point [m] and unit normal towards the camera.
+        to_camera: Unit vector towards the camera.
+        offset: How far shadow rays start off the surface [m].
+        relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
+        roughness, specular: GGX roughness and reflectance at normal incidence.
+        valid: Whether there is a point at all.
+    """
+
+    position: Any
+    normal: Any
+    to_camera: Any
+    offset: Any
+    relit: Any
+    roughness: Any
+    specular: Any
+    valid: Any
+
+
+def trace_light(
+    scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int, reference: Any
+) -> tuple[Any, Any]:
+    """Light factor (Color3f) and highlight (Color3f) of every visible point, see the module docstring.
+
+    Args:
+        scene: Mitsuba scene whose emitters give the light.
+        proxies: What can stand in its way.
+        surface: Visible points of an image.
+        width: Image width [px].
+        samples: Shadow rays per pixel.
+        seed: Offset into the low-discrepancy sequence.
+        reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
+    """
+    count = dr.width(surface.valid)
+    pixel = dr.arange(mi.UInt32, count)
+    x, y = pixel % width, pixel // width
+    start = dr.opaque(mi.UInt32, seed * samples * BLOCK * BLOCK % (1 << 20)) + _bayer(x, y)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.p = surface.position
+    si.n = mi.Normal3f(surface.normal)
+    si.sh_frame = mi.Frame3f(surface.normal)
+    origin = dr.fma(surface.normal, surface.offset, surface.position)
+    alpha2 = dr.square(dr.square(surface.roughness))
+    cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
+
+    def body(i: Any, lit: Any, unshadowed: Any, shine: Any) -> tuple[Any, Any, Any, Any]:
+        index = mi.Float((start + i * (BLOCK * BLOCK)) & 0xFFFFF) + 1.0
+        point = mi.Point2f(*[index * step - dr.floor(index * step) for step in R2])
+        sample, radiance = scene.sample_emitter_direction(si, point, False, surface.valid)
+        cosine = dr.dot(surface.normal, sample.d)
+        active = surface.valid & (cosine > 0) & (sample.pdf > 0)
+        ray = mi.Ray3f(origin, sample.d)
+        ray.maxt = dr.maximum(sample.dist - 2 * surface.offset, 0)
+        blocked = mi.Bool(False)
+        if proxies.static is not None:
+            blocked = proxies.static.scene.ray_test(ray, active=active)
+        static_light = dr.select(active & ~blocked, radiance * cosine, 0)
+        shadowed = mi.Bool(False)
+        if proxies.dynamic is not None:
+            shadowed = proxies.dynamic.scene.ray_test(ray, active=active & ~blocked)
+        light = dr.select(shadowed, 0, static_light)
+        unshadowed += static_light
+        lit += light
+        shine += light * _ggx(surface, sample.d, cosine, cos_camera, alpha2)
+        return i + 1, lit, unshadowed, shine
+
+    rounds = dr.opaque(mi.UInt32, samples)
+    black = mi.Color3f(0)
+    _, lit, unshadowed, shine = dr.while_loop(
+        (dr.zeros(mi.UInt32, count), black, mi.Color3f(0), mi.Color3f(0)), lambda i, *_: i < rounds, body, label="light"
+    )
+    weight = 1.0 / mi.Float(rounds)
+    captured = dr.select(unshadowed > 0, lit / unshadowed, 1)
+    factor = dr.select(surface.relit, lit * weight / reference, captured)
+    return dr.select(surface.valid, factor, 1), shine * (weight * dr.pi / reference)
+
+
+def _ggx(surface: Surface, to_light: Any, cos_light: Any, cos_camera: Any, alpha2: Any) -> Any:
+    """GGX microfacet reflection with height-correlated masking (Walter 2007; Heitz 2014) and Schlick's Fresnel term."""
+    half = dr.normalize(to_light + surface.to_camera)
+    cos_half = dr.dot(surface.normal, half)
+    spread = dr.fma(cos_half * cos_half, alpha2 - 1, 1)
+    distribution = alpha2 / (dr.pi * dr.square(spread))
+    masking = cos_light * dr.sqrt(dr.fma(cos_camera * cos_camera, 1 - alpha2, alpha2)) + cos_camera * dr.sqrt(
+        dr.fma(cos_light * cos_light, 1 - alpha2, alpha2)
+    )
+    grazing = dr.power(dr.clip(1 - dr.dot(half, to_light), 0, 1), 5)
+    fresnel = dr.select(surface.specular > 0, dr.fma(1 - surface.specular, grazing, surface.specular), 0)
+    return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
+
+
+def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
+    """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element."""
+    i = dr.arange(mi.Float, REFERENCE_SAMPLES) + 1.0
+    si = dr.zeros(mi.SurfaceInteraction3f, REFERENCE_SAMPLES)
+    si.p = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point])
+    si.n = mi.Normal3f(*normal)
+    si.sh_frame = mi.Frame3f(si.n)
+    sample, radiance = scene.sample_emitter_direction(si, mi.Point2f(*[i * s - dr.floor(i * s) for s in R2]), False)
+    light = radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)
+    return mi.Color3f(*[dr.mean(c) for c in light])
+
+
+def _bayer(x: Any, y: Any) -> Any:
+    """Rank of a pixel in an 8x8 ordered-dither matrix: neighbours take far-apart points of the sequence."""
+    result = mi.UInt32(0)
+    for bit in range(3):
+        a, b = (x >> bit) & 1, (y >> bit) & 1
+        result |= ((a ^ b) << (5 - 2 * bit)) | (b << (4 - 2 * bit))
+    return result
+
+
+def smooth_light(
+    factor: Any, highlight: Any, surface: Surface, group: Any, view: View, *, radius: int = 4
+) -> tuple[Any, Any]:
+    """Average light over neighbours on the same surface: a separable filter that keeps edges.
+
+    A neighbour counts where it belongs to the same ``group``, its normal agrees, and it lies in the tangent plane. Where
+    all neighbours are equal the result is the same value exactly, so that unshadowed points stay at 1.
+    """
+    count = dr.width(group)
+    pixel = dr.arange(mi.UInt32, count)
+    x, y = mi.Int32(pixel % view.width), mi.Int32(pixel // view.width)
+    footprint = surface.offset * 8
+    values = [*factor, *highlight]
+    dr.eval(values, surface.position, surface.normal)
+    for horizontal in (True, False):
+        middle = values
+        total = [mi.Float(v) for v in values]
+        weights = mi.Float(1)
+        sums = [mi.Float(0) for _ in values]
+        for step in [s for r in range(1, radius + 1) for s in (-r, r)]:
+            nx, ny = (x + step, y) if horizontal else (x, y + step)
+            inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height) & surface.valid
+            other = mi.UInt32(ny * view.width + nx)
+            position = dr.gather(mi.Point3f, surface.position, other, inside)
+            normal = dr.gather(mi.Vector3f, surface.normal, other, inside)
+            same = inside & (dr.gather(mi.UInt32, group, other, inside) == group)
+            plane = dr.abs(dr.dot(surface.normal, position - surface.position))
+            same &= (dr.dot(surface.normal, normal) > 0.95) & (plane < footprint * abs(step))
+            weight = dr.select(same, 1.0, 0.0)
+            weights += weight
+            # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
+            sums = [
+                dr.fma(weight, dr.gather(mi.Float, v, other, same) - m, s) for v, m, s in zip(values, middle, sums, strict=True)
+            ]
+        values = [m + s / weights for m, s in zip(total, sums, strict=True)]
+        dr.eval(values)
+    return mi.Color3f(*values[:3]), mi.Color3f(*values[3:])

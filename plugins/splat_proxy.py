@@ -1,0 +1,314 @@
+"""The integrator plugin ``splat_proxy``: splats for appearance, their proxy meshes for light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.errors import InputError
+from mitsplat.plugins.gaussian import Cloud, upload_cloud
+from mitsplat.plugins.light import Occluder, Proxies, Surface, reference_irradiance, smooth_light, trace_light
+from mitsplat.plugins.march import Image, march
+from mitsplat.plugins.rays import View
+from mitsplat.plugins.tiles import CloudSet, Placement, bin_gaussians, merge_clouds
+from mitsplat.quality import resolve_quality
+
+AOVS = (
+    "captured.R",
+    "captured.G",
+    "captured.B",
+    "depth",
+    "instance",
+    "proxy.depth",
+    "proxy.instance",
+    "normal.X",
+    "normal.Y",
+    "normal.Z",
+    "light.R",
+    "light.G",
+    "light.B",
+    "highlight.R",
+    "highlight.G",
+    "highlight.B",
+)
+"""Channels after R, G, B, A: linear colour before light, depths along z [m], ids, world normal, light factor, highlight."""
+
+AGREEMENT = 0.02
+"""Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
+
+
+def srgb_to_linear(value: Any) -> Any:
+    """IEC 61966-2-1 electro-optical transfer, extended above 1."""
+    return dr.select(value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4))
+
+
+@dataclass(frozen=True, eq=False)
+class _Contents:
+    """What the shapes of a scene amount to on the device; kept while the shapes stay the same."""
+
+    shapes: tuple[Any, ...]
+    clouds: CloudSet | None
+    placements: tuple[Placement, ...]
+    proxies: Proxies
+    visible_meshes: bool
+    relit: Any
+    roughness: Any
+    specular: Any
+
+
+class SplatProxyIntegrator(mi.CppADIntegrator):
+    r"""Splats with proxy light (:monosp:`splat_proxy`)
+
+    .. pluginparameters::
+
+     * - quality
+       - |string|
+       - Preset of the splat renderer: ``fast``, ``balanced`` or ``exact``. (Default: ``balanced``)
+
+     * - shadow
+       - |string|
+       - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured.
+         (Default: ``traced``)
+
+     * - shadow_samples
+       - |int|
+       - Shadow rays per pixel. (Default: 8)
+
+     * - reference
+       - |point|
+       - Where an unoccluded horizontal surface shows uniformly captured colours unchanged. (Default: origin)
+
+    Every :monosp:`splats` shape is blended front to back per pixel; other meshes of the scene are visible as diffuse
+    surfaces, hide splats behind them and are hidden by splats before them. The image holds linear R, G, B, A and the
+    channels that ``aov_names`` lists. One emitter or more are needed for ``shadow: traced``; without any, colours stay
+    as captured.
+
+    .. tabs::
+
+        .. code-tab:: xml
+
+            <integrator type="splat_proxy">
+                <string name="quality" value="balanced"/>
+                <integer name="shadow_samples" value="16"/>
+            </integrator>
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.quality = resolve_quality(_text(props, "quality", "balanced"))
+        self.shadow = _text(props, "shadow", "traced")
+        if self.shadow not in ("traced", "none"):
+            raise InputError(f"integrator 'splat_proxy': 'shadow' must be 'traced' or 'none' (got {self.shadow!r})")
+        self.shadow_samples = props.get("shadow_samples", 8)
+        if type(self.shadow_samples) is not int or not 1 <= self.shadow_samples <= 4096:
+            raise InputError(
+                f"integrator 'splat_proxy': 'shadow_samples' must be a whole number from 1 to 4096 (got {self.shadow_samples!r})"
+            )
+        self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
+        self._contents: _Contents | None = None
+        self._uploaded: list[tuple[Any, Cloud]] = []
+
+    def aov_names(self) -> list[str]:
+        return list(AOVS)
+
+    def render(
+        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+    ) -> Any:
+        """Image tensor (H, W, 4 + AOVs), linear RGBA first."""
+        if not isinstance(sensor, mi.Sensor):
+            sensor = scene.sensors()[sensor]
+        layers = self.render_layers(scene, sensor, seed=int(seed))
+        view = view_of(sensor)
+        channels = [*layers["rgb"], layers["alpha"], *layers["captured"], layers["depth"], mi.Float(layers["instance"])]
+        channels += [layers["proxy_depth"], mi.Float(layers["proxy_instance"]), *layers["normal"]]
+        channels += [*layers["light"], *layers["highlight"]]
+        flat = dr.empty(mi.Float, view.width * view.height * len(channels))
+        pixel = dr.arange(mi.UInt32, view.width * view.height)
+        for i, channel in enumerate(channels):
+            dr.scatter(flat, channel, pixel * len(channels) + i)
+        image = mi.TensorXf(flat, shape=(view.height, view.width, len(channels)))
+        if evaluate:
+            dr.eval(image)
+        return image
+
+    def render_layers(self, scene: Any, sensor: Any, *, seed: int = 0) -> dict[str, Any]:
+        """All layers as flat row-major device arrays: colours linear, depths along z [m]."""
+        contents = self._read(scene)
+        view = view_of(sensor)
+        rays = view.rays()
+        behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
+        splat = self._trace_splats(contents, view, behind.depth if behind else None)
+        distance, normal, proxy_instance = contents.proxies.nearest(rays)
+        hit = distance < dr.inf
+        proxy_depth = dr.select(hit, distance * view.cosine(rays), 0)
+        dr.eval(splat, proxy_depth, normal, proxy_instance)
+
+        covered = dr.maximum(splat.alpha, 1e-6)
+        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
+        alpha, depth, instance = splat.alpha, splat.depth, splat.instance
+        if behind:
+            front = behind.valid & (splat.alpha < 0.5)
+            colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
+            alpha = dr.select(behind.valid, 1, alpha)
+            depth = dr.select(front, behind.depth, depth)
+            instance = dr.select(front, 0, instance)
+        light, highlight = mi.Color3f(1), mi.Color3f(0)
+        if self.shadow == "traced" and scene.emitters():
+            surface = _surface(contents, view, rays, alpha, depth, instance, proxy_depth, normal, proxy_instance)
+            if behind:
+                surface.relit |= front
+            reference = reference_irradiance(scene, self.reference)
+            light, highlight = trace_light(
+                scene, contents.proxies, surface, view.width, samples=self.shadow_samples, seed=seed, reference=reference
+            )
+            light, highlight = smooth_light(light, highlight, surface, instance, view)
+        layers = {
+            "rgb": colour * light + highlight * alpha,
+            "alpha": alpha,
+            "captured": colour,
+            "depth": depth,
+            "instance": instance,
+            "proxy_depth": proxy_depth,
+            "proxy_instance": proxy_instance,
+            "normal": mi.Vector3f(normal),
+            "light": light,
+            "highlight": highlight,
+        }
+        dr.eval(layers)
+        return layers
+
+    def _trace_splats(self, contents: _Contents, view: View, z_max: Any | None) -> Image:
+        if contents.clouds is None:
+            return Image.empty(view.width * view.height)
+        quality = self.quality
+        fine = view.sampled(quality.samples)
+        lists = bin_gaussians(
+            contents.clouds, contents.placements, fine, alpha_min=quality.alpha_min, sh_degree=quality.sh_degree
+        )
+        return march(lists, fine, quality, z_max=z_max)
+
+    def _read(self, scene: Any) -> _Contents:
+        """Upload what the shapes hold, unless they are those of the last call."""
+        shapes = tuple(scene.shapes())
+        known = self._contents
+        if known is not None and len(known.shapes) == len(shapes) and all(a is b for a, b in zip(known.shapes, shapes, strict=True)):
+            return known
+        carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
+        visible = [s for s in shapes if not hasattr(s, "world_from_splats") and not s.is_emitter()]
+        distinct = list({id(c.splats): c.splats for c in carriers}.values())
+        number = {id(splats): i for i, splats in enumerate(distinct)}
+        placements = tuple(Placement(number[id(c.splats)], c.world_from_splats, c.instance) for c in carriers)
+        occluders = [
+            Occluder(c.proxy.copy().apply_transform(c.world_from_splats), c.instance, c.dynamic)
+            for c in carriers
+            if c.proxy is not None
+        ]
+        size = 1 + max([0, *(c.instance for c in carriers)])
+        relit, roughness, specular = np.zeros(size, bool), np.full(size, 0.4, np.float32), np.zeros(size, np.float32)
+        for c in carriers:
+            relit[c.instance], roughness[c.instance], specular[c.instance] = c.capture_light == "uniform", c.roughness, c.specular
+        self._contents = _Contents(
+            shapes,
+            self._upload(distinct),
+            placements,
+            Proxies(occluders, visible),
+            bool(visible),
+            mi.Bool(relit),
+            mi.Float(roughness),
+            mi.Float(specular),
+        )
+        return self._contents
+
+    def _upload(self, distinct: list[Any]) -> CloudSet | None:
+        """Device copies of splats; those of the last call are kept, because layouts of a scene share their assets."""
+        kept = {id(splats): (splats, cloud) for splats, cloud in self._uploaded}
+        self._uploaded = [
+            kept.get(id(s)) or (s, upload_cloud(s.means, s.quats, s.scales, s.opacities, s.sh)) for s in distinct
+        ]
+        clouds = [cloud for _, cloud in self._uploaded]
+        return merge_clouds(clouds) if sum(c.count for c in clouds) else None
+
+    def to_string(self) -> str:
+        return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
+
+
+@dataclass(frozen=True, eq=False)
+class _Behind:
+    """Visible meshes as the camera sees them."""
+
+    depth: Any
+    reflectance: Any
+    valid: Any
+
+
+def _trace_meshes(scene: Any, view: View, rays: Any) -> _Behind:
+    si = scene.ray_intersect(rays)
+    valid = si.is_valid() & (si.emitter(scene) == None)  # noqa: E711 - element-wise comparison of pointers
+    reflectance = si.bsdf().eval_diffuse_reflectance(si, valid)
+    depth = dr.select(valid, si.t * view.cosine(rays), dr.inf)
+    dr.eval(depth, reflectance, valid)
+    return _Behind(depth, reflectance, valid)
+
+
+def _surface(
+    contents: _Contents,
+    view: View,
+    rays: Any,
+    alpha: Any,
+    depth: Any,
+    instance: Any,
+    proxy_depth: Any,
+    proxy_normal: Any,
+    proxy_instance: Any,
+) -> Surface:
+    """Points that light is traced at: on the proxy where it agrees with what is seen, else at the seen depth."""
+    same = (proxy_instance == instance) & (proxy_depth > 0)
+    # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
+    on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
+    z = dr.select(on_proxy, proxy_depth, depth)
+    position = rays(z / view.cosine(rays))
+    valid = (alpha > 1 / 255) & (z > 0)
+    reach = dr.max(dr.abs(position))
+    return Surface(
+        position=position,
+        normal=mi.Vector3f(dr.select(same, proxy_normal, mi.Normal3f(-rays.d))),
+        to_camera=-rays.d,
+        offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
+        relit=dr.gather(mi.Bool, contents.relit, instance),
+        roughness=dr.gather(mi.Float, contents.roughness, instance),
+        specular=dr.gather(mi.Float, contents.specular, instance),
+        valid=valid,
+    )
+
+
+def view_of(sensor: Any) -> View:
+    """The camera of a sensor: ``opencv_camera``, or Mitsuba's own ``perspective``.
+
+    Raises:
+        InputError: If the sensor is of another kind.
+    """
+    if hasattr(sensor, "view"):
+        return sensor.view()
+    width, height = (int(n) for n in sensor.film().size())
+    params = mi.traverse(sensor)
+    if "x_fov" not in params or "to_world" not in params:
+        raise InputError("integrator 'splat_proxy': the sensor must be 'opencv_camera' or 'perspective'")
+    focal = 0.5 * width / np.tan(0.5 * np.radians(float(np.array(params["x_fov"]).ravel()[0])))
+    shift = [float(np.array(params[f"principal_point_offset_{a}"]).ravel()[0]) if f"principal_point_offset_{a}" in params else 0.0 for a in "xy"]
+    pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    near = float(np.array(params["near_clip"]).ravel()[0])
+    return View(width, height, focal, focal, width * (0.5 + shift[0]), height * (0.5 + shift[1]), pose, (), near)
+
+
+def _text(props: mi.Properties, name: str, default: str) -> str:
+    value = props[name] if name in props else default
+    if not isinstance(value, str):
+        raise InputError(f"integrator 'splat_proxy': {name!r} must be text (got {value!r})")
+    return value
+
+
+mi.register_integrator("splat_proxy", lambda props: SplatProxyIntegrator(props))

@@ -20,6 +20,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _COLUMNS = 4
 _TILE_WIDTH = 480
 _CAPTION = 24
+_GAP = 6
 
 
 def class_colour(class_index: int) -> tuple[int, int, int]:
@@ -53,11 +54,11 @@ def contact_sheet(root: Path, records: Collection[Record], path: Path, *, count:
     """
     chosen = np.unique(np.linspace(0, len(records) - 1, min(count, len(records))).round().astype(int))
     tiles = [_tile(root, record) for i, record in enumerate(records) if i in chosen]
-    height = max(tile.shape[0] for tile in tiles)
+    height, width = max(tile.shape[0] for tile in tiles) + _GAP, _TILE_WIDTH + _GAP
     columns = min(_COLUMNS, len(tiles))
-    sheet = np.full((-(-len(tiles) // columns) * height, columns * _TILE_WIDTH, 3), 32, dtype=np.uint8)
+    sheet = np.full((-(-len(tiles) // columns) * height, columns * width - _GAP, 3), 32, dtype=np.uint8)
     for i, tile in enumerate(tiles):
-        top, left = i // columns * height, i % columns * _TILE_WIDTH
+        top, left = i // columns * height, i % columns * width
         sheet[top : top + tile.shape[0], left : left + _TILE_WIDTH] = tile
     _, data = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
     write_file(path, lambda temporary: temporary.write_bytes(bytes(data)))
@@ -93,7 +94,9 @@ def _draw_name(image: Image, label: InstanceLabel, unit: float) -> None:
     (width, height), baseline = cv2.getTextSize(label.class_name, _FONT, scale, thickness)
     left = max(0, min(x0, image.shape[1] - width - 2))
     bottom = max(y0, height + baseline)
+    colour = class_colour(label.class_index)
     corner = (left + width + 2, bottom)
-    cv2.rectangle(image, (left, bottom - height - baseline), corner, class_colour(label.class_index), cv2.FILLED)
+    cv2.rectangle(image, (left, bottom - height - baseline), corner, colour, cv2.FILLED)
+    ink = (0, 0, 0) if np.dot(colour, (0.299, 0.587, 0.114)) > 128 else (255, 255, 255)  # by Rec. 601 luma
     origin = (left + 1, bottom - baseline // 2 - 1)
-    cv2.putText(image, label.class_name, origin, _FONT, scale, (0, 0, 0), thickness, cv2.LINE_AA)
+    cv2.putText(image, label.class_name, origin, _FONT, scale, ink, thickness, cv2.LINE_AA)

@@ -374,4 +374,4 @@ class TestPictures:
 
     def test_the_sheet_shows_a_spread_of_frames(self, scene, tmp_path):
         summary = write(scene, tmp_path / "out")
-        assert cv2.imread(str(summary.contact_sheet)).shape[1] == 4 * 480
+        assert cv2.imread(str(summary.contact_sheet)).shape[1] == 4 * 480 + 3 * 6

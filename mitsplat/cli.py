@@ -1,0 +1,262 @@
+"""The command ``mitsplat``: arguments to calls, and errors in one sentence instead of a traceback.
+
+Exit status: 0 done, 1 the doctor found something missing, 2 bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from mitsplat import __version__
+from mitsplat.errors import InputError
+
+# Commands import what they need themselves, so that help appears at once.
+
+app = typer.Typer(
+    help="Labelled training images of settled objects, from Gaussian splats, physics and traced light.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
+FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, from 0.")]
+QualityName = Literal["fast", "balanced", "exact"]
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command line and exit.
+
+    Args:
+        args: Arguments; those of the process if None.
+    """
+    try:
+        app(args)
+    except InputError as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+
+
+@app.command()
+def render(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a Mitsuba scene (.xml).")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Dataset folder; out/<name of SCENE> if absent.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option("--frames", "-n", help="Only the first so many images.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Decides everything that is random.")] = None,
+    quality: Annotated[QualityName | None, typer.Option(help="Rendering preset.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes that make images.")] = 1,
+    formats: Annotated[
+        str | None, typer.Option("--format", metavar="NAMES", help="Of yolo, coco, bop and exr, separated by commas.")
+    ] = None,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite/--resume", help="Replace the dataset in the folder, or keep what is finished of it."),
+    ] = False,
+) -> None:
+    """Write the labelled dataset that SCENE describes.
+
+    Options replace what the file says. A Mitsuba scene (.xml) gives one picture.
+    """
+    overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
+    if out is None:
+        out = Path("out") / scene.stem
+    if scene.suffix == ".xml":
+        if overrides or frames is not None:
+            raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
+        from mitsplat.render import render_xml
+
+        typer.echo(f"picture: {render_xml(scene, out)}")
+        return
+    from mitsplat.dataset import write_dataset
+    from mitsplat.scene import load_scene
+
+    loaded = load_scene(scene, overrides=overrides)
+    with _progress_bar() as progress:
+        summary = write_dataset(loaded, out, frames=frames, workers=workers, overwrite=overwrite, progress=progress)
+    images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
+    typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
+    typer.echo(f"contact sheet: {summary.contact_sheet}")
+
+
+@app.command()
+def preview(
+    scene: SceneFile,
+    frame: FrameIndex = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write (.png or .jpg).")] = Path("preview.png"),
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 640x360.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Decides everything that is random.")] = None,
+    quality: Annotated[QualityName | None, typer.Option(help="Rendering preset.")] = None,
+) -> None:
+    """Render one frame of SCENE to a picture."""
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(f"--out must end in .png or .jpg (got {out})")
+    if not out.parent.is_dir():
+        raise InputError(f"--out must be in a folder that exists (got {out})")
+    from PIL import Image
+
+    from mitsplat.frame import render_frame
+    from mitsplat.scene import load_scene
+
+    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality))
+    Image.fromarray(render_frame(loaded, frame).image).save(out)
+    typer.echo(f"picture: {out}")
+
+
+@app.command()
+def export(
+    scene: SceneFile,
+    frame: FrameIndex = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Mitsuba scene to write (.xml).")] = Path("scene.xml"),
+) -> None:
+    """Write one frame of SCENE as a Mitsuba scene.
+
+    It can be edited, and rendered by `mitsplat render`.
+    """
+    from mitsplat.render import export_xml
+    from mitsplat.scene import load_scene
+
+    export_xml(load_scene(scene), frame, out)
+    typer.echo(f"scene: {out}")
+
+
+@app.command()
+def bake(
+    mesh: Annotated[Path, typer.Argument(metavar="MESH", help="Textured or coloured mesh that trimesh reads.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Asset folder to write.")],
+    name: Annotated[str | None, typer.Option(help="Name of the asset; the folder's if absent.")] = None,
+    class_name: Annotated[str | None, typer.Option("--class", help="Class to learn; the name if absent.")] = None,
+    kind: Annotated[Literal["object", "environment"], typer.Option(help="Whether physics moves it.")] = "object",
+    light: Annotated[Literal["uniform", "studio"], typer.Option(help="Light to bake under.")] = "uniform",
+    gaussians: Annotated[int, typer.Option(help="Number of Gaussians aimed for.")] = 20000,
+    sh_degree: Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")] = 2,
+    units: Annotated[float, typer.Option(help="Metres per unit of the mesh; 0.001 for millimetres.")] = 1.0,
+    up: Annotated[Literal["y", "z"], typer.Option(help="Axis of the mesh that points up.")] = "z",
+    density: Annotated[float, typer.Option(help="Mass density [kg/m^3].")] = 1000.0,
+    friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
+    seed: Annotated[int, typer.Option(help="Decides everything that is random.")] = 0,
+) -> None:
+    """Turn MESH into an asset.
+
+    It has Gaussians with baked radiance, a proxy mesh and convex pieces.
+    """
+    from mitsplat.bake import BakeSettings, bake_asset
+
+    result = bake_asset(
+        mesh,
+        name=name or out.resolve().name,
+        class_name=class_name,
+        kind=kind,
+        light=light,
+        settings=BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed),
+        metres_per_unit=units,
+        up=up,
+        density=density,
+        friction=friction,
+    )
+    result.asset.save(out)
+    typer.echo(f"asset: {out} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of scene files, for editors."""
+    import json
+
+    from mitsplat.scene import scene_json_schema
+
+    typer.echo(json.dumps(scene_json_schema(), indent=2))
+
+
+@app.command()
+def doctor() -> None:
+    """Check that this machine has what is needed.
+
+    Python, Mitsuba, LLVM, Warp and memory, and what to do about what is missing.
+    """
+    from mitsplat.doctor import examine
+
+    healthy = True
+    for finding in examine():
+        healthy &= finding.ok
+        typer.echo(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name}: {finding.text}")
+        if not finding.ok:
+            typer.echo(f"      to do: {finding.remedy}")
+    raise typer.Exit(0 if healthy else 1)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mitsplat {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+def _fail(sentence: str) -> None:
+    typer.echo(f"mitsplat: {sentence}", err=True)
+    sys.exit(2)
+
+
+def _overrides(
+    *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
+) -> dict[str, Any]:
+    """The options that were given, by the scene file's keys."""
+    overrides: dict[str, Any] = {"seed": seed, "quality": quality}
+    if size is not None:
+        width, _, height = size.lower().partition("x")
+        if not (width.isdecimal() and height.isdecimal()):
+            raise InputError(f"--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got {size})")
+        overrides |= {"output.width": int(width), "output.height": int(height)}
+    if formats is not None:
+        overrides["output.formats"] = [name.strip() for name in formats.split(",")]
+    return {key: value for key, value in overrides.items() if value is not None}
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[int, int, str], None]]:
+    """A bar on stderr with images per second and the time left."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
+
+    class RateColumn(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            speed = task.finished_speed or task.speed
+            return Text("" if speed is None else f"{speed:.2f} images/s")
+
+    columns = (BarColumn(), MofNCompleteColumn(), RateColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=300) as bar:
+        task = bar.add_task("", total=None)
+
+        def update(done: int, total: int, doing: str) -> None:
+            if bar.tasks[0].total is None:  # frames of an earlier run must not count as this run's speed
+                bar.reset(task, total=total, completed=done)
+            bar.update(task, completed=done, description=doing)
+
+        yield update

@@ -1,0 +1,303 @@
+"""The command line: arguments to calls, one sentence and status 2 for bad input."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+import typer.core
+import typer.main
+from conftest import WriteScene, box_asset
+from PIL import Image
+
+from mitsplat import bake, dataset, frame, render
+from mitsplat.bake import BakeResult, BakeSettings
+from mitsplat.cli import app, main
+from mitsplat.dataset import DatasetSummary
+from mitsplat.errors import InputError
+from mitsplat.scene import Scene
+
+
+def run(*args: object) -> int:
+    with pytest.raises(SystemExit) as exited:
+        main([str(arg) for arg in args])
+    return int(exited.value.code or 0)
+
+
+class Calls:
+    """Stands in for a function: keeps what it was called with."""
+
+    def __init__(self, result: Any = None, error: BaseException | None = None) -> None:
+        self.result, self.error = result, error
+        self.args: tuple[Any, ...] = ()
+        self.kwargs: dict[str, Any] = {}
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        self.args, self.kwargs = args, kwargs
+        if self.error is not None:
+            raise self.error
+        return self.result
+
+
+@pytest.fixture
+def scene_path(scene_data: dict[str, Any], write_scene: WriteScene) -> Path:
+    return write_scene(scene_data)
+
+
+@pytest.fixture
+def write_dataset(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
+    summary = DatasetSummary(
+        path=tmp_path / "out",
+        frames=3,
+        rendered=3,
+        images={"train": 2, "val": 1},
+        instances={"nut": 4, "bolt": 5},
+        dropped={},
+        contact_sheet=tmp_path / "out/contact_sheet.jpg",
+    )
+    calls = Calls(summary)
+    monkeypatch.setattr(dataset, "write_dataset", calls)
+    return calls
+
+
+def test_render_passes_every_option_on(
+    scene_path: Path, write_dataset: Calls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = run(
+        "render", scene_path, "-o", tmp_path / "out", "-n", 3, "--size", "32x24", "--seed", 9, "--quality", "fast",
+        "--workers", 2, "--format", "yolo,coco", "--overwrite",
+    )  # fmt: skip
+    assert status == 0
+    scene, out = write_dataset.args
+    assert isinstance(scene, Scene)
+    assert out == tmp_path / "out"
+    assert (scene.spec.output.width, scene.spec.output.height) == (32, 24)
+    assert scene.spec.output.formats == ("yolo", "coco")
+    assert (scene.spec.seed, scene.spec.quality) == (9, "fast")
+    write_dataset.kwargs.pop("progress")
+    assert write_dataset.kwargs == {"frames": 3, "workers": 2, "overwrite": True}
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"dataset: {tmp_path / 'out'} (2 train, 1 val; 9 labelled instances)"
+    assert lines[-1] == f"contact sheet: {tmp_path / 'out/contact_sheet.jpg'}"
+
+
+def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_dataset: Calls) -> None:
+    assert run("render", scene_path) == 0
+    scene, out = write_dataset.args
+    assert out == Path("out/scene")
+    assert (scene.spec.output.width, scene.spec.seed, scene.spec.quality) == (64, 7, "balanced")
+    write_dataset.kwargs.pop("progress")
+    assert write_dataset.kwargs == {"frames": None, "workers": 1, "overwrite": False}
+
+
+def test_progress_bar_tells_images_and_rate(
+    scene_path: Path, write_dataset: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write(*args: Any, progress: Any, **kwargs: Any) -> DatasetSummary:
+        for done in range(5, 13):
+            progress(done, 12, "rendering")
+        return DatasetSummary(**vars(write_dataset.result))
+
+    monkeypatch.setattr(dataset, "write_dataset", write)
+    assert run("render", scene_path) == 0
+    bar = capsys.readouterr().err
+    assert "12/12" in bar
+    assert "images/s" in bar
+
+
+def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "one.png"
+    calls = Calls(picture)
+    monkeypatch.setattr(render, "render_xml", calls)
+    assert run("render", "one.xml", "-o", tmp_path) == 0
+    assert calls.args == (Path("one.xml"), tmp_path)
+    assert str(picture) in capsys.readouterr().out
+    assert run("render", "one.xml", "--seed", 3) == 2
+    assert "a Mitsuba scene says size, seed and quality itself" in capsys.readouterr().err
+
+
+def test_preview_writes_a_picture(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    image = np.full((4, 6, 3), (10, 20, 30), dtype=np.uint8)
+    calls = Calls(SimpleNamespace(image=image))
+    monkeypatch.setattr(frame, "render_frame", calls)
+    assert run("preview", scene_path, "--frame", 5, "-o", tmp_path / "a.png", "--size", "6x4") == 0
+    scene, index = calls.args
+    assert (scene.spec.output.width, index) == (6, 5)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
+
+
+@pytest.mark.parametrize("name", ["a.gif", "no/such/folder/a.png"])
+def test_preview_refuses_a_bad_output_before_rendering(
+    scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    monkeypatch.setattr(frame, "render_frame", Calls(error=AssertionError("rendered")))
+    assert run("preview", scene_path, "-o", tmp_path / name) == 2
+
+
+def test_export(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls = Calls()
+    monkeypatch.setattr(render, "export_xml", calls)
+    assert run("export", scene_path, "--frame", 2, "-o", tmp_path / "a.xml") == 0
+    assert calls.args[1:] == (2, tmp_path / "a.xml")
+
+
+def test_bake_passes_every_option_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = Calls(BakeResult(asset=box_asset("gear"), psnr=31.26, psnr_object=28.0))
+    monkeypatch.setattr(bake, "bake_asset", calls)
+    status = run(
+        "bake", "gear.glb", "-o", tmp_path / "gear", "--class", "wheel", "--light", "studio", "--gaussians", 500,
+        "--sh-degree", 1, "--units", 0.001, "--up", "y", "--density", 7800, "--friction", 0.2, "--seed", 4,
+        "--kind", "environment", "--name", "cog",
+    )  # fmt: skip
+    assert status == 0
+    assert calls.args == (Path("gear.glb"),)
+    assert calls.kwargs == {
+        "name": "cog", "class_name": "wheel", "kind": "environment", "light": "studio",
+        "settings": BakeSettings(gaussians=500, sh_degree=1, seed=4), "metres_per_unit": 0.001, "up": "y",
+        "density": 7800.0, "friction": 0.2,
+    }  # fmt: skip
+    assert (tmp_path / "gear/asset.yaml").is_file()
+    assert "31.3 dB" in capsys.readouterr().out
+    assert run("bake", "gear.glb", "-o", tmp_path / "gear") == 0
+    assert calls.kwargs["name"] == "gear"
+
+
+def test_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("schema") == 0
+    assert json.loads(capsys.readouterr().out)["properties"]["camera"]
+
+
+def test_doctor_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("doctor") == 0
+    assert "LLVM" in capsys.readouterr().out
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/no/such/libLLVM.so")
+    assert run("doctor") == 1
+    lines = capsys.readouterr().out.splitlines()
+    failing = next(number for number, line in enumerate(lines) if line.startswith("FAIL  LLVM: /no/such/libLLVM.so"))
+    assert "set DRJIT_LIBLLVM_PATH" in lines[failing + 1]
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--size", "12"], "--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got 12)"),
+        (["--size", "-1x3"], "--size must be WIDTHxHEIGHT"),
+        (["--size", "0x3"], "scene.yaml: output.width: must be >= 1 (got 0)"),
+        (["--seed", "-1"], "scene.yaml: seed: must be >= 0 (got -1)"),
+        (["--format", "yolo,zip"], "output.formats[1]: must be 'yolo', 'coco', 'bop' or 'exr' (got \"zip\")"),
+        (["-n", "13"], "(got 13)"),
+        (["-n", "0"], "(got 0)"),
+        (["--workers", "0"], "(got 0)"),
+    ],
+)
+def test_bad_option_is_one_sentence(
+    scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
+    assert run("render", scene_path, "-o", tmp_path / "out", *options) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert sentence in err
+    assert "Traceback" not in err
+    assert not list(tmp_path.glob("out/images/*/*"))
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (InputError("a.ply: broken"), "mitsplat: a.ply: broken\n"),
+        (PermissionError(13, "Permission denied", "/out"), "mitsplat: /out: Permission denied\n"),
+        (OSError("disk on fire"), "mitsplat: disk on fire\n"),
+    ],
+)
+def test_input_and_file_errors_are_one_sentence(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: Exception, sentence: str
+) -> None:
+    write_dataset.error = error
+    assert run("render", scene_path) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_our_own_bugs_keep_their_traceback(scene_path: Path, write_dataset: Calls) -> None:
+    write_dataset.error = ZeroDivisionError()
+    with pytest.raises(ZeroDivisionError):
+        main(["render", str(scene_path)])
+
+
+def test_interrupt_ends_with_130(scene_path: Path, write_dataset: Calls) -> None:
+    write_dataset.error = KeyboardInterrupt()
+    assert run("render", scene_path) == 130
+
+
+def test_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("render", "gone.yaml") == 2
+    assert capsys.readouterr().err == "mitsplat: gone.yaml: no such file\n"
+
+
+def cut(data: bytes) -> bytes:
+    return data[:-7]
+
+
+def promise_billions(data: bytes) -> bytes:
+    return data.replace(b"element vertex 12\n", b"element vertex 4000000000\n")
+
+
+def first_mean_nan(data: bytes) -> bytes:
+    head, _, body = data.partition(b"end_header\n")
+    return head + b"end_header\n" + np.float32(np.nan).tobytes() + body[4:]
+
+
+@pytest.mark.parametrize("damage", [cut, promise_billions, first_mean_nan])
+def test_damaged_splats_are_one_sentence(
+    scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[bytes], bytes]
+) -> None:
+    splats = tmp_path / "assets/nut/splats.ply"
+    data = splats.read_bytes()
+    assert damage(data) != data
+    splats.write_bytes(damage(data))
+    assert run("render", scene_path, "-o", tmp_path / "out") == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"mitsplat: {scene_path}:")
+    assert str(splats) in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_output_that_is_no_folder_is_one_sentence(
+    scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").write_text("in the way")
+    assert run("render", scene_path, "-o", tmp_path / "out") == 2
+    err = capsys.readouterr().err
+    assert str(tmp_path / "out") in err
+    assert "Traceback" not in err
+
+
+# Help
+
+
+def test_every_command_and_option_is_explained() -> None:
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    for name, command in group.commands.items():
+        assert command.get_short_help_str(80).endswith("."), name
+        unexplained = [param.name for param in command.params if not getattr(param, "help", None)]
+        assert unexplained == [], name
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    from importlib.metadata import version
+
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"

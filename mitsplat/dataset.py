@@ -163,7 +163,7 @@ def _default_settle() -> Settle:
     return settle_layout
 
 
-@dataclass(frozen=True)
+@dataclass
 class _FrameMaker:
     """Renders one frame and writes its files; the unit of work of the engine."""
 
@@ -171,6 +171,7 @@ class _FrameMaker:
     out: Path
     render: Render
     settle: Settle
+    _kept: Layout | None = None
 
     def __call__(self, index: int, note: Note, /) -> tuple[Record, dict[str, float]]:
         from mitsplat.scene import layout_of
@@ -187,17 +188,21 @@ class _FrameMaker:
     def _layout(self, index: int, note: Note) -> Layout:
         """The layout from its file, settled by the first process that asks while others wait for it.
 
-        It is always read back, so that a resumed run works with the very same numbers.
+        It is always read back, so that a resumed run works with the very same numbers, and stays the same object from
+        view to view, by which the renderer knows that nothing moved.
         """
         from mitsplat.settle import Layout
 
+        if self._kept is not None and self._kept.index == index:
+            return self._kept
         path = self.out / f"layouts/{index:04d}.json"
         with (path.parent / _LOCK).open("ab") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; freed with the file or the process
             if not path.exists():
                 note(f"settling layout {index}")
                 write_text(path, json.dumps(self.settle(self.scene, index).to_json()))
-        return Layout.from_json(json.loads(path.read_bytes()))
+        self._kept = Layout.from_json(json.loads(path.read_bytes()))
+        return self._kept
 
 
 @contextmanager
@@ -297,7 +302,7 @@ def _content(scene: Scene) -> dict[str, Any]:
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
         "mitsplat": __version__,
-        "scene": scene.spec.model_dump(mode="json"),
+        "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
         "classes": list(scene.class_names),
         "inputs": inputs,
         "libraries": {name: importlib.metadata.version(name) for name in libraries},

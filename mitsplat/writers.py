@@ -9,8 +9,8 @@ The formats, by their names in a scene file's ``output.formats``:
     ``annotations/instances_<split>.json``: boxes, areas and run-length masks. File names are relative to
     ``images/<split>``, category ids are class indices + 1.
 ``exr``
-    ``layers/<split>/NNNNNN.exr``: linear R, G, B; Z (depth along the camera's axis [m], 0 = nothing); instance (id);
-    normal.X/Y/Z; light; and whatever else the frame carries as layers.
+    ``layers/<split>/NNNNNN.exr``: linear R, G, B; A (opacity); Z (depth along the camera's axis [m], 0 = nothing);
+    instance and proxy_instance (ids); normal.X/Y/Z (world); light.R/G/B; and the frame's further layers by name.
 """
 
 from __future__ import annotations
@@ -122,15 +122,16 @@ def write_exr(path: Path, frame: Frame) -> None:
     """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
     import OpenEXR
 
-    layers = {"depth": frame.depth, "instance": frame.instance, "normal": frame.normal, "light": frame.light}
+    fixed = ("depth", "instance", "proxy_instance", "normal", "light")
+    layers = {**{name: getattr(frame, name) for name in fixed}, **frame.layers}
     names = {"depth": "Z", "alpha": "A"}
+    axes = {"normal": "XYZ"}
     channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}
-    for layer, values in {**layers, **frame.layers}.items():
-        if layer == "rgb" or values is None:
-            continue
-        axes = {2: [""], 3: [".X", ".Y", ".Z"]}[values.ndim]
-        for i, axis in enumerate(axes):
-            channels[names.get(layer, layer) + axis] = values if values.ndim == 2 else values[..., i]
+    for layer, values in layers.items():
+        if values.ndim == 2:
+            channels[names.get(layer, layer)] = values
+        else:
+            channels |= {f"{layer}.{axis}": values[..., i] for i, axis in enumerate(axes.get(layer, "RGB"))}
     kinds = {"f": np.float32, "u": np.uint32, "i": np.uint32, "b": np.uint32}
     contiguous = {name: np.ascontiguousarray(c, dtype=kinds[c.dtype.kind]) for name, c in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

@@ -56,8 +56,9 @@ def render(scene, index, *, layout):
         rgb=image.astype(np.float32) / 255,
         depth=ids.astype(np.float32),
         instance=ids.astype(np.uint16),
-        normal=np.zeros((*ids.shape, 3), dtype=np.float32),
-        light=np.ones(ids.shape, dtype=np.float32),
+        proxy_instance=ids.astype(np.uint16),
+        normal=np.stack(np.meshgrid(range(camera.width), range(camera.height), [0.5]), -1)[:, :, 0].astype(np.float32),
+        light=np.ones((*ids.shape, 3), dtype=np.float32),
         layers={"alpha": np.ones(ids.shape, dtype=np.float32)},
         labels=label_instances(
             ids,
@@ -183,8 +184,10 @@ class TestContent:
         frame = render(scene, 0, layout=settle(scene, 0))
         with OpenEXR.File(str(tmp_path / "out/layers/train/000000.exr"), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-        assert sorted(channels) == ["A", "B", "G", "R", "Z", "instance", "light", "normal.X", "normal.Y", "normal.Z"]
+        single = {"R", "G", "B", "A", "Z", "instance", "proxy_instance"}
+        assert set(channels) == single | {f"normal.{axis}" for axis in "XYZ"} | {f"light.{axis}" for axis in "RGB"}
         np.testing.assert_array_equal(channels["R"], frame.rgb[..., 0])
+        np.testing.assert_array_equal(channels["normal.Y"], frame.normal[..., 1])
         np.testing.assert_array_equal(channels["instance"], frame.instance)
         assert channels["instance"].dtype == np.uint32
 
@@ -262,12 +265,28 @@ class TestSameBytes:
         assert (summary.frames, summary.rendered) == (12, 7)
         assert contents(tmp_path / "out") == undisturbed
 
+    def test_with_layouts_added(self, scene, tmp_path, undisturbed):
+        out = tmp_path / "out"
+        write(load_scene(scene.path, overrides={"output.layouts": 2, "output.formats": scene.spec.output.formats}), out)
+        assert write(scene, out).rendered == 4
+        assert contents(out) == undisturbed
+
     def test_partial_files_are_cleared(self, scene, tmp_path, undisturbed):
         out = tmp_path / "out"
         write(scene, out, frames=2)
         (out / "images/train/.000002.png.123.part").write_bytes(b"half")
         write(scene, out)
         assert contents(out) == undisturbed
+
+    def test_views_of_a_layout_get_the_same_object(self, scene, tmp_path):
+        seen = []
+
+        def watch(scene, index, *, layout):
+            seen.append(layout)
+            return render(scene, index, layout=layout)
+
+        write(scene, tmp_path / "out", render=watch)
+        assert len(set(map(id, seen))) == 3
 
     def test_settled_layouts_are_not_settled_again(self, scene, tmp_path):
         def never(scene, index):

@@ -266,7 +266,7 @@ def _encode_spz(splats: Splats) -> bytes:
     magnified = Splats(means, splats.quats, splats.scales, splats.opacities, splats.sh)
     packed = bytearray(gzip.decompress(_convert(_encode_ply(magnified), "ply", "spz")))
     packed[_SPZ_FRACTIONAL_BITS_OFFSET] = bits
-    return gzip.compress(bytes(packed), mtime=0)
+    return gzip.compress(bytes(packed), compresslevel=6, mtime=0)
 
 
 def _convert(data: bytes, source: str, target: str) -> bytes:

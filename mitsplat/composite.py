@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -132,10 +133,17 @@ def colour_matrix(
     return matrix * 2.0**exposure
 
 
+def _colour() -> Any:
+    """colour-science, without its warning that plots need matplotlib."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    return colour
+
+
 @lru_cache(maxsize=64)
 def _adaptation(kelvin: float) -> npt.NDArray[np.float64]:
-    import colour
-
+    colour = _colour()
     xyz_from_rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
     white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy_CIE_D1967(np.array(kelvin)))
     target = colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint)
@@ -150,8 +158,7 @@ def tone_curve(tone: Literal["neutral", "filmic"]) -> FloatArray:
 
     ``filmic`` is Hable's curve (2010, "Filmic tonemapping operators", Uncharted 2), scaled so that 0.18 stays 0.18.
     """
-    import colour
-
+    colour = _colour()
     x = CURVE_WHITE * (np.arange(CURVE_STEPS) / (CURVE_STEPS - 1)) ** 2
     if tone == "filmic":
 

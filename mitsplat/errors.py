@@ -5,3 +5,7 @@ from __future__ import annotations
 
 class InputError(ValueError):
     """Bad input: one sentence that names file or place, rule and value. The command line exits with status 2."""
+
+
+class MissingResourceError(RuntimeError):
+    """Something that mitsplat needs of the machine is missing; the sentence says what to do. Exit status 3."""

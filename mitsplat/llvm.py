@@ -6,6 +6,8 @@ import os
 import sysconfig
 from pathlib import Path
 
+from mitsplat.errors import MissingResourceError
+
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST_USABLE = 16
 
@@ -26,3 +28,21 @@ def find_bundled_llvm() -> Path | None:
             if (folder / name).exists():
                 return folder / name
     return None
+
+
+def check_llvm() -> None:
+    """Refuse an LLVM that would abort the process at the first kernel.
+
+    Raises:
+        MissingResourceError: If Dr.Jit has loaded no LLVM, or one that is too old.
+    """
+    import drjit
+
+    version = drjit.detail.llvm_version()
+    if version[0] >= OLDEST_USABLE:
+        return
+    found = f"has loaded LLVM {'.'.join(map(str, version))}" if version[0] >= 0 else "has found no LLVM"
+    raise MissingResourceError(
+        f"Dr.Jit {found}, but needs {OLDEST_USABLE} or newer: import mitsplat before drjit and mitsuba, "
+        f"or set {VARIABLE} to a newer libLLVM"
+    )

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
+from mitsplat.llvm import check_llvm
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.splats import Splats
 
@@ -48,7 +49,13 @@ class Layers:
 
 
 def ensure_variant() -> None:
-    """Choose ``llvm_ad_rgb`` unless the user has chosen a variant that the plugins can run in."""
+    """Choose ``llvm_ad_rgb`` unless the user has chosen a variant that the plugins can run in.
+
+    Raises:
+        MissingResourceError: If Dr.Jit has no usable LLVM.
+    """
+    if mi.variant() is None or mi.variant().startswith(("scalar", "llvm")):
+        check_llvm()
     if mi.variant() is None or mi.variant().startswith("scalar"):
         mi.set_variant(VARIANT)
 

@@ -63,7 +63,7 @@ def upload_cloud(means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opaci
     count, bands = len(means), sh.shape[1]
     stride = -(-3 * bands // 4) * 4
     padded = np.zeros((count, stride), np.float32)
-    padded[:, : 3 * bands] = sh.reshape(count, -1)
+    padded[:, : 3 * bands] = sh.reshape(count, 3 * bands)
     widest = scales.max(axis=1, keepdims=True) if count else scales[:, :1]
     sigma = np.zeros((count, 4), np.float32)
     sigma[:, :3] = np.maximum(scales, SCALE_RATIO_MIN * widest)

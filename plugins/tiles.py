@@ -312,7 +312,9 @@ class _Source:
         def coefficient(k: int) -> list[Any]:
             return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]
 
-        return evaluate_sh(dr.normalize(mean), coefficient, bands)
+        # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
+        direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
+        return evaluate_sh(direction, coefficient, bands)
 
 
 def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tuple[Any, Any, Any]:
@@ -344,7 +346,7 @@ def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tup
     tile, entries = dr.gather(mi.UInt32, tile, order), dr.gather(mi.UInt32, rank, order)
     dr.eval(tile, entries)
     i = dr.arange(mi.UInt32, pairs)
-    last = pairs - 1
+    last = dr.opaque(mi.UInt32, pairs - 1)
     first_of_tile = (i == 0) | (tile != dr.gather(mi.UInt32, tile, dr.maximum(i, 1) - 1))
     last_of_tile = (i == last) | (tile != dr.gather(mi.UInt32, tile, dr.minimum(i + 1, last)))
     dr.scatter(start, i, tile, first_of_tile)

@@ -1,0 +1,245 @@
+"""The renderer against its float64 twin and against closed forms."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from reference import render_reference
+from scipy.spatial.transform import Rotation
+
+from mitsplat.camera import Camera
+from mitsplat.composite import tone_curve
+from mitsplat.errors import InputError
+from mitsplat.quality import PRESETS, Quality
+from mitsplat.render import Layers, render_splats
+from mitsplat.splats import SH_C0, Splats
+
+CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=50)
+
+
+def decode(encoded: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB-encoded ones."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def make_splats(n: int, seed: int = 0, *, spread: float = 0.5, scales: tuple[float, float] = (0.02, 0.2), bands: int = 16) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.uniform(-spread, spread, (n, 3)),
+        quats=Rotation.random(n, rng=rng).as_quat(),
+        scales=np.exp(rng.uniform(*np.log(scales), (n, 3))),
+        opacities=rng.uniform(0.05, 1.0, n),
+        sh=np.concatenate([rng.uniform(-1, 1.5, (n, 1, 3)), rng.normal(0, 0.1, (n, bands - 1, 3))], axis=1),
+    )
+
+
+def one(scales: tuple[float, float, float], *, mean=(0.0, 0.0, 0.0), quat=(0.0, 0.0, 0.0, 1.0), opacity=1.0, count=1) -> Splats:
+    """Equal Gaussians of display-encoded colour (0.2, 0.5, 0.8)."""
+    colour = (np.array([0.2, 0.5, 0.8]) - 0.5) / SH_C0
+    tile = lambda v: np.tile(np.asarray(v, dtype=np.float64), (count, 1))  # noqa: E731
+    return Splats(tile(mean), tile(quat), tile(scales), np.full(count, opacity), tile(colour)[:, None, :])
+
+
+def error(layers: Layers, splats: Splats, camera: Camera) -> float:
+    """Largest difference of colour and alpha from the twin, colour compared linear."""
+    twin = render_reference(splats, camera)
+    alpha = np.maximum(twin.alpha, 1e-6)[..., None]
+    linear = decode(twin.rgb / alpha) * twin.alpha[..., None]
+    return float(max(np.abs(layers.rgb - linear).max(), np.abs(layers.alpha - twin.alpha).max()))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_exact_preset_equals_the_twin(seed: int) -> None:
+    splats = make_splats(60, seed)
+    assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+def test_tile_order_equals_the_twin_where_gaussians_do_not_overlap_in_depth() -> None:
+    stack = Splats.concatenate([one((0.1, 0.2, 0.01), mean=(0.0, 0.0, z), opacity=0.4) for z in np.linspace(-0.8, 0.8, 5)])
+    quality = Quality(order="tile", alpha_min=1e-6, transmittance_min=0)
+    assert error(render_splats(stack, CAMERA, quality=quality), stack, CAMERA) < 1e-4
+
+
+def test_all_spherical_harmonic_bands_follow_the_twin_from_every_side() -> None:
+    splats = make_splats(12, 5)
+    for angle in (0.4, 2.0, 4.1):
+        eye = 2 * np.array([np.cos(angle), np.sin(angle), 0.5])
+        camera = Camera.look_at(eye, (0, 0, 0), width=24, height=24, fov_x=45)
+        assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 1e-4
+
+
+@pytest.mark.parametrize("aspect", [10.0, 100.0, 1000.0])
+@pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0, 85.0, 90.0])
+def test_flat_gaussian_is_met_exactly_once(aspect: float, tilt: float) -> None:
+    quat = Rotation.from_euler("x", tilt, degrees=True).as_quat()
+    splats = one((0.3, 0.3, 0.3 / aspect), quat=quat, opacity=0.7)
+    assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+@pytest.mark.parametrize("angle", [0.0, 17.0, 45.0, 90.0])
+def test_needle_follows_the_twin(angle: float) -> None:
+    quat = Rotation.from_euler("zy", [angle, 20.0], degrees=True).as_quat()
+    splats = one((0.5, 0.001, 0.001), quat=quat, opacity=0.9)
+    assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+@pytest.mark.parametrize("count", [20, 200])
+@pytest.mark.parametrize("order", ["tile", "ray"])
+def test_coincident_layers_multiply(count: int, order: str) -> None:
+    """K layers of opacity a at one place leave (1 - a)^K of the light."""
+    splats = one((50.0, 50.0, 0.001), opacity=0.01, count=count)
+    quality = Quality(order=order, alpha_min=1e-6, transmittance_min=0)
+    alpha = render_splats(splats, CAMERA, quality=quality).alpha
+    assert alpha[12, 16] == pytest.approx(1 - 0.99**count, abs=1e-4)
+
+
+@pytest.mark.parametrize("offset", [(0, 0, 0.0), (0, 0, 0.1), (0.05, 0.02, -0.05), (0.0, 0.1, 0.0)])
+def test_camera_inside_a_gaussian_follows_the_twin(offset: tuple[float, float, float]) -> None:
+    mean = np.array([0.0, 0.0, -2.0]) + offset
+    splats = Splats.concatenate([one((0.5, 0.5, 0.5), mean=mean, opacity=0.6), make_splats(20, 9)])
+    assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+def test_gaussian_that_straddles_the_camera_plane_follows_the_twin() -> None:
+    quat = Rotation.from_euler("y", 70.0, degrees=True).as_quat()
+    splats = one((2.0, 0.05, 0.3), mean=(0.8, 0.1, -2.1), quat=quat, opacity=0.8)
+    twin = render_reference(splats, CAMERA)
+    assert twin.alpha.max() > 0.1
+    assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+def test_wide_lens_is_exact_in_the_corners() -> None:
+    camera = Camera.look_at((0, 0, -1), (0, 0, 0), up=(0, -1, 0), width=40, height=30, fov_x=110)
+    splats = make_splats(80, 11, spread=1.2)
+    assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 1e-4
+
+
+def test_distorted_lens_follows_the_twin() -> None:
+    camera = Camera.look_at(
+        (0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=40, height=30, fov_x=70, distortion=(-0.25, 0.08, 0.002, -0.001, -0.01)
+    )
+    splats = make_splats(60, 13, spread=1.0)
+    assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 2e-4
+
+
+def test_means_far_from_the_origin_keep_their_place() -> None:
+    """10 km from the origin, on coordinates that float32 can hold."""
+    near = make_splats(30, 15)
+    shift = np.array([8192.0, -4096.0, 2048.0])
+    grid = 2.0**-10
+    means = np.round(near.means / grid) * grid
+    near = Splats(means, near.quats, near.scales, near.opacities, near.sh)
+    far = Splats(means + shift, near.quats, near.scales, near.opacities, near.sh)
+    camera = Camera.look_at(np.array((0, 0, -2)) + shift, shift, up=(0, -1, 0), width=32, height=24, fov_x=50)
+    expected = render_splats(near, CAMERA, quality="exact").rgb
+    assert np.abs(render_splats(far, camera, quality="exact").rgb - expected).max() < 1e-4
+
+
+def test_rotating_object_and_camera_together_changes_nothing() -> None:
+    splats = make_splats(60, 17)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    turned = Camera(**{**vars(CAMERA), "world_from_camera": turn @ CAMERA.world_from_camera})
+    a = render_splats(splats, CAMERA, quality="exact").rgb
+    b = render_splats(splats.transformed(turn), turned, quality="exact").rgb
+    assert np.abs(a - b).max() < 5e-5
+
+
+def test_opaque_gaussian_hides_what_is_behind() -> None:
+    front, behind = one((500, 500, 0.01), mean=(0, 0, -0.5)), one((500, 500, 0.01), mean=(0, 0, 0.5))
+    behind = Splats(behind.means, behind.quats, behind.scales, behind.opacities, behind.sh * -3)
+    both = render_splats(Splats.concatenate([behind, front]), CAMERA)
+    assert both.alpha[12, 16] == pytest.approx(1.0, abs=1e-5)
+    np.testing.assert_allclose(both.rgb[12, 16], decode(np.array([0.2, 0.5, 0.8])), atol=1e-3)
+    assert both.depth[12, 16] == pytest.approx(1.5, abs=1e-3)
+
+
+def test_opacity_at_the_cut_off_and_below_is_not_seen() -> None:
+    faint = one((0.3, 0.3, 0.3), opacity=1 / 255)
+    assert render_splats(faint, CAMERA).alpha.max() <= 1 / 255 + 1e-6
+    assert render_splats(one((0.3, 0.3, 0.3), opacity=0.9 / 255), CAMERA).alpha.max() == 0.0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (401, 3), (9, 17)])
+def test_odd_image_sizes(size: tuple[int, int]) -> None:
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=size[0], height=size[1], fov_x=40)
+    splats = make_splats(20, 19)
+    layers = render_splats(splats, camera, quality="exact")
+    assert layers.rgb.shape == (size[1], size[0], 3)
+    assert error(layers, splats, camera) < 1e-4
+
+
+def test_nothing_to_see_is_black_and_empty() -> None:
+    behind = one((0.1, 0.1, 0.1), mean=(0, 0, -5))
+    for splats in (behind.select(np.zeros(1, bool)), behind):
+        layers = render_splats(splats, CAMERA)
+        assert not layers.rgb.any() and not layers.alpha.any() and not layers.depth.any() and not layers.instance.any()
+
+
+def test_instance_is_the_one_with_the_largest_share() -> None:
+    layers = render_splats(one((0.1, 0.1, 0.1)), CAMERA)
+    assert layers.instance[12, 16] == 1
+    assert layers.instance[0, 0] == 0
+
+
+def test_denormal_scales_stay_finite() -> None:
+    layers = render_splats(one((0.2, 1e-42, 0.2)), CAMERA)
+    assert np.isfinite(layers.rgb).all() and np.isfinite(layers.depth).all()
+    assert render_splats(one((1e-40, 1e-40, 1e-40)), CAMERA).alpha.max() <= 1.0
+
+
+def test_samples_average_the_pixel() -> None:
+    """4x4 samples of a small image equal the box-downsampled image of four times the size."""
+    splats = make_splats(30, 21)
+    fine = render_splats(splats, CAMERA.resized(128, 96), quality=Quality(alpha_min=1e-5, transmittance_min=1e-6))
+    coarse = render_splats(splats, CAMERA, quality=Quality(samples=4, alpha_min=1e-5, transmittance_min=1e-6))
+    boxed = fine.alpha.reshape(24, 4, 32, 4).mean(axis=(1, 3))
+    assert np.abs(coarse.alpha - boxed).max() < 1e-4
+
+
+def test_same_bytes_from_run_to_run_and_on_one_thread() -> None:
+    splats = make_splats(500, 23)
+    first = render_splats(splats, CAMERA).rgb.tobytes()
+    assert render_splats(splats, CAMERA).rgb.tobytes() == first
+    threads = dr.thread_count()
+    try:
+        dr.set_thread_count(1)
+        assert render_splats(splats, CAMERA).rgb.tobytes() == first
+    finally:
+        dr.set_thread_count(threads)
+
+
+def test_second_frame_needs_no_new_kernel() -> None:
+    """The kernels of another camera and other splats are those of the first frame, not merely on disk by chance."""
+
+    def kernels(splats: Splats, camera: Camera) -> set[int]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            render_splats(splats, camera)
+            return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+
+    first = kernels(make_splats(200, 25), CAMERA)
+    moved = Camera.look_at((0.3, 0.2, -1.9), (0.1, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=42)
+    assert first
+    assert kernels(make_splats(300, 26), moved) <= first
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.integers(0, 2**31), st.floats(-4, 1), st.floats(0, 3), st.floats(20, 120), st.booleans())
+def test_random_extremes_follow_the_twin(seed: int, size: float, stretch: float, fov: float, inside: bool) -> None:
+    rng = np.random.default_rng(seed)
+    splats = make_splats(12, seed, spread=1.0, scales=(10**size / 10**stretch, 10**size))
+    eye = rng.uniform(-1, 1, 3) * (0.5 if inside else 3.0)
+    camera = Camera.look_at(eye, rng.uniform(-0.2, 0.2, 3), width=13, height=9, fov_x=fov)
+    assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 3e-4
+
+
+def test_unknown_quality_is_refused() -> None:
+    with pytest.raises(InputError, match="balanced"):
+        render_splats(make_splats(1), CAMERA, quality="best")
+    assert set(PRESETS) == {"fast", "balanced", "exact"}
+    assert tone_curve("neutral")[0] == 0
+

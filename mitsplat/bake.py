@@ -1,0 +1,367 @@
+"""CAD meshes to assets: surface-aligned Gaussians whose outgoing radiance Mitsuba's path tracer bakes.
+
+Surfels (:mod:`mitsplat.surfels`) are seen from directions all over their hemispheres. The radiance that leaves them
+towards each, display-encoded, is fitted with spherical harmonics. A diffuse white surface under the ``uniform`` light
+has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or face colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.spatial import KDTree
+
+from mitsplat.assets import Asset
+from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.mesh import convex_pieces
+from mitsplat.scene import LightSpec
+from mitsplat.splats import Splats, sh_basis
+from mitsplat.surfels import Surfels, place_surfels
+
+FloatArray = npt.NDArray[np.float64]
+
+_RAYS_PER_LAUNCH = 1 << 21
+_OPACITY = 0.98
+_DETAIL = 4.0
+"""How many times denser Gaussians are where the texture changes strongly."""
+_RIDGE = 0.02
+"""Weight of the penalty on view dependence, relative to the data: decides what no ray has seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class BakeResult:
+    """A baked asset and how close it comes to a path-traced picture of its mesh.
+
+    Attributes:
+        asset: The asset, in metres, z up.
+        psnr: Over whole images of unseen views [dB]; NaN without verification.
+        psnr_object: Over the mesh's pixels alone [dB]; NaN without verification.
+    """
+
+    asset: Asset
+    psnr: float
+    psnr_object: float
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """How finely a mesh is baked.
+
+    Attributes:
+        gaussians: Number of Gaussians aimed for.
+        sh_degree: Degree of the spherical harmonics, 0 to 3; metal needs 2.
+        directions: Directions in which every Gaussian is seen.
+        samples: Light paths per direction.
+        bounces: Longest light path.
+        sharpening: Rounds that undo the blur which overlapping Gaussians cause.
+        density: Relative density of Gaussians of a part of the mesh, by its name; 1 where unnamed.
+        proxy_faces: Most faces of the proxy mesh.
+        verify_views: Views in which the result is compared with the mesh; 0 skips it.
+        seed: Decides every random number.
+    """
+
+    gaussians: int = 20000
+    sh_degree: int = 2
+    directions: int = 48
+    samples: int = 8
+    bounces: int = 6
+    sharpening: int = 4
+    density: Mapping[str, float] | None = None
+    proxy_faces: int = 10000
+    verify_views: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("gaussians", "directions", "samples", "bounces", "proxy_faces"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1 (got {getattr(self, name)})")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
+
+
+def bake_asset(
+    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    *,
+    name: str,
+    class_name: str | None = None,
+    kind: Literal["object", "environment"] = "object",
+    light: str | Sequence[LightSpec] = "uniform",
+    settings: BakeSettings | None = None,
+    metres_per_unit: float = 1.0,
+    up: Literal["y", "z"] = "z",
+    density: float = 1000.0,
+    friction: float = 0.5,
+    cameras: Sequence[Camera] = (),
+) -> BakeResult:
+    """Bake a textured or coloured mesh into an asset of Gaussians.
+
+    Args:
+        mesh: A mesh, a scene of several parts, or a file that trimesh reads.
+        name: Name of the asset.
+        class_name: Class that detectors learn; ``name`` if None.
+        kind: Objects get convex pieces for physics.
+        light: ``uniform`` (radiance 1 from everywhere), ``studio`` (soft boxes all around, mean radiance 1), or the
+            lights of a scene, which the asset then carries as ``capture_light: scene``.
+        settings: How finely to bake.
+        metres_per_unit: Length of the mesh's unit [m].
+        up: Axis that points up in the mesh (glTF: y).
+        density: Mass density [kg/m^3].
+        friction: Coulomb friction coefficient.
+        cameras: Views for the comparison; by default all around the mesh.
+
+    Raises:
+        InputError: If the mesh cannot be read or is empty, or the light is unknown.
+    """
+    settings = settings or BakeSettings()
+    parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up)
+    scene = mitsuba_scene(parts, bake_lights(light))
+    rng = np.random.default_rng(settings.seed)
+    surface = trimesh.util.concatenate([part.mesh for part in parts])
+    relative = settings.density or {}
+    surfels = place_surfels(
+        surface,
+        np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts]),
+        settings.gaussians,
+        rng,
+    )
+    surfels = surfels.subset(~_buried(scene, surfels, rng))
+    if not len(surfels):
+        raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
+    colour = _fit_radiance(scene, surfels, settings, rng)
+    splats = Splats(
+        means=surfels.points.astype(np.float32),
+        quats=surfels.quats.astype(np.float32),
+        scales=surfels.scales.astype(np.float32),
+        opacities=np.full(len(surfels), _OPACITY, dtype=np.float32),
+        sh=_sharpened(surfels, colour, settings.sharpening).astype(np.float32),
+    )
+    proxy = _proxy_mesh(parts, settings.proxy_faces)
+    area = np.array([part.mesh.area for part in parts])
+    asset = Asset(
+        name=name,
+        class_name=class_name or name,
+        splats=splats,
+        mesh=proxy,
+        pieces=convex_pieces(proxy) if kind == "object" else (),
+        kind=kind,
+        density=density,
+        friction=friction,
+        roughness=float(np.average([part.roughness for part in parts], weights=area)),
+        specular=float(np.average([part.specular for part in parts], weights=area)),
+        capture_light="uniform" if isinstance(light, str) else "scene",
+    )
+    if not settings.verify_views:
+        return BakeResult(asset, float("nan"), float("nan"))
+    cameras = cameras or _orbit(surface, settings.verify_views)
+    return BakeResult(asset, *_compare(scene, splats, cameras, settings))
+
+
+def trace_radiance(
+    scene: mi.Scene, origins: FloatArray, directions: FloatArray, *, samples: int, bounces: int, seed: int
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Mean radiance (R, 3) that arrives at ``origins`` (R, 3) [m] from ``directions`` (R, 3), and where a surface is.
+
+    Every ray is traced ``samples`` times by Mitsuba's path tracer.
+    """
+    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
+    radiance, hit = np.empty((len(origins), 3)), np.empty(len(origins), dtype=bool)
+    step = max(1, _RAYS_PER_LAUNCH // samples)
+    for launch, start in enumerate(range(0, len(origins), step)):
+        chunk = slice(start, start + step)
+        rays = mi.RayDifferential3f(
+            mi.Point3f(np.repeat(origins[chunk], samples, axis=0).T.astype(np.float32)),
+            mi.Vector3f(np.repeat(directions[chunk], samples, axis=0).T.astype(np.float32)),
+        )
+        count = len(origins[chunk]) * samples
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed + launch, count)
+        spectrum, valid, _ = integrator.sample(scene, sampler, rays)
+        radiance[chunk] = np.asarray(mi.Color3f(spectrum)).T.reshape(-1, samples, 3).mean(axis=1)
+        hit[chunk] = np.asarray(valid).reshape(-1, samples)[:, 0]
+    return radiance, hit
+
+
+def encode_srgb(linear: npt.ArrayLike) -> FloatArray:
+    """Display-encoded values of linear ones (IEC 61966-2-1), continued above 1 and clipped below 0."""
+    linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _hemisphere(count: int) -> FloatArray:
+    """Directions (M, 3) evenly over the hemisphere around z, none closer than 3 degrees to the horizon."""
+    height = 1.0 - 0.95 * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    radius = np.sqrt(1.0 - height**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
+
+
+def _turned(frames: FloatArray, directions: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """``directions`` (M, 3) in every one of ``frames`` (N, 3, 3), each turned by a random angle: (N, M, 3)."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, (len(frames), 1))
+    cos, sin = np.cos(angle), np.sin(angle)
+    local = np.empty((len(frames), len(directions), 3))
+    local[..., 0] = cos * directions[:, 0] - sin * directions[:, 1]
+    local[..., 1] = sin * directions[:, 0] + cos * directions[:, 1]
+    local[..., 2] = directions[:, 2]
+    return np.einsum("nij,nmj->nmi", frames, local)
+
+
+def _buried(scene: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """Where a surfel (N,) lies inside another solid or under another surface, so that nobody sees it."""
+    directions = _turned(surfels.frames, _hemisphere(12), rng)
+    thickness = surfels.scales[:, 2]
+    origins = surfels.points[:, None] + (2.0 * thickness)[:, None, None] * surfels.normals[:, None]
+    origins = origins + (0.5 * thickness)[:, None, None] * directions
+    rays = mi.Ray3f(
+        mi.Point3f(origins.reshape(-1, 3).T.astype(np.float32)),
+        mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)),
+    )
+    hit = scene.ray_intersect_preliminary(rays)
+    surface = hit.compute_surface_interaction(rays)
+    inside = np.asarray(mi.Float(surface.n @ rays.d)) > 0.0
+    near = np.asarray(hit.t).reshape(len(surfels), -1) < 2.0 * surfels.scales[:, 1:2]
+    covered = (np.asarray(hit.is_valid()) & inside).reshape(len(surfels), -1) | near
+    return np.asarray(covered.all(axis=1))
+
+
+def _fit_radiance(
+    scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator
+) -> FloatArray:
+    """Spherical-harmonic coefficients (N, K, 3) of the display-encoded radiance that leaves every surfel."""
+    local = _hemisphere(settings.directions)
+    weights = 0.2 + local[:, 2]
+    terms = (settings.sh_degree + 1) ** 2
+    penalty = _RIDGE * weights.sum() * np.diag([1e-6] + [1.0] * (terms - 1)) / (4.0 * np.pi)
+    coefficients = np.empty((len(surfels), terms, 3))
+    step = max(1, _RAYS_PER_LAUNCH // (settings.directions * settings.samples))
+    for start in range(0, len(surfels), step):
+        chunk = slice(start, start + step)
+        frames, scales = surfels.frames[chunk], surfels.scales[chunk]
+        towards = _turned(frames, local, rng)
+        # Footprint samples average the texture over the Gaussian instead of aliasing it.
+        offset = np.clip(rng.normal(size=(*towards.shape[:2], 2)), -1.5, 1.5) * 0.5 * scales[:, None, :2]
+        origins = surfels.points[chunk, None] + np.einsum("nij,nmj->nmi", frames[:, :, :2], offset)
+        origins += 2.0 * scales[:, None, 2:] * frames[:, None, :, 2] + 0.5 * scales[:, None, 2:] * towards
+        radiance, _ = trace_radiance(
+            scene,
+            origins.reshape(-1, 3),
+            -towards.reshape(-1, 3),
+            samples=settings.samples,
+            bounces=settings.bounces,
+            seed=int(rng.integers(1 << 30)),
+        )
+        basis = sh_basis(-towards.reshape(-1, 3), settings.sh_degree).reshape(*towards.shape[:2], terms)
+        weighted = weights[:, None] * basis
+        target = encode_srgb(radiance).reshape(*towards.shape) - 0.5
+        coefficients[chunk] = np.linalg.solve(
+            np.einsum("nmk,nml->nkl", weighted, basis) + penalty, np.einsum("nmk,nmc->nkc", weighted, target)
+        )
+    return coefficients
+
+
+def _sharpened(surfels: Surfels, target: FloatArray, rounds: int) -> FloatArray:
+    """Colours (N, K, 3) whose blend at every surfel comes close to ``target`` (N, K, 3).
+
+    Van Cittert's iteration; colours stay within those of their neighbours, so that nothing rings.
+    """
+    if not rounds or len(surfels) < 2:
+        return target
+    neighbours = min(16, len(surfels))
+    _, index = KDTree(surfels.points).query(surfels.points, k=neighbours)
+    offset = surfels.points[:, None] - surfels.points[index]
+    local = np.einsum("nkj,nkji->nki", offset, surfels.frames[index]) / surfels.scales[index]
+    facing = np.einsum("nkd,nd->nk", surfels.normals[index], surfels.normals) > 0.8
+    blend = np.exp(-0.5 * (local[..., :2] ** 2).sum(axis=2)) * facing
+    blend /= blend.sum(axis=1, keepdims=True)
+    colour = target.copy()
+    for band in range(target.shape[1]):
+        wanted, now = target[:, band], colour[:, band]
+        around = wanted[index]
+        low, high = around.min(axis=1), around.max(axis=1)
+        for _ in range(rounds):
+            now = np.clip(now + 0.7 * (wanted - np.einsum("nk,nkc->nc", blend, now[index])), low, high)
+        colour[:, band] = now
+    return colour
+
+
+def _proxy_mesh(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
+    """One surface of all parts, of at most about ``most_faces`` faces; decals on solids are left out."""
+    solids = [part.mesh for part in parts if part.mesh.is_volume]
+    open_parts = [part.mesh for part in parts if not part.mesh.is_volume and not part.is_decal]
+    if len(solids) > 1:
+        solids = [trimesh.boolean.union(solids, engine="manifold")]
+    proxy = trimesh.util.concatenate(solids + (open_parts or ([] if solids else [part.mesh for part in parts])))
+    if len(proxy.faces) > most_faces:
+        proxy = proxy.simplify_quadric_decimation(face_count=most_faces)
+    return trimesh.Trimesh(proxy.vertices, proxy.faces)
+
+
+def _orbit(surface: trimesh.Trimesh, count: int) -> list[Camera]:
+    """Views (``count``) from all around that frame the mesh."""
+    centre = surface.bounds.mean(axis=0)
+    radius = 0.5 * float(np.linalg.norm(surface.extents))
+    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + 0.7
+    ring = np.sqrt(1.0 - height**2)
+    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=1)
+    return [
+        Camera.look_at(centre + 4.5 * radius * d, centre, width=256, height=256, fov_x=29.0, near=0.1 * radius)
+        for d in outward
+    ]
+
+
+def _compare(
+    scene: mi.Scene, splats: Splats, cameras: Sequence[Camera], settings: BakeSettings
+) -> tuple[float, float]:
+    """PSNR [dB] of the splats against the path-traced mesh: whole images, and the mesh's pixels alone."""
+    from mitsplat.render import render_splats
+
+    errors, on_object = [], []
+    for view, camera in enumerate(cameras):
+        truth, hit = render_mesh(scene, camera, samples=36, bounces=settings.bounces, seed=settings.seed + view)
+        layers = render_splats(splats, camera)
+        error = (np.clip(encode_srgb(layers.rgb), 0, 1) - np.clip(encode_srgb(truth), 0, 1)) ** 2
+        errors.append(error.mean())
+        on_object.append(error[hit].mean() if hit.any() else np.nan)
+    return _psnr(float(np.mean(errors))), _psnr(float(np.nanmean(on_object)))
+
+
+def _psnr(error: float) -> float:
+    return float(-10.0 * np.log10(max(error, 1e-12)))
+
+
+def render_mesh(
+    scene: mi.Scene, camera: Camera, *, samples: int, bounces: int = 6, seed: int = 0
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Path-traced radiance (H, W, 3) of a pinhole ``camera``, black where nothing is, and the mask (H, W) of surfaces.
+
+    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid.
+    """
+    side = max(1, round(samples**0.5))
+    fine = camera.resized(camera.width * side, camera.height * side)
+    x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
+    slopes = fine.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.broadcast_to(camera.centre, directions.shape)
+    radiance, hit = trace_radiance(scene, origins, directions, samples=1, bounces=bounces, seed=seed)
+    shape: tuple[Any, ...] = (camera.height, side, camera.width, side)
+    radiance = np.where(hit[:, None], radiance, 0.0).reshape(*shape, 3)
+    # Pixels are averaged encoded, as splats are blended: light spilling over edges is no error of the bake.
+    mean = encode_srgb(radiance).mean(axis=(1, 3))
+    return decode_srgb(mean), hit.reshape(shape).any(axis=(1, 3))
+
+
+def decode_srgb(encoded: npt.ArrayLike) -> FloatArray:
+    """Linear values of display-encoded ones (IEC 61966-2-1)."""
+    encoded = np.asarray(encoded, dtype=np.float64)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)

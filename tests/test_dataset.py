@@ -222,7 +222,7 @@ class TestSameBytes:
             write(scene, out, render=RenderUntil(5, RuntimeError), workers=2)
         kept = len(Manifest(out / "manifest.jsonl"))
         assert kept >= 1
-        assert write(scene, out, workers=2).rendered == 12 - kept
+        assert write(scene, out).rendered == 12 - kept
         assert contents(out) == undisturbed
 
     def test_stopped_between_image_and_label(self, scene, tmp_path, undisturbed, monkeypatch):

@@ -253,8 +253,8 @@ def _load_objects(spec: SceneSpec, path: Path) -> tuple[Asset, ...]:
 
 def _check_fit(asset: Asset, region: Region) -> None:
     """Refuse an object that physics cannot move, or that could not lie in the region on its largest side."""
-    if asset.mesh is None:
-        raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
+    if asset.kind != "object" or asset.mesh is None:
+        raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh to be dropped")
     footprint = np.sort(asset.mesh.extents)[1:]
     space = np.sort(np.subtract(region.max, region.min)[:2])
     if (footprint > space).any():

@@ -68,7 +68,7 @@ class Box(StrictModel):
 
 
 class Shape(StrictModel):
-    """A box or a mesh that is rendered, collides, or both."""
+    """A box or a mesh that is rendered, collides or shades."""
 
     name: str = Field(min_length=1, description="Name, unique among the shapes.")
     box: Box | None = Field(None, description="The shape as a box.")
@@ -76,7 +76,8 @@ class Shape(StrictModel):
     visible: bool = Field(False, description="Whether it is rendered.")
     collider: bool = Field(True, description="Whether objects rest on it and bounce off it.")
     proxy: bool = Field(
-        False, description="Whether light is traced against it though it is not rendered: a table that only splats show."
+        False,
+        description="Whether light is traced against it though it is not rendered: a table that only splats show.",
     )
     colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
     friction: NonNegativeFloat = Field(0.6, description="Coulomb friction coefficient.")
@@ -85,8 +86,8 @@ class Shape(StrictModel):
     def _check(self) -> Shape:
         if (self.box is None) == (self.mesh is None):
             raise FieldError("name", f"shape {self.name!r} must have either a box or a mesh")
-        if not (self.visible or self.collider):
-            raise FieldError("visible", f"shape {self.name!r} must be visible, a collider, or both")
+        if not (self.visible or self.collider or self.proxy):
+            raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
         return self
 
 

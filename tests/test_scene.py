@@ -129,7 +129,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0__count": 1.5}, "objects[0].count: must be a list (got 1.5)"),
         ({"objects__0__scale": 0}, "objects[0].scale: must be > 0 (got 0)"),
         ({"region__max": [0.2, -0.3, 1]}, "region.max: must be above min along y (got -0.3, min is -0.2)"),
-        ({"shapes__0__visible": False, "shapes__0__collider": False}, "must be visible, a collider, or both"),
+        ({"shapes__0__visible": False, "shapes__0__collider": False}, "must be visible, a collider or a proxy"),
         ({"shapes__0__mesh": "a.ply"}, "must have either a box or a mesh"),
         ({"shapes": [{"name": "a", "mesh": "b.ply"}] * 2}, "shapes[1].name: must be unique (got 'a' again)"),
         ({"shapes__0__colour": [0, 0, 2]}, "shapes[0].colour[2]: must be <= 1 (got 2)"),
@@ -187,6 +187,13 @@ def test_errors_in_assets_name_both_files(scene_data: SceneData, write_scene: Wr
     message = refusal(path)
     assert message.startswith("objects[1].asset: ")
     assert str(path.parent / "assets/bolt") in message
+
+
+def test_environment_cannot_be_dropped(scene_data: SceneData, write_scene: WriteScene) -> None:
+    path = write_scene(scene_data)
+    replace(box_asset("room"), kind="environment", pieces=()).save(path.parent / "assets/room")
+    scene_data["objects"][1]["asset"] = "assets/room"
+    assert "asset 'room' must be of kind object and have a mesh" in refusal(write_scene(scene_data))
 
 
 # Frames

@@ -49,7 +49,8 @@ def main(args: Sequence[str] | None = None) -> None:
 def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a Mitsuba scene (.xml).")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Dataset folder; out/<name of SCENE> if absent.")
+        Path | None,
+        typer.Option("--out", "-o", help="Dataset folder, or picture of an .xml; out/<name of SCENE> if absent."),
     ] = None,
     frames: Annotated[int | None, typer.Option("--frames", "-n", help="Only the first so many images.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")] = None,
@@ -74,7 +75,7 @@ def render(
     if scene.suffix == ".xml":
         if overrides or frames is not None:
             raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
-        from mitsplat.render import render_xml
+        from mitsplat.xml_scene import render_xml
 
         typer.echo(f"picture: {render_xml(scene, out)}")
         return
@@ -123,8 +124,8 @@ def export(
 
     It can be edited, and rendered by `mitsplat render`.
     """
-    from mitsplat.render import export_xml
     from mitsplat.scene import load_scene
+    from mitsplat.xml_scene import export_xml
 
     export_xml(load_scene(scene), frame, out)
     typer.echo(f"scene: {out}")

@@ -16,7 +16,7 @@ import typer.main
 from conftest import WriteScene, box_asset
 from PIL import Image
 
-from mitsplat import bake, dataset, frame, render
+from mitsplat import bake, dataset, frame, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
@@ -114,7 +114,7 @@ def test_progress_bar_tells_images_and_rate(
 def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "one.png"
     calls = Calls(picture)
-    monkeypatch.setattr(render, "render_xml", calls)
+    monkeypatch.setattr(xml_scene, "render_xml", calls)
     assert run("render", "one.xml", "-o", tmp_path) == 0
     assert calls.args == (Path("one.xml"), tmp_path)
     assert str(picture) in capsys.readouterr().out
@@ -142,7 +142,7 @@ def test_preview_refuses_a_bad_output_before_rendering(
 
 def test_export(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = Calls()
-    monkeypatch.setattr(render, "export_xml", calls)
+    monkeypatch.setattr(xml_scene, "export_xml", calls)
     assert run("export", scene_path, "--frame", 2, "-o", tmp_path / "a.xml") == 0
     assert calls.args[1:] == (2, tmp_path / "a.xml")
 

@@ -156,11 +156,10 @@ class _Studio:
     def __init__(self, scene: Scene, quality: str | Quality) -> None:
         ensure_variant()
         self.scene = scene
-        low, high = np.array(scene.spec.region.min), np.array(scene.spec.region.max)
         self.integrator = make_integrator(
             quality=quality,
             shadow="none" if scene.spec.composite.shadow == "none" else "traced",
-            reference=(*(low + high)[:2] / 2, low[2]),
+            reference=reference_point(scene),
         )
         self.static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None
@@ -213,13 +212,24 @@ def _asset_shape(asset: Asset, world_from_asset: npt.NDArray[np.float64], instan
 
 def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) -> Any:
     """A plain diffuse mesh; its colour is display-encoded, as in the scene file."""
-    encoded = np.asarray(colour)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}})
+    props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": srgb_to_linear(colour).tolist()}})
     shape = mi.Mesh("shape", len(mesh.vertices), len(mesh.faces), props=props)
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, dtype=np.float32).ravel())
     params["faces"] = mi.UInt32(np.asarray(mesh.faces, dtype=np.uint32).ravel())
     params.update()
     return shape
+
+
+def srgb_to_linear(encoded: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Linear values of display-encoded ones (IEC 61966-2-1)."""
+    values = np.asarray(encoded, dtype=np.float64)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def reference_point(scene: Scene) -> tuple[float, float, float]:
+    """Where uniformly captured colours are shown unchanged [m]: below the middle of the drop region."""
+    low, high = np.array(scene.spec.region.min), np.array(scene.spec.region.max)
+    x, y = (low + high)[:2] / 2
+    return float(x), float(y), float(low[2])

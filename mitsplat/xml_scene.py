@@ -1,0 +1,143 @@
+"""Mitsuba scene files: one frame written as XML to be edited by hand, and XML scenes rendered to a picture."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.assets import Asset
+from mitsplat.cad import emitter_dict
+from mitsplat.composite import develop
+from mitsplat.errors import InputError
+from mitsplat.frame import reference_point, srgb_to_linear
+from mitsplat.render import describe_sensor, ensure_variant
+from mitsplat.scene import Scene, layout_of, plan_frame
+from mitsplat.settle import settle_layout
+from mitsplat.spec import Shape
+
+
+def export_xml(scene: Scene, index: int, path: str | Path) -> None:
+    """Write one frame as a Mitsuba scene, with its splats and meshes in a folder beside it.
+
+    The scene shows what the frame's layers hold; exposure, tone and noise are not part of it.
+
+    Raises:
+        InputError: If the index is out of range, or the layout cannot be settled.
+        OSError: If the files cannot be written.
+    """
+    ensure_variant()
+    path = Path(path)
+    files = path.with_name(f"{path.stem}_files")
+    plan = plan_frame(scene, index)
+    layout = settle_layout(scene, layout_of(scene, index))
+    files.mkdir(parents=True, exist_ok=True)
+    shapes: dict[str, Any] = {}
+    if scene.environment is not None:
+        shapes["environment"] = _describe_asset(scene.environment, files, np.eye(4), 0)
+    for instance in layout.instances:
+        asset = scene.assets[instance.asset]
+        shapes[f"instance_{instance.id}"] = _describe_asset(asset, files, instance.world_from_object, instance.id)
+    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
+        if shape.visible:
+            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, files / f"shape_{number}.ply")
+    lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
+    description = {
+        "type": "scene",
+        "integrator": {
+            "type": "splat_proxy",
+            "quality": scene.spec.quality,
+            "shadow": "none" if scene.spec.composite.shadow == "none" else "traced",
+            "reference": list(reference_point(scene)),
+        },
+        "sensor": describe_sensor(plan.camera),
+        **shapes,
+        **lights,
+    }
+    _teach_writer()
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), description)
+    mi.parser.write_file(state, str(path))
+
+
+def render_xml(path: str | Path, out: str | Path) -> Path:
+    """Render a Mitsuba scene with the integrator, sensor and size that it states.
+
+    Args:
+        path: The ``.xml`` file.
+        out: Picture to write (``.png``, ``.jpg`` or ``.exr``), or a folder, which gets ``picture.png``.
+
+    Returns:
+        Path of the picture.
+
+    Raises:
+        InputError: If the file is missing or Mitsuba refuses it.
+    """
+    ensure_variant()
+    path, out = Path(path), Path(out)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    picture = out if out.suffix.lower() in (".png", ".jpg", ".exr") else out / "picture.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        scene = mi.load_file(str(path.resolve()))
+        if not scene.sensors():
+            raise InputError(f"{path}: the scene has no sensor")
+        image = np.array(mi.render(scene))
+    except RuntimeError as error:
+        raise InputError(f"{path}: {_last_sentence(error)}") from error
+    if picture.suffix.lower() == ".exr":
+        mi.Bitmap(image[..., :3]).write(str(picture))
+        return picture
+    mi.Bitmap(develop(image[..., :3], {})).write(str(picture))
+    return picture
+
+
+def _last_sentence(error: RuntimeError) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else "Mitsuba refuses it without a reason"
+
+
+def _describe_asset(asset: Asset, files: Path, world_from_asset: np.ndarray, instance: int) -> dict[str, Any]:
+    splats, mesh = files / f"{asset.name}.ply", files / f"{asset.name}_proxy.ply"
+    if not splats.exists():
+        asset.splats.save(splats)
+    description: dict[str, Any] = {
+        "type": "splats",
+        "filename": f"{files.name}/{splats.name}",
+        "instance": instance,
+        "capture_light": asset.capture_light,
+        "roughness": float(asset.roughness),
+        "specular": float(asset.specular) if instance else 0.0,
+        "to_world": mi.ScalarTransform4f(world_from_asset),
+    }
+    if asset.mesh is not None:
+        if not mesh.exists():
+            asset.mesh.export(mesh)
+        description["proxy"] = f"{files.name}/{mesh.name}"
+    return description
+
+
+def _describe_shape(shape: Shape, mesh: trimesh.Trimesh, path: Path) -> dict[str, Any]:
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+    return {
+        "type": "ply",
+        "filename": f"{path.parent.name}/{path.name}",
+        "face_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": srgb_to_linear(shape.colour).tolist()}},
+    }
+
+
+def _teach_writer() -> None:
+    """Tell Mitsuba's XML writer what kind of plugin ours are: it looks them up in a scalar variant, where they cannot run."""
+    scalar = importlib.import_module("mitsuba.scalar_rgb")
+
+    def refuse(props: Any) -> Any:
+        raise RuntimeError(f"plugin {props.plugin_name()!r} needs an llvm or cuda variant")
+
+    scalar.register_integrator("splat_proxy", refuse)
+    scalar.register_sensor("opencv_camera", refuse)
+    scalar.register_shape("splats", refuse)

@@ -50,7 +50,7 @@ def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a Mitsuba scene (.xml).")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Dataset folder, or picture of an .xml; out/<name of SCENE> if absent."),
+        typer.Option("--out", "-o", help="Dataset folder (for .xml: picture); out/<name of SCENE> if absent."),
     ] = None,
     frames: Annotated[int | None, typer.Option("--frames", "-n", help="Only the first so many images.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")] = None,

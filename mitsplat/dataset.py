@@ -21,6 +21,7 @@ import hashlib
 import importlib.metadata
 import json
 import os
+import re
 import shutil
 import time
 from collections import Counter
@@ -36,7 +37,7 @@ from mitsplat.engine import Note, run_frames
 from mitsplat.errors import InputError
 from mitsplat.manifest import Manifest, append_line, cut_torn_line
 from mitsplat.sheet import contact_sheet
-from mitsplat.writers import FORMATS, SPLITS, Record, write_collection, write_frame, write_text
+from mitsplat.writers import FORMATS, SPLITS, Record, write_collection, write_file, write_frame, write_text
 
 if TYPE_CHECKING:
     from mitsplat.assets import Asset
@@ -56,6 +57,8 @@ _MANIFEST = "manifest.jsonl"
 _TIMINGS = "timings.jsonl"
 _SHEET = "contact_sheet.jpg"
 _LOCK = ".lock"
+_UNFINISHED = re.compile(r"\.lock|\.dataset\.json\.\d+\.part")
+"""Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
     *("images", "labels", "layers", "annotations", "layouts", "scene"),
     *("data.yaml", _SHEET, _MANIFEST, _TIMINGS, _CONTENT, _LOCK),
@@ -209,6 +212,7 @@ class _FrameMaker:
 def _open_folder(scene: Scene, out: Path, *, resume: bool, overwrite: bool) -> Iterator[Manifest]:
     """Lock and prepare the folder; its manifest, without the frames that miss a file."""
     content = _content(scene)
+    _check_own(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
         lock = (out / _LOCK).open("a+")
@@ -224,9 +228,9 @@ def _open_folder(scene: Scene, out: Path, *, resume: bool, overwrite: bool) -> I
         lock.write(str(os.getpid()))
         lock.flush()
         try:
-            _check_resumable(out, content, resume=resume, overwrite=overwrite)
             if overwrite:
                 _remove_dataset(out)
+            _check_resumable(out, content, resume=resume)
             _prepare(out, scene, content)
         except OSError as error:
             raise InputError(f"cannot write into {out}: {error.strerror} ({error.filename})") from error
@@ -240,36 +244,42 @@ def _open_folder(scene: Scene, out: Path, *, resume: bool, overwrite: bool) -> I
             _remove_partial(out)
 
 
-def _check_resumable(out: Path, content: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
-    """Refuse a folder that holds something other than a dataset, or one that may not be continued."""
+def _check_own(out: Path) -> None:
+    """Refuse a folder that holds something other than a dataset of mitsplat, which must not be mixed up or removed."""
+    try:
+        present = json.loads((out / _CONTENT).read_bytes())
+        own = isinstance(present, dict) and "mitsplat" in present
+    except (FileNotFoundError, NotADirectoryError):
+        own = not out.is_dir() or all(_UNFINISHED.fullmatch(entry.name) for entry in out.iterdir())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{out / _CONTENT} cannot be read ({error})") from error
+    if not own:
+        raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds other files)")
+
+
+def _check_resumable(out: Path, content: dict[str, Any], *, resume: bool) -> None:
+    """Refuse to continue a dataset against the caller's will, or one that another scene began."""
     if not (out / _CONTENT).exists():
-        if foreign := sorted({entry.name for entry in out.iterdir()} - set(_ENTRIES)):
-            raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds {foreign[0]})")
-        return
-    if overwrite:
         return
     if not resume:
         raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
-    try:
-        present = json.loads((out / _CONTENT).read_bytes())
-    except ValueError as error:
-        raise InputError(f"{out / _CONTENT} is not readable JSON ({error}); overwrite the dataset") from error
-    present.pop("libraries", None)
-    if difference := _first_difference(present, {k: v for k, v in content.items() if k != "libraries"}):
+    present = json.loads((out / _CONTENT).read_bytes())
+    if difference := _first_difference({**present, "libraries": None}, {**content, "libraries": None}):
         key, before, now = difference
         raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
 
 
 def _prepare(out: Path, scene: Scene, content: dict[str, Any]) -> None:
-    """Make the folders and what describes the run; clear what an interrupted one left."""
+    """Make what describes the run, by which the folder is known for a dataset, then the rest; clear what is torn."""
+    _remove_partial(out)
+    if not (out / _CONTENT).exists():
+        write_text(out / _CONTENT, json.dumps(content, indent=1) + "\n")
     kinds = ["images", *(["labels"] if "yolo" in scene.spec.output.formats else [])]
     kinds += ["layers"] if "exr" in scene.spec.output.formats else []
     for name in ("layouts", "scene", *(f"{kind}/{split}" for kind in kinds for split in SPLITS)):
         (out / name).mkdir(parents=True, exist_ok=True)
-    _remove_partial(out)
-    if not (out / _CONTENT).exists():
-        shutil.copyfile(scene.path, out / "scene" / scene.path.name)
-        write_text(out / _CONTENT, json.dumps(content, indent=1) + "\n")
+    if not (out / "scene" / scene.path.name).exists():
+        write_file(out / "scene" / scene.path.name, lambda temporary: shutil.copyfile(scene.path, temporary))
     cut_torn_line(out / _TIMINGS)
 
 

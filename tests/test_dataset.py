@@ -336,11 +336,20 @@ class TestRefusals:
         self.refuse(scene, tmp_path / "out", "already holds a dataset", resume=False)
 
     @pytest.mark.parametrize("overwrite", [False, True])
-    def test_a_folder_of_something_else(self, scene, tmp_path, overwrite):
-        (tmp_path / "out").mkdir()
-        (tmp_path / "out/thesis.tex").write_text("years of work")
-        self.refuse(scene, tmp_path / "out", r"must be empty or a dataset .*thesis\.tex", overwrite=overwrite)
-        assert (tmp_path / "out/thesis.tex").exists()
+    @pytest.mark.parametrize("files", [["thesis.tex"], ["images/train/1.png", "labels/train/1.txt", "data.yaml"]])
+    def test_a_folder_of_something_else_stays_as_it_is(self, scene, tmp_path, files, overwrite):
+        out = tmp_path / "out"
+        for file in files:
+            (out / file).parent.mkdir(parents=True, exist_ok=True)
+            (out / file).write_text("years of work")
+        before = contents(out, without=())
+        self.refuse(scene, out, "must be empty or a dataset of mitsplat", overwrite=overwrite)
+        (out / "dataset.json").write_text("[]")
+        self.refuse(scene, out, "must be empty or a dataset of mitsplat", overwrite=overwrite)
+        (out / "dataset.json").write_text("{")
+        self.refuse(scene, out, r"dataset\.json cannot be read", overwrite=overwrite)
+        (out / "dataset.json").unlink()
+        assert contents(out, without=()) == before
 
     def test_a_second_writer(self, scene, tmp_path):
         out = tmp_path / "out"

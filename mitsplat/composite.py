@@ -145,7 +145,7 @@ def _colour() -> Any:
 def _adaptation(kelvin: float) -> npt.NDArray[np.float64]:
     colour = _colour()
     xyz_from_rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
-    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy_CIE_D1967(np.array(kelvin)))
+    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="CIE Illuminant D Series"))
     target = colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint)
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(white, target, transform="Bradford")
     matrix = np.linalg.inv(xyz_from_rgb) @ adapt @ xyz_from_rgb

@@ -33,6 +33,9 @@ R2 = (0.7548776662466927, 0.5698402909980532)
 """Additive recurrence of the two-dimensional golden ratio (Roberts 2018, "The unreasonable effectiveness of quasirandom
 sequences")."""
 
+NOISE_LIMIT = 6.0
+"""Squared standard deviations within which two neighbours' shadows may be averaged."""
+
 REFERENCE_SAMPLES = 4096
 
 
@@ -68,7 +71,7 @@ class Proxies:
             si = scene.scene.ray_intersect(ray)
             closer = si.t < distance
             facing = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
-            proxy = closer & (si.shape == scene.mesh)
+            proxy = closer & (si.shape == scene.mesh) if scene.mesh is not None else mi.Bool(False)
             number = dr.gather(mi.UInt32, scene.instances, si.prim_index, proxy)
             instance = dr.select(closer, number, instance)
             distance, normal = dr.select(closer, si.t, distance), dr.select(closer, facing, normal)
@@ -77,7 +80,7 @@ class Proxies:
 
 @dataclass(frozen=True, eq=False)
 class _TraceScene:
-    """All meshes as one, with the instance id of every triangle."""
+    """All meshes as one, with the instance id of every triangle, beside visible shapes; ``mesh`` is None without any."""
 
     scene: Any
     mesh: Any
@@ -89,7 +92,7 @@ class _TraceScene:
         occluders = [o for o in occluders if len(o.mesh.faces)]
         if not occluders:
             nothing = mi.UInt32([0])
-            return cls(mi.load_dict({"type": "scene", **others}), mi.ShapePtr(), nothing) if others else None
+            return cls(mi.load_dict({"type": "scene", **others}), None, nothing) if others else None
         merged = trimesh.util.concatenate([trimesh.Trimesh(o.mesh.vertices, o.mesh.faces, process=False) for o in occluders])
         mesh = mi.Mesh("proxies", len(merged.vertices), len(merged.faces))
         params = mi.traverse(mesh)
@@ -126,8 +129,10 @@ class Surface:
 
 def trace_light(
     scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int, reference: Any
-) -> tuple[Any, Any]:
-    """Light factor (Color3f) and highlight (Color3f) of every visible point, see the module docstring.
+) -> tuple[Any, Any, Any]:
+    """Light factor and highlight (Color3f) of every visible point, and the share of its light that dynamic objects leave.
+
+    See the module docstring for what the factor means.
 
     Args:
         scene: Mitsuba scene whose emitters give the light.
@@ -157,7 +162,9 @@ def trace_light(
         cosine = dr.dot(surface.normal, sample.d)
         active = surface.valid & (cosine > 0) & (sample.pdf > 0)
         ray = mi.Ray3f(origin, sample.d)
-        ray.maxt = dr.maximum(sample.dist - 2 * surface.offset, 0)
+        # The distance to a light at infinity is made up from the extent of visible meshes, which proxies are not part of.
+        infinite = mi.has_flag(sample.emitter.flags(), mi.EmitterFlags.Infinite)
+        ray.maxt = dr.select(infinite, dr.inf, dr.maximum(sample.dist - 2 * surface.offset, 0))
         blocked = mi.Bool(False)
         if proxies.static is not None:
             blocked = proxies.static.scene.ray_test(ray, active=active)
@@ -179,7 +186,8 @@ def trace_light(
     weight = 1.0 / mi.Float(rounds)
     captured = dr.select(unshadowed > 0, lit / unshadowed, 1)
     factor = dr.select(surface.relit, lit * weight / reference, captured)
-    return dr.select(surface.valid, factor, 1), shine * (weight * dr.pi / reference)
+    share = dr.select(dr.sum(unshadowed) > 0, dr.sum(lit) / dr.sum(unshadowed), 1)
+    return dr.select(surface.valid, factor, 1), shine * (weight * dr.pi / reference), share
 
 
 def _ggx(surface: Surface, to_light: Any, cos_light: Any, cos_camera: Any, alpha2: Any) -> Any:
@@ -197,15 +205,19 @@ def _ggx(surface: Surface, to_light: Any, cos_light: Any, cos_camera: Any, alpha
 
 
 def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
-    """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element."""
+    """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
+
+    Where next to nothing reaches that element, it is the mean over all orientations, a quarter of the fluence.
+    """
     i = dr.arange(mi.Float, REFERENCE_SAMPLES) + 1.0
     si = dr.zeros(mi.SurfaceInteraction3f, REFERENCE_SAMPLES)
     si.p = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point])
     si.n = mi.Normal3f(*normal)
     si.sh_frame = mi.Frame3f(si.n)
     sample, radiance = scene.sample_emitter_direction(si, mi.Point2f(*[i * s - dr.floor(i * s) for s in R2]), False)
-    light = radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)
-    return mi.Color3f(*[dr.mean(c) for c in light])
+    irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
+    mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])
+    return dr.maximum(dr.select(irradiance > 1e-3 * mean, irradiance, mean), 1e-12)
 
 
 def _bayer(x: Any, y: Any) -> Any:
@@ -218,19 +230,24 @@ def _bayer(x: Any, y: Any) -> Any:
 
 
 def smooth_light(
-    factor: Any, highlight: Any, surface: Surface, group: Any, view: View, *, radius: int = 4
+    factor: Any, highlight: Any, share: Any, surface: Surface, group: Any, view: View, *, samples: int, radius: int = 4
 ) -> tuple[Any, Any]:
     """Average light over neighbours on the same surface: a separable filter that keeps edges.
 
-    A neighbour counts where it belongs to the same ``group``, its normal agrees, and it lies in the tangent plane. Where
-    all neighbours are equal the result is the same value exactly, so that unshadowed points stay at 1.
+    A neighbour counts where it belongs to the same ``group``, its normal agrees, it lies in the tangent plane, and its
+    ``share`` of unshadowed light differs by no more than the noise of ``samples`` binary draws explains, so that a hard
+    shadow keeps its edge while a penumbra becomes smooth. Where all neighbours are equal the result is the same value
+    exactly, so that unshadowed points stay at 1.
     """
     count = dr.width(group)
     pixel = dr.arange(mi.UInt32, count)
     x, y = mi.Int32(pixel % view.width), mi.Int32(pixel // view.width)
     footprint = surface.offset * 8
     values = [*factor, *highlight]
-    dr.eval(values, surface.position, surface.normal)
+    draws = 0.5 * samples  # of the samples, those that are not below the horizon
+    likely = (share * draws + 0.5) / (draws + 1)
+    variance = likely * (1 - likely) / draws
+    dr.eval(values, surface.position, surface.normal, share, variance)
     for horizontal in (True, False):
         middle = values
         total = [mi.Float(v) for v in values]
@@ -245,6 +262,8 @@ def smooth_light(
             same = inside & (dr.gather(mi.UInt32, group, other, inside) == group)
             plane = dr.abs(dr.dot(surface.normal, position - surface.position))
             same &= (dr.dot(surface.normal, normal) > 0.95) & (plane < footprint * abs(step))
+            noise = variance + dr.gather(mi.Float, variance, other, same)
+            same &= dr.square(dr.gather(mi.Float, share, other, same) - share) <= NOISE_LIMIT * noise
             weight = dr.select(same, 1.0, 0.0)
             weights += weight
             # Differences from the middle, so that equal neighbours leave it bit for bit as it was.

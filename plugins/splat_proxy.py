@@ -162,10 +162,10 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             if behind:
                 surface.relit |= front
             reference = reference_irradiance(scene, self.reference)
-            light, highlight = trace_light(
+            traced = trace_light(
                 scene, contents.proxies, surface, view.width, samples=self.shadow_samples, seed=seed, reference=reference
             )
-            light, highlight = smooth_light(light, highlight, surface, instance, view)
+            light, highlight = smooth_light(*traced, surface, instance, view, samples=self.shadow_samples)
         layers = {
             "rgb": colour * light + highlight * alpha,
             "alpha": alpha,

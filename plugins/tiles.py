@@ -78,6 +78,8 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     geometry, scales = dr.empty(mi.Float, 8 * total), dr.empty(mi.Float, 4 * total)
     sh = dr.zeros(mi.Float, stride * total)
     for start, c in zip(first, clouds, strict=True):
+        if c.count == 0:
+            continue
         for target, source, width in ((geometry, c.geometry, 8), (scales, c.scales, 4)):
             dr.scatter(target, source, dr.arange(mi.UInt32, c.count * width) + start * width)
         i = dr.arange(mi.UInt32, c.count * c.sh_stride)

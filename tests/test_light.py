@@ -1,0 +1,172 @@
+"""Traced light against closed forms, and the mutual occlusion of splats and visible meshes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.camera import Camera
+from mitsplat.render import Layers, make_integrator, make_splats_shape, render_layers
+from mitsplat.splats import SH_C0, Splats
+
+WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
+
+
+def down_camera(height: float = 1.0, size: int = 32, fov: float = 20.0) -> Camera:
+    return Camera.look_at((0, 0, height), (0, 0, 0), up=(0, 1, 0), width=size, height=size, fov_x=fov)
+
+
+def floor(extent: float = 1.0, grey: float = 0.5, z: float = 0.0) -> Splats:
+    """An opaque grey plane of Gaussians at height z."""
+    n = 40
+    x, y = np.meshgrid(np.linspace(-extent, extent, n), np.linspace(-extent, extent, n))
+    spacing = 2 * extent / (n - 1)
+    means = np.stack([x.ravel(), y.ravel(), np.full(n * n, z)], axis=1)
+    return Splats(
+        means,
+        np.tile([0, 0, 0, 1.0], (n * n, 1)),
+        np.tile([spacing, spacing, 0.01 * spacing], (n * n, 1)),
+        np.full(n * n, 0.999),
+        np.full((n * n, 1, 3), (grey - 0.5) / SH_C0),
+    )
+
+
+def slab(extent: float = 1.0, top: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[[-extent, -extent, top - 0.1 * extent], [extent, extent, top]])
+
+
+def render(shapes: dict[str, Any], camera: Camera, *, samples: int = 64, **options: Any) -> Layers:
+    integrator = make_integrator(shadow_samples=samples, **options)
+    return render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), camera)
+
+
+def test_without_dynamic_objects_nothing_changes_bit_for_bit() -> None:
+    make_integrator()
+    shapes = {"floor": make_splats_shape(floor(), proxy=slab()), "sky": WHITE_SKY}
+    lit = render(shapes, down_camera())
+    plain = render(shapes, down_camera(), shadow="none")
+    assert (lit.light == 1).all()
+    assert lit.rgb.tobytes() == plain.rgb.tobytes()
+    assert lit.rgb.max() > 0.1
+
+
+def test_wall_hides_half_of_a_uniform_sky() -> None:
+    """At the foot of a tall wall half of the cosine-weighted hemisphere is dark: the ratio is 1/2."""
+    make_integrator()
+    wall = trimesh.creation.box(bounds=[[0.0, -500, 0.001], [0.5, 500, 500]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "wall": make_splats_shape(floor().select(np.zeros(1600, bool)), proxy=wall, instance=1),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((-0.02, 0, 0.3), (-0.02, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=4)
+    light = render(shapes, camera, samples=256).light
+    assert light.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_object_between_a_point_light_and_the_floor_leaves_none() -> None:
+    make_integrator()
+    blocker = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.4], [0.05, 0.05, 0.41]])
+    lamp = {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": {"type": "rgb", "value": 5.0}}
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "blocker": make_splats_shape(floor().select(np.zeros(1600, bool)), proxy=blocker, instance=1),
+        "lamp": lamp,
+    }
+    camera = Camera.look_at((0.0, -1.5, 0.3), (0, 0, 0), width=64, height=48, fov_x=30)
+    light = render(shapes, camera).light
+    assert light.min() == 0.0
+    assert light.max() == 1.0
+    # The shadow of a 0.1 m square from 2 m above, 0.4 m over the floor, is 0.1 * 2 / 1.6 m wide.
+    pixels, _ = camera.project([[0.0, 0.0, 0.0], [0.055, 0, 0], [0.07, 0, 0], [-0.055, 0, 0], [-0.07, 0, 0]])
+    values = [light[int(y), int(x), 0] for x, y in pixels]
+    assert values[0] == values[1] == values[3] == 0.0
+    assert values[2] == values[4] == 1.0
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
+def test_uniform_capture_keeps_its_colour_on_an_open_horizontal_surface(unit: float) -> None:
+    """At three scales: no acne, no missing light."""
+    make_integrator()
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5 * unit], target=[0, 0, 0], up=[0, 1, 0]).scale(unit),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 3.0}},
+    }
+    camera = Camera.look_at(
+        (0, 0, unit), (0, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=6, near=0.01 * unit
+    )
+    shapes = {
+        "floor": make_splats_shape(floor(unit), proxy=slab(unit), instance=1, capture_light="uniform"),
+        "sky": WHITE_SKY,
+        "lamp": lamp,
+    }
+    light = render(shapes, camera, samples=256).light
+    np.testing.assert_allclose(light, 1.0, atol=0.03)
+    assert light.mean() == pytest.approx(1.0, abs=5e-3)
+
+
+def test_side_away_from_the_light_is_darker() -> None:
+    make_integrator()
+    ball = trimesh.creation.icosphere(4, 0.3)
+    sphere = Splats(
+        ball.vertices,
+        np.tile([0, 0, 0, 1.0], (len(ball.vertices), 1)),
+        np.full((len(ball.vertices), 3), 0.02),
+        np.full(len(ball.vertices), 0.99),
+        np.zeros((len(ball.vertices), 1, 3)),
+    )
+    lamp = {"type": "point", "position": [3.0, 0.0, 0.0], "intensity": {"type": "rgb", "value": 5.0}}
+    shapes = {"ball": make_splats_shape(sphere, proxy=ball, instance=1), "lamp": lamp}
+    camera = Camera.look_at((0, -2, 0), (0, 0, 0), width=48, height=48, fov_x=25)
+    light = render(shapes, camera).light[..., 0]
+    assert light[24, 36] > 4 * light[24, 20] + 0.1
+    assert light[24, 16] == 0.0
+
+
+def test_highlight_lies_at_the_mirror_direction_and_only_there() -> None:
+    make_integrator()
+    lamp = {"type": "point", "position": [0.0, 0.0, 1.0], "intensity": {"type": "rgb", "value": 1.0}}
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab(), instance=1, specular=0.5, roughness=0.1),
+        "lamp": lamp,
+    }
+    highlight = render(shapes, down_camera(1.0, 65, 40.0)).highlight[..., 0]
+    assert np.unravel_index(highlight.argmax(), highlight.shape) == (32, 32)
+    assert highlight[32, 60] < 0.01 * highlight.max()
+
+
+def test_visible_mesh_and_splats_hide_each_other() -> None:
+    make_integrator()
+    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.1, 0.1]}}
+    cube = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([0.1, 0, 0]).scale(0.1),
+        "bsdf": red,
+    }
+    shapes = {
+        "above": make_splats_shape(floor(0.04, grey=0.9, z=0.3), instance=2),
+        "below": make_splats_shape(floor(1.0, grey=0.2, z=0.0), instance=1),
+        "cube": cube,
+    }
+    layers = render(shapes, down_camera(1.0, 64, 40.0))
+    pixels, _ = down_camera(1.0, 64, 40.0).project([[0.0, 0, 0.3], [0.16, 0, 0.1], [-0.2, 0, 0.0]])
+    above, mesh, below = [(int(y), int(x)) for x, y in pixels]
+    assert [layers.instance[p] for p in (above, mesh, below)] == [2, 0, 1]
+    assert layers.rgb[mesh][0] > 4 * layers.rgb[mesh][1] > 0
+    assert layers.depth[mesh] == pytest.approx(0.9, abs=1e-3)
+    assert layers.depth[below] == pytest.approx(1.0, abs=1e-2)
+    assert layers.rgb[above].min() > layers.rgb[below].max()
+
+
+def test_layers_say_where_the_proxy_is() -> None:
+    make_integrator()
+    shapes = {"floor": make_splats_shape(floor(), proxy=slab(), instance=7)}
+    layers = render(shapes, down_camera())
+    np.testing.assert_allclose(layers.proxy_depth, 1.0, atol=1e-5)
+    np.testing.assert_allclose(layers.normal, np.broadcast_to([0, 0, 1.0], layers.normal.shape), atol=1e-5)
+    assert (layers.proxy_instance == 7).all() and (layers.instance == 7).all()

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 Render = Callable[..., "Frame"]
 """As :func:`mitsplat.frame.render_frame`."""
-Settle = Callable[["Scene", int], "Layout"]
+Settle = Callable[..., "Layout"]
 """As :func:`mitsplat.settle.settle_layout`."""
 Progress = Callable[[int, int, str], None]
 """Takes the frames finished, the frames wanted and a few words on what is being done now."""
@@ -203,7 +203,8 @@ class _FrameMaker:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; freed with the file or the process
             if not path.exists():
                 note(f"settling layout {index}")
-                write_text(path, json.dumps(self.settle(self.scene, index).to_json()))
+                layout = self.settle(self.scene, index, progress=lambda text: note(f"layout {index}: {text}"))
+                write_text(path, json.dumps(layout.to_json()))
         self._kept = Layout.from_json(json.loads(path.read_bytes()))
         return self._kept
 

@@ -61,7 +61,7 @@ def write_text(path: Path, text: str) -> str:
 
 def write_frame(frame: Frame, root: Path, output: Output) -> Record:
     """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest."""
-    plan, certificate = frame.plan, frame.layout.certificate
+    plan = frame.plan
     name = f"{plan.split}/{frame.index:06d}"
     files = {f"images/{name}.{output.image}": lambda path: path.write_bytes(encode_image(frame.image, output))}
     if "yolo" in output.formats:
@@ -84,15 +84,7 @@ def write_frame(frame: Frame, root: Path, output: Output) -> Record:
             "world_from_camera": frame.camera.world_from_camera.tolist(),
         },
         "labels": frame.labels.to_json(),
-        "rest": {
-            "rested": certificate.rested,
-            "time_to_rest": certificate.time_to_rest,
-            "max_speed": certificate.max_speed,
-            "max_spin": certificate.max_spin,
-            "deepest_penetration": certificate.deepest_penetration,
-            "attempts": certificate.attempts,
-            "refused": list(certificate.refused),
-        },
+        "rest": frame.layout.to_json()["certificate"],
     }
 
 

@@ -24,8 +24,20 @@ from mitsplat.settle import Instance, Layout, RestCertificate
 from mitsplat.sheet import class_colour, draw_labels
 from mitsplat.writers import SPLITS, data_yaml
 
+CERTIFICATE = RestCertificate(
+    rested=True,
+    time_to_rest=1.5,
+    max_speed=0.0,
+    max_spin=0.0,
+    surface_motion=0.0,
+    deepest_penetration=1e-5,
+    support_gap=0.0,
+    attempts=2,
+    refused=("too deep",),
+)
 
-def settle(scene, index):
+
+def settle(scene, index, *, progress):
     """Three objects at random places; no physics."""
     rng = random_stream(scene.spec.seed, "synthetic layout", index)
     instances = []
@@ -33,7 +45,7 @@ def settle(scene, index):
         pose = np.eye(4)
         pose[:3, 3] = rng.uniform(-1, 1, 3)
         instances.append(Instance(i + 1, i % len(scene.assets), i % len(scene.class_names), pose))
-    return Layout(index, tuple(instances), RestCertificate(True, 1.5, 0.0, 0.0, 1e-5, 1, ()))
+    return Layout(index, tuple(instances), CERTIFICATE)
 
 
 def render(scene, index, *, layout):
@@ -121,6 +133,7 @@ class TestContent:
         assert [record["index"] for record in records] == list(range(12))
         for record in records:
             assert len(record["files"]) == 3
+            assert record["rest"]["refused"] == ["too deep"]
             for file, digest in record["files"].items():
                 assert hashlib.sha256((tmp_path / "out" / file).read_bytes()).hexdigest() == digest
         timings = [json.loads(line) for line in (tmp_path / "out/timings.jsonl").read_text().splitlines()]
@@ -137,7 +150,7 @@ class TestContent:
     def test_images_are_the_pixels_that_were_rendered(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         stored = cv2.imread(str(next((tmp_path / "out/images").rglob("000000.png"))))
-        expected = render(scene, 0, layout=settle(scene, 0)).image
+        expected = render(scene, 0, layout=settle(scene, 0, progress=print)).image
         np.testing.assert_array_equal(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), expected)
 
     def test_data_yaml_names_splits_relative_to_itself(self, scene, tmp_path):
@@ -181,7 +194,7 @@ class TestContent:
 
     def test_exr_holds_every_layer(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
-        frame = render(scene, 0, layout=settle(scene, 0))
+        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
         with OpenEXR.File(str(tmp_path / "out/layers/train/000000.exr"), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
         single = {"R", "G", "B", "A", "Z", "instance", "proxy_instance"}
@@ -289,7 +302,7 @@ class TestSameBytes:
         assert len(set(map(id, seen))) == 3
 
     def test_settled_layouts_are_not_settled_again(self, scene, tmp_path):
-        def never(scene, index):
+        def never(scene, index, *, progress):
             raise AssertionError(index)
 
         write(scene, tmp_path / "out", frames=3)
@@ -389,7 +402,7 @@ class TestRefusals:
 
 class TestPictures:
     def test_masks_are_tinted_with_the_class_colour(self, scene):
-        frame = render(scene, 0, layout=settle(scene, 0))
+        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
         frame.image[:] = 0
         drawn = draw_labels(frame.image, frame.labels, opacity=1.0)
         assert not frame.image.any()

@@ -13,7 +13,7 @@ CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data" / "splats"
 
 
 def crowd(count: int = 887_026) -> tuple[Splats, str]:
-    """About 0.9 M Gaussians: eleven captures side by side, or as many random surface-like Gaussians, and which it is."""
+    """About 0.9 M Gaussians and what they are: eleven captures side by side, or as many on random spheres."""
     files = sorted(CAPTURES.glob("*.splat"))
     if not files:
         return synthetic(count), f"{count} synthetic Gaussians"

@@ -1,6 +1,6 @@
 """Seconds per stage of a frame of the default scene, peak memory, and the renderer against Mitsuba's own splat path.
 
-    python benchmarks/frame.py [--scene scenes/workcell.yaml] [--frames 8] [--no-volprim]
+    python -m benchmarks.frame [--scene scenes/workcell.yaml] [--frames 8] [--no-volprim]
 
 Timings are medians of frames after the first (which compiles); quote the ratios, and the load, which is printed too.
 """
@@ -55,7 +55,10 @@ def compare_with_volprim(repeats: int = 5) -> None:
     theirs = time.perf_counter() - start
     mine = statistics.median(ours[1:])
     print(f"{name}, {CAMERA.width}x{CAMERA.height}:")
-    print(f"  render_splats, upload included {mine:.3f} s, ellipsoids + volprim_rf_basic {theirs:.2f} s, ratio {theirs / mine:.0f}")
+    print(
+        f"  render_splats, upload included {mine:.3f} s, "
+        f"ellipsoids + volprim_rf_basic {theirs:.2f} s, ratio {theirs / mine:.0f}"
+    )
 
 
 def main() -> None:

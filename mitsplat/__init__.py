@@ -1,7 +1,7 @@
 """mitsplat: labelled training images of robot workcells from Gaussian splats, settled parts and traced light.
 
 Conventions (frames, units, colour) are stated in :mod:`mitsplat.splats`. Importing this package points Dr.Jit at a
-usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the current and every
+usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the current and any
 later variant; heavy modules load when a name that needs them is first used.
 """
 
@@ -38,7 +38,7 @@ _HOME = {
     "write_dataset": "dataset",
 }
 
-__all__ = sorted(_HOME)  # noqa: PLE0605 - one table says name and home
+__all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
     from mitsplat.assets import Asset as Asset

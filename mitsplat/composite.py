@@ -31,8 +31,9 @@ CURVE_WHITE = 16.0
 
 @dataclass(frozen=True)
 class ImageShadow:
-    """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2): the shadow map is
-    normalised, blurred, bent by a sigmoid and multiplied; where it is brightest a highlight is added.
+    """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2).
+
+    The shadow map is normalised, blurred, bent by a sigmoid and multiplied; where it is brightest, light is added.
 
     Attributes:
         blur: Standard deviation of the Gaussian blur [px at a width of 1280].
@@ -78,7 +79,10 @@ def shadow_from_image(shadow_map: FloatArray, parameters: ImageShadow = ImageSha
 
     low, high = sigmoid(0.0), sigmoid(1.0)
     factor = parameters.darkest + (1 - parameters.darkest) * (sigmoid(soft) - low) / (high - low)
-    shine = np.clip((soft - parameters.highlight_start) / (1 - parameters.highlight_start), 0, 1) * parameters.highlight_gain
+    shine = (
+        np.clip((soft - parameters.highlight_start) / (1 - parameters.highlight_start), 0, 1)
+        * parameters.highlight_gain
+    )
     return factor.astype(np.float32), shine.astype(np.float32)
 
 
@@ -108,7 +112,7 @@ def develop(
     if noise > 0:
         rng = np.random.default_rng(seed)
         encoded = encoded + np.float32(noise) * rng.standard_normal(encoded.shape, dtype=np.float32)
-    return np.rint(np.clip(encoded, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return np.asarray(np.rint(np.clip(encoded, 0.0, 1.0) * 255.0), dtype=np.uint8)
 
 
 def colour_matrix(
@@ -116,8 +120,8 @@ def colour_matrix(
 ) -> npt.NDArray[np.float64]:
     """One 3x3 matrix on linear sRGB for exposure, white balance, hue and saturation.
 
-    White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; hue turns colours about
-    the grey axis; saturation scales their distance from the grey of the same luminance.
+    White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; hue turns colours
+    about the grey axis; saturation scales their distance from the grey of the same luminance.
     """
     matrix = np.eye(3)
     if white_balance != 6504.0:
@@ -130,7 +134,7 @@ def colour_matrix(
     if saturation != 1.0:
         grey = np.broadcast_to(LUMINANCE.astype(np.float64), (3, 3))
         matrix = (saturation * np.eye(3) + (1 - saturation) * grey) @ matrix
-    return matrix * 2.0**exposure
+    return np.asarray(matrix * 2.0**exposure, dtype=np.float64)
 
 
 def _colour() -> Any:
@@ -154,7 +158,7 @@ def _adaptation(kelvin: float) -> npt.NDArray[np.float64]:
 
 @lru_cache(maxsize=2)
 def tone_curve(tone: Literal["neutral", "filmic"]) -> FloatArray:
-    """Display-encoded values of linear inputs ``CURVE_WHITE * (i / (CURVE_STEPS - 1))^2``, encoded with sRGB's transfer.
+    """Display-encoded values of linear inputs ``CURVE_WHITE * (i / (CURVE_STEPS - 1))^2``, by sRGB's transfer.
 
     ``filmic`` is Hable's curve (2010, "Filmic tonemapping operators", Uncharted 2), scaled so that 0.18 stays 0.18.
     """

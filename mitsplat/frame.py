@@ -26,7 +26,7 @@ from mitsplat.settle import Layout, settle_layout
 from mitsplat.spec import LightSpec
 from mitsplat.splats import Splats
 
-NOTHING = Splats(np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 3)), np.empty(0), np.empty((0, 1, 3)))
+NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
 """Splats of a proxy that only receives and casts shadows."""
 
 
@@ -213,7 +213,9 @@ def _asset_shape(asset: Asset, world_from_asset: npt.NDArray[np.float64], instan
 def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) -> Any:
     """A plain diffuse mesh; its colour is display-encoded, as in the scene file."""
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": srgb_to_linear(colour).tolist()}})
+    props["bsdf"] = mi.load_dict(
+        {"type": "diffuse", "reflectance": {"type": "rgb", "value": srgb_to_linear(colour).tolist()}}
+    )
     shape = mi.Mesh("shape", len(mesh.vertices), len(mesh.faces), props=props)
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, dtype=np.float32).ravel())

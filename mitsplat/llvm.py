@@ -1,4 +1,4 @@
-"""Which LLVM Dr.Jit uses: a wheel brings a modern one, because the versions that distributions ship abort on recent CPUs."""
+"""Which LLVM Dr.Jit uses: a wheel brings a modern one, because those of distributions abort on recent processors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OLDEST_USABLE = 16
 
 
 def use_bundled_llvm() -> None:
-    """Point Dr.Jit at the libLLVM of this Python environment, unless the user has set one. Call before any variant is used."""
+    """Point Dr.Jit, before it is imported, at the libLLVM of this Python environment, unless the user has set one."""
     if not os.environ.get(VARIABLE):
         path = find_bundled_llvm()
         if path is not None:

@@ -15,7 +15,7 @@ class Quality:
     Attributes:
         order: Gaussians of a pixel are blended in the order of their centres' depth, sorted per tile (``tile``), or
             in the order of their peaks along the ray itself, sorted per ray (``ray``).
-        alpha_min: A Gaussian is cut where its opacity along a ray falls below this value. 1/255 is what 3DGS trains with.
+        alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
         transmittance_min: A ray ends when less than this share of the light behind would still be seen.
         sh_degree: Highest spherical-harmonic band that is evaluated.
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered).

@@ -109,7 +109,9 @@ def describe_sensor(camera: Camera) -> dict[str, Any]:
     }
 
 
-def make_splats_shape(splats: Splats, world_from_splats: npt.ArrayLike | None = None, proxy: Any = None, **properties: Any) -> Any:
+def make_splats_shape(
+    splats: Splats, world_from_splats: npt.ArrayLike | None = None, proxy: Any = None, **properties: Any
+) -> Any:
     """The shape plugin ``splats`` around data in memory; ``properties`` are those of the plugin."""
     ensure_variant()
     from mitsplat.plugins.splats import SplatsShape

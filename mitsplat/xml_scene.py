@@ -59,7 +59,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         **lights,
     }
     _teach_writer()
-    state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), description)
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), description)
     mi.parser.write_file(state, str(path))
 
 
@@ -132,7 +132,7 @@ def _describe_shape(shape: Shape, mesh: trimesh.Trimesh, path: Path) -> dict[str
 
 
 def _teach_writer() -> None:
-    """Tell Mitsuba's XML writer what kind of plugin ours are: it looks them up in a scalar variant, where they cannot run."""
+    """Tell Mitsuba's XML writer of what kind our plugins are: it looks them up in a scalar variant."""
     scalar = importlib.import_module("mitsuba.scalar_rgb")
 
     def refuse(props: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Mitsuba plugins of mitsplat, one per module: ``splats`` (shape), ``splat_proxy`` (integrator), ``opencv_camera`` (sensor)."""
+"""Mitsuba plugins, one per module: ``splats`` (shape), ``splat_proxy`` (integrator), ``opencv_camera`` (sensor)."""
 
 from __future__ import annotations
 

@@ -58,7 +58,9 @@ class Cloud:
     sh_stride: int
 
 
-def upload_cloud(means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray) -> Cloud:
+def upload_cloud(
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
+) -> Cloud:
     """Copy N Gaussians to the device (shapes as in :class:`mitsplat.splats.Splats`)."""
     count, bands = len(means), sh.shape[1]
     stride = -(-3 * bands // 4) * 4
@@ -75,7 +77,9 @@ def aligned(values: np.ndarray) -> Any:
     """Device copy of an array. Wrapping NumPy's memory instead would switch Dr.Jit's packet loads off (unaligned)."""
     result = dr.empty(mi.Float, values.size)
     if values.size:
-        dr.scatter(result, mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel()), dr.arange(mi.UInt32, values.size))
+        dr.scatter(
+            result, mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel()), dr.arange(mi.UInt32, values.size)
+        )
         dr.eval(result)
     return result
 
@@ -169,7 +173,9 @@ def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
         mean: Centre relative to the camera's centre, in the Gaussians' frame.
         axes: The three principal axes in the same frame.
         sigma: Standard deviations along them.
-        right, down, forward: The camera's axes in the same frame.
+        right: The camera's x axis in the same frame.
+        down: Its y axis.
+        forward: Its z axis.
         scale: Size of one unit of that frame in the camera's units [m].
     """
     depth = dr.dot(forward, mean)
@@ -243,7 +249,7 @@ def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v
 
 
 def general_response(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, forward: Any, scale: Any) -> list[Any]:
-    """The response without a reference ray, for Gaussians that reach the camera's plane; arguments as `project_gaussian`.
+    """The response without a reference ray, for Gaussians at the camera's plane; arguments as `project_gaussian`.
 
     With d = (u, v, 1): q = |W m x W d|^2 / |W d|^2 and z = (W m . W d) / |W d|^2. Returns 15 coefficients: of
     u^2, uv, v^2, u, v, 1 in the first numerator and in the denominator, and of u, v, 1 in the second numerator.

@@ -80,7 +80,7 @@ class Proxies:
 
 @dataclass(frozen=True, eq=False)
 class _TraceScene:
-    """All meshes as one, with the instance id of every triangle, beside visible shapes; ``mesh`` is None without any."""
+    """All meshes as one (or None), with the instance id of every triangle, beside visible shapes."""
 
     scene: Any
     mesh: Any
@@ -93,11 +93,13 @@ class _TraceScene:
         if not occluders:
             nothing = mi.UInt32([0])
             return cls(mi.load_dict({"type": "scene", **others}), None, nothing) if others else None
-        merged = trimesh.util.concatenate([trimesh.Trimesh(o.mesh.vertices, o.mesh.faces, process=False) for o in occluders])
-        mesh = mi.Mesh("proxies", len(merged.vertices), len(merged.faces))
+        vertices, faces = trimesh.util.append_faces(
+            [o.mesh.vertices for o in occluders], [o.mesh.faces for o in occluders]
+        )
+        mesh = mi.Mesh("proxies", len(vertices), len(faces))
         params = mi.traverse(mesh)
-        params["vertex_positions"] = mi.Float(np.asarray(merged.vertices, dtype=np.float32).ravel())
-        params["faces"] = mi.UInt32(np.asarray(merged.faces, dtype=np.uint32).ravel())
+        params["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
+        params["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
         params.update()
         instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
         scene = mi.load_dict({"type": "scene", "mesh": mesh, **others})
@@ -130,7 +132,7 @@ class Surface:
 def trace_light(
     scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int, reference: Any
 ) -> tuple[Any, Any, Any]:
-    """Light factor and highlight (Color3f) of every visible point, and the share of its light that dynamic objects leave.
+    """Light factor and highlight (Color3f) of every visible point, and the share of light that dynamic objects leave.
 
     See the module docstring for what the factor means.
 
@@ -162,7 +164,7 @@ def trace_light(
         cosine = dr.dot(surface.normal, sample.d)
         active = surface.valid & (cosine > 0) & (sample.pdf > 0)
         ray = mi.Ray3f(origin, sample.d)
-        # The distance to a light at infinity is made up from the extent of visible meshes, which proxies are not part of.
+        # The distance to a light at infinity comes from the extent of visible meshes, which proxies are not part of.
         infinite = mi.has_flag(sample.emitter.flags(), mi.EmitterFlags.Infinite)
         ray.maxt = dr.select(infinite, dr.inf, dr.maximum(sample.dist - 2 * surface.offset, 0))
         blocked = mi.Bool(False)
@@ -268,7 +270,8 @@ def smooth_light(
             weights += weight
             # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
             sums = [
-                dr.fma(weight, dr.gather(mi.Float, v, other, same) - m, s) for v, m, s in zip(values, middle, sums, strict=True)
+                dr.fma(weight, dr.gather(mi.Float, v, other, same) - m, s)
+                for v, m, s in zip(values, middle, sums, strict=True)
             ]
         values = [m + s / weights for m, s in zip(total, sums, strict=True)]
         dr.eval(values)

@@ -89,7 +89,7 @@ def _blend(pixel: Pixel, weight: Any, transmittance: Any, colour: list[Any], z: 
 
 
 def _respond(record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool) -> list[tuple[Any, Any]]:
-    """(log2 of opacity along the ray, depth of the peak) of one Gaussian on several rays, module `gaussian`'s formula."""
+    """(log2 of opacity along the ray, depth of the peak) of one Gaussian on several rays, as in module `gaussian`."""
     u0, v0, a, b2, c, opacity, _, _, _, depth, e, f, g, h, i, _ = record
     result: list[Any] = []
     previous: Any = None
@@ -139,7 +139,8 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
     pixel = [(y + k) * view.width + x for k in range(per_lane)]
     inside = [(x < view.width) & (y + k < view.height) for k in range(per_lane)]
     far = [
-        dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf) for p, m in zip(pixel, inside, strict=True)
+        dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
+        for p, m in zip(pixel, inside, strict=True)
     ]
     start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
     stop = dr.select(inside[0], stop, start)
@@ -159,7 +160,7 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
 
 
 def _average(passes: list[Image]) -> Image:
-    """Mean of several samples of every pixel; depth and instance are those of the sample nearest to the pixel's centre."""
+    """Mean of several samples of every pixel; depth and instance are those of the middle sample."""
     share = 1.0 / len(passes)
     middle = passes[len(passes) // 2]
 
@@ -179,7 +180,15 @@ def _average(passes: list[Image]) -> Image:
 
 
 def _walk_in_tile_order(
-    lists: TileLists, start: Any, stop: Any, us: list[Any], vs: list[Any], far: list[Any], view: View, cut: Any, end: Any
+    lists: TileLists,
+    start: Any,
+    stop: Any,
+    us: list[Any],
+    vs: list[Any],
+    far: list[Any],
+    view: View,
+    cut: Any,
+    end: Any,
 ) -> list[Pixel]:
     """Blend in the order of the tile's list: by depth of the Gaussians' centres."""
     near = view.near_plane
@@ -192,7 +201,9 @@ def _walk_in_tile_order(
         return brightest > end
 
     def body(i: Any, pixels: list[Pixel]) -> tuple[Any, list[Pixel]]:
-        record = dr.gather(mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i)))
+        record = dr.gather(
+            mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
+        )
         blended = []
         responses = _respond(record, lists, us, vs, shared_column)
         for pixel, (log_alpha, z), z_far in zip(pixels, responses, far, strict=True):
@@ -208,7 +219,15 @@ def _walk_in_tile_order(
 
 
 def _walk_in_ray_order(
-    lists: TileLists, start: Any, stop: Any, us: list[Any], vs: list[Any], far: list[Any], view: View, cut: Any, end: Any
+    lists: TileLists,
+    start: Any,
+    stop: Any,
+    us: list[Any],
+    vs: list[Any],
+    far: list[Any],
+    view: View,
+    cut: Any,
+    end: Any,
 ) -> list[Pixel]:
     """Blend in the exact order of the peaks along each ray.
 
@@ -223,7 +242,9 @@ def _walk_in_ray_order(
 
     def collect(last_z: Any, last_i: Any, limit: Any) -> tuple[list[Any], list[Any]]:
         def body(i: Any, zs: list[Any], entries: list[Any]) -> tuple[Any, list[Any], list[Any]]:
-            ((log_alpha, z),) = _respond(fetch(dr.gather(mi.UInt32, lists.entries, i), True), lists, us, vs, shared_column)
+            ((log_alpha, z),) = _respond(
+                fetch(dr.gather(mi.UInt32, lists.entries, i), True), lists, us, vs, shared_column
+            )
             behind = (z > last_z) | ((z == last_z) & (i > last_i))
             hit = (log_alpha > cut) & (z > near) & (z < far[0]) & behind
             moving_z, moving_i = dr.select(hit, z, dr.inf), mi.UInt32(i)

@@ -13,7 +13,7 @@ from mitsplat.plugins.rays import View
 
 
 class OpenCVCamera(mi.Sensor):
-    r"""OpenCV camera (:monosp:`opencv_camera`)
+    r"""OpenCV camera (:monosp:`opencv_camera`).
 
     .. pluginparameters::
 
@@ -43,7 +43,9 @@ class OpenCVCamera(mi.Sensor):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.world_from_mitsuba = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64).reshape(4, 4)
+        self.world_from_mitsuba = np.array(
+            props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64
+        ).reshape(4, 4)
         width, height = self.film().size()
         self.fx, self.fy = _positive(props, "fx", None), _positive(props, "fy", None)
         self.cx = _number(props, "cx", width / 2)
@@ -55,7 +57,9 @@ class OpenCVCamera(mi.Sensor):
         except ValueError:
             raise InputError(f"sensor 'opencv_camera': 'distortion' must be numbers (got {text!r})") from None
         if len(self.distortion) not in (0, 4, 5, 8):
-            raise InputError(f"sensor 'opencv_camera': 'distortion' takes 0, 4, 5 or 8 numbers (got {len(self.distortion)})")
+            raise InputError(
+                f"sensor 'opencv_camera': 'distortion' takes 0, 4, 5 or 8 numbers (got {len(self.distortion)})"
+            )
 
     def view(self, samples: int = 1) -> View:
         """What the splat renderer needs of this camera."""
@@ -64,7 +68,9 @@ class OpenCVCamera(mi.Sensor):
         pose = self.world_from_mitsuba @ flip
         return View(width, height, self.fx, self.fy, self.cx, self.cy, pose, self.distortion, self.near, samples)
 
-    def sample_ray(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> tuple[Any, Any]:
+    def sample_ray(  # noqa: D102 - Mitsuba's interface
+        self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+    ) -> tuple[Any, Any]:
         width, height = self.film().size()
         u, v = self.view().slopes(position.x * width, position.y * height)
         ray = dr.zeros(mi.Ray3f, dr.width(position))
@@ -76,16 +82,19 @@ class OpenCVCamera(mi.Sensor):
         ray.maxt = dr.inf
         return ray, mi.Color3f(1)
 
-    def sample_ray_differential(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> Any:
+    def sample_ray_differential(  # noqa: D102 - Mitsuba's interface
+        self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+    ) -> Any:
         ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
         return mi.RayDifferential3f(ray), weight
 
     def to_string(self) -> str:
+        """Mitsuba's description of the plugin."""
         return f"OpenCVCamera[fx = {self.fx}, fy = {self.fy}, cx = {self.cx}, cy = {self.cy}, distortion = {self.distortion}]"
 
 
 def _number(props: mi.Properties, name: str, default: float | None) -> float:
-    value = props[name] if name in props else default
+    value = props.get(name, default)
     if value is None:
         raise InputError(f"sensor 'opencv_camera': {name!r} is missing")
     if isinstance(value, bool) or not isinstance(value, (int, float)):

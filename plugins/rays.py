@@ -1,4 +1,4 @@
-"""The camera as the splat renderer sees it: ray slopes per pixel, tiles, and the tiles that a box of slopes may meet."""
+"""The camera as the splat renderer sees it: ray slopes per pixel, tiles, and the tiles that slopes fall into."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class View:
         return self if samples == self.samples else replace(self, samples=samples)
 
     def rays(self) -> Any:
-        """World-space rays through the pixels' centres, row-major, unit directions, starting at the centre of projection."""
+        """World-space rays through the pixels' centres, row-major, of unit direction."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         row = pixel // self.width
         u, v = self.slopes(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
@@ -201,4 +201,4 @@ class View:
     def _extent(self) -> tuple[Any, Any, Any, Any]:
         rows = np.array(self._tile_table).reshape(-1, 4)
         lo, hi = rows.min(axis=0), rows.max(axis=0)
-        return tuple(dr.opaque(mi.Float, float(v)) for v in (lo[0], hi[1], lo[2], hi[3]))  # type: ignore[return-value]
+        return tuple(dr.opaque(mi.Float, float(v)) for v in (lo[0], hi[1], lo[2], hi[3]))

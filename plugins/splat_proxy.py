@@ -35,7 +35,7 @@ AOVS = (
     "highlight.G",
     "highlight.B",
 )
-"""Channels after R, G, B, A: linear colour before light, depths along z [m], ids, world normal, light factor, highlight."""
+"""Channels after R, G, B, A: linear colour before light, depths along z [m], ids, world normal, light, highlight."""
 
 AGREEMENT = 0.02
 """Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
@@ -43,7 +43,9 @@ AGREEMENT = 0.02
 
 def srgb_to_linear(value: Any) -> Any:
     """IEC 61966-2-1 electro-optical transfer, extended above 1."""
-    return dr.select(value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4))
+    return dr.select(
+        value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,7 @@ class _Contents:
 
 
 class SplatProxyIntegrator(mi.CppADIntegrator):
-    r"""Splats with proxy light (:monosp:`splat_proxy`)
+    r"""Splats with proxy light (:monosp:`splat_proxy`).
 
     .. pluginparameters::
 
@@ -106,13 +108,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow_samples = props.get("shadow_samples", 8)
         if type(self.shadow_samples) is not int or not 1 <= self.shadow_samples <= 4096:
             raise InputError(
-                f"integrator 'splat_proxy': 'shadow_samples' must be a whole number from 1 to 4096 (got {self.shadow_samples!r})"
+                f"integrator 'splat_proxy': 'shadow_samples' must be from 1 to 4096 (got {self.shadow_samples!r})"
             )
         self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
 
     def aov_names(self) -> list[str]:
+        """Names of the channels after R, G, B and A."""
         return list(AOVS)
 
     def render(
@@ -163,7 +166,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 surface.relit |= front
             reference = reference_irradiance(scene, self.reference)
             traced = trace_light(
-                scene, contents.proxies, surface, view.width, samples=self.shadow_samples, seed=seed, reference=reference
+                scene,
+                contents.proxies,
+                surface,
+                view.width,
+                samples=self.shadow_samples,
+                seed=seed,
+                reference=reference,
             )
             light, highlight = smooth_light(*traced, surface, instance, view, samples=self.shadow_samples)
         layers = {
@@ -195,7 +204,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """Upload what the shapes hold, unless they are those of the last call."""
         shapes = tuple(scene.shapes())
         known = self._contents
-        if known is not None and len(known.shapes) == len(shapes) and all(a is b for a, b in zip(known.shapes, shapes, strict=True)):
+        if (
+            known is not None
+            and len(known.shapes) == len(shapes)
+            and all(a is b for a, b in zip(known.shapes, shapes, strict=True))
+        ):
             return known
         carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
         visible = [s for s in shapes if not hasattr(s, "world_from_splats") and not s.is_emitter()]
@@ -210,7 +223,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         size = 1 + max([0, *(c.instance for c in carriers)])
         relit, roughness, specular = np.zeros(size, bool), np.full(size, 0.4, np.float32), np.zeros(size, np.float32)
         for c in carriers:
-            relit[c.instance], roughness[c.instance], specular[c.instance] = c.capture_light == "uniform", c.roughness, c.specular
+            relit[c.instance], roughness[c.instance], specular[c.instance] = (
+                c.capture_light == "uniform",
+                c.roughness,
+                c.specular,
+            )
         self._contents = _Contents(
             shapes,
             self._upload(distinct),
@@ -233,6 +250,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return merge_clouds(clouds) if sum(c.count for c in clouds) else None
 
     def to_string(self) -> str:
+        """Mitsuba's description of the plugin."""
         return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
 
 
@@ -298,14 +316,19 @@ def view_of(sensor: Any) -> View:
     if "x_fov" not in params or "to_world" not in params:
         raise InputError("integrator 'splat_proxy': the sensor must be 'opencv_camera' or 'perspective'")
     focal = 0.5 * width / np.tan(0.5 * np.radians(float(np.array(params["x_fov"]).ravel()[0])))
-    shift = [float(np.array(params[f"principal_point_offset_{a}"]).ravel()[0]) if f"principal_point_offset_{a}" in params else 0.0 for a in "xy"]
+    shift = [
+        float(np.array(params[f"principal_point_offset_{a}"]).ravel()[0])
+        if f"principal_point_offset_{a}" in params
+        else 0.0
+        for a in "xy"
+    ]
     pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     near = float(np.array(params["near_clip"]).ravel()[0])
     return View(width, height, focal, focal, width * (0.5 + shift[0]), height * (0.5 + shift[1]), pose, (), near)
 
 
 def _text(props: mi.Properties, name: str, default: str) -> str:
-    value = props[name] if name in props else default
+    value = props.get(name, default)
     if not isinstance(value, str):
         raise InputError(f"integrator 'splat_proxy': {name!r} must be text (got {value!r})")
     return value

@@ -15,7 +15,7 @@ from mitsplat.splats import Splats
 
 
 class SplatsShape(mi.Mesh):
-    r"""Gaussian splats (:monosp:`splats`)
+    r"""Gaussian splats (:monosp:`splats`).
 
     .. pluginparameters::
 
@@ -69,7 +69,9 @@ class SplatsShape(mi.Mesh):
             </shape>
     """
 
-    def __init__(self, props: mi.Properties, splats: Splats | None = None, proxy: trimesh.Trimesh | None = None) -> None:
+    def __init__(
+        self, props: mi.Properties, splats: Splats | None = None, proxy: trimesh.Trimesh | None = None
+    ) -> None:
         super().__init__("splats", 3, 1, props=props)
         # One triangle without area: Mitsuba asks for a mesh, and no ray can meet this one.
         params = mi.traverse(self)
@@ -93,7 +95,9 @@ class SplatsShape(mi.Mesh):
         self.dynamic = _typed(props, "dynamic", bool, self.instance > 0)
         self.capture_light = _typed(props, "capture_light", str, "uniform" if self.instance else "scene")
         if self.capture_light not in ("uniform", "scene"):
-            raise InputError(f"shape 'splats': 'capture_light' must be 'uniform' or 'scene' (got {self.capture_light!r})")
+            raise InputError(
+                f"shape 'splats': 'capture_light' must be 'uniform' or 'scene' (got {self.capture_light!r})"
+            )
         self.roughness = _typed(props, "roughness", float, 0.4)
         if not 0 < self.roughness <= 1:
             raise InputError(f"shape 'splats': 'roughness' must be in (0, 1] (got {self.roughness})")
@@ -102,6 +106,7 @@ class SplatsShape(mi.Mesh):
             raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
 
     def to_string(self) -> str:
+        """Mitsuba's description of the plugin."""
         return f"SplatsShape[count = {len(self.splats)}, instance = {self.instance}, proxy = {self.proxy is not None}]"
 
 

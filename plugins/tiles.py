@@ -206,7 +206,9 @@ class _Source:
         k2 = 2 * dr.log(g["opacity"] / cut)
         k = dr.safe_sqrt(k2)
         reach = [
-            g["scale"] * k * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(g["axes"], g["sigma"], strict=True)]))
+            g["scale"]
+            * k
+            * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(g["axes"], g["sigma"], strict=True)]))
             for v in (g["right"], g["down"], g["forward"])
         ]
         centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
@@ -259,7 +261,7 @@ class _Source:
             dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
             u0, v0 = dr.select(near, 0.0, u0), dr.select(near, 0.0, v0)
             row = dr.gather(mi.ArrayXf, near_cut, near_number, near, shape=(8, count))
-            conic = tuple(dr.select(near, row[i], c) for i, c in enumerate(conic))  # type: ignore[assignment]
+            conic = tuple(dr.select(near, row[i], c) for i, c in enumerate(conic))
         scaled = LOG2_E_HALF
         record = [
             dr.select(near, mi.Float(near_number), response.u0),
@@ -307,9 +309,7 @@ class _Source:
         bands = min(clouds.sh_count, (sh_degree + 1) ** 2)
         floats = -(-3 * bands // 4) * 4
         base = local * (clouds.sh_stride // 4)
-        packets = [
-            dr.gather(mi.Array4f, clouds.sh, base + j) for j in range(floats // 4)
-        ]
+        packets = [dr.gather(mi.Array4f, clouds.sh, base + j) for j in range(floats // 4)]
 
         def coefficient(k: int) -> list[Any]:
             return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]

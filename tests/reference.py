@@ -1,4 +1,4 @@
-"""The slow, readable twin of the renderer: float64 NumPy, every Gaussian on every ray, exact order, no tiles, no cut-off."""
+"""The slow, readable twin of the renderer: float64 NumPy, every Gaussian on every ray, exact order, no cut-off."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reference:
-    """Display-encoded colour times alpha (H, W, 3), alpha (H, W), and the mean depth of the blended Gaussians (H, W) [m]."""
+    """Display-encoded colour times alpha (H, W, 3), alpha (H, W), and mean depth of what was blended (H, W) [m]."""
 
     rgb: Array
     alpha: Array
@@ -43,7 +43,7 @@ def render_reference(splats: Splats, camera: Camera) -> Reference:
 
 
 def responses(splats: Splats, camera: Camera, u: float, v: float) -> tuple[Array, Array]:
-    """Opacity along the ray of slopes (u, v), and depth of the peak, of every Gaussian (N,); 0 where it is not ahead."""
+    """Opacity along the ray of slopes (u, v), and depth of the peak, of every Gaussian (N,); 0 if it is not ahead."""
     pose = camera.camera_from_world
     means = splats.means.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     axes = pose[:3, :3] @ Rotation.from_quat(splats.quats.astype(np.float64)).as_matrix()

@@ -97,9 +97,7 @@ def test_uniform_capture_keeps_its_colour_on_an_open_horizontal_surface(unit: fl
         "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5 * unit], target=[0, 0, 0], up=[0, 1, 0]).scale(unit),
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 3.0}},
     }
-    camera = Camera.look_at(
-        (0, 0, unit), (0, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=6, near=0.01 * unit
-    )
+    camera = Camera.look_at((0, 0, unit), (0, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=6, near=0.01 * unit)
     shapes = {
         "floor": make_splats_shape(floor(unit), proxy=slab(unit), instance=1, capture_light="uniform"),
         "sky": WHITE_SKY,

@@ -25,7 +25,9 @@ def decode(encoded: np.ndarray) -> np.ndarray:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4)
 
 
-def make_splats(n: int, seed: int = 0, *, spread: float = 0.5, scales: tuple[float, float] = (0.02, 0.2), bands: int = 16) -> Splats:
+def make_splats(
+    n: int, seed: int = 0, *, spread: float = 0.5, scales: tuple[float, float] = (0.02, 0.2), bands: int = 16
+) -> Splats:
     rng = np.random.default_rng(seed)
     return Splats(
         means=rng.uniform(-spread, spread, (n, 3)),
@@ -36,7 +38,9 @@ def make_splats(n: int, seed: int = 0, *, spread: float = 0.5, scales: tuple[flo
     )
 
 
-def one(scales: tuple[float, float, float], *, mean=(0.0, 0.0, 0.0), quat=(0.0, 0.0, 0.0, 1.0), opacity=1.0, count=1) -> Splats:
+def one(
+    scales: tuple[float, float, float], *, mean=(0.0, 0.0, 0.0), quat=(0.0, 0.0, 0.0, 1.0), opacity=1.0, count=1
+) -> Splats:
     """Equal Gaussians of display-encoded colour (0.2, 0.5, 0.8)."""
     colour = (np.array([0.2, 0.5, 0.8]) - 0.5) / SH_C0
     tile = lambda v: np.tile(np.asarray(v, dtype=np.float64), (count, 1))  # noqa: E731
@@ -58,7 +62,9 @@ def test_exact_preset_equals_the_twin(seed: int) -> None:
 
 
 def test_tile_order_equals_the_twin_where_gaussians_do_not_overlap_in_depth() -> None:
-    stack = Splats.concatenate([one((0.1, 0.2, 0.01), mean=(0.0, 0.0, z), opacity=0.4) for z in np.linspace(-0.8, 0.8, 5)])
+    stack = Splats.concatenate(
+        [one((0.1, 0.2, 0.01), mean=(0.0, 0.0, z), opacity=0.4) for z in np.linspace(-0.8, 0.8, 5)]
+    )
     quality = Quality(order="tile", alpha_min=1e-6, transmittance_min=0)
     assert error(render_splats(stack, CAMERA, quality=quality), stack, CAMERA) < 1e-4
 
@@ -119,7 +125,13 @@ def test_wide_lens_is_exact_in_the_corners() -> None:
 
 def test_distorted_lens_follows_the_twin() -> None:
     camera = Camera.look_at(
-        (0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=40, height=30, fov_x=70, distortion=(-0.25, 0.08, 0.002, -0.001, -0.01)
+        (0, 0, -2),
+        (0, 0, 0),
+        up=(0, -1, 0),
+        width=40,
+        height=30,
+        fov_x=70,
+        distortion=(-0.25, 0.08, 0.002, -0.001, -0.01),
     )
     splats = make_splats(60, 13, spread=1.0)
     assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 2e-4
@@ -242,4 +254,3 @@ def test_unknown_quality_is_refused() -> None:
         render_splats(make_splats(1), CAMERA, quality="best")
     assert set(PRESETS) == {"fast", "balanced", "exact"}
     assert tone_curve("neutral")[0] == 0
-

@@ -90,7 +90,7 @@ class OpenCVCamera(mi.Sensor):
 
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""
-        return f"OpenCVCamera[fx = {self.fx}, fy = {self.fy}, cx = {self.cx}, cy = {self.cy}, distortion = {self.distortion}]"
+        return f"OpenCVCamera[f = ({self.fx}, {self.fy}), c = ({self.cx}, {self.cy}), distortion = {self.distortion}]"
 
 
 def _number(props: mi.Properties, name: str, default: float | None) -> float:

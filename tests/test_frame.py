@@ -1,0 +1,97 @@
+"""Whole frames of a small scene: from the plan to picture and labels, and through XML."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import WriteScene
+from PIL import Image
+
+import mitsplat as ms
+from mitsplat.errors import InputError
+from mitsplat.xml_scene import export_xml, render_xml
+
+
+@pytest.fixture(scope="module")
+def settled() -> dict[str, Any]:
+    """The layout of the small scene, settled once for all tests of this module."""
+    return {}
+
+
+@pytest.fixture
+def scene(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
+    scene_data["output"] |= {"width": 192, "height": 144}
+    scene_data["camera"] |= {"radius": 0.25, "height": 0.25}
+    return ms.load_scene(write_scene(scene_data))
+
+
+def layout_of_small_scene(scene: ms.Scene, settled: dict[str, Any]) -> ms.Layout:
+    if "layout" not in settled:
+        settled["layout"] = ms.settle_layout(scene, 0)
+    return settled["layout"]
+
+
+def test_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    frame = ms.render_frame(scene, 1, layout=layout)
+    assert frame.image.shape == (144, 192, 3) and frame.image.dtype == np.uint8
+    known = {instance.id for instance in layout.instances}
+    assert set(np.unique(frame.instance)) <= known | {0}
+    assert frame.labels.instances
+    for label in frame.labels.instances:
+        assert label.class_name in scene.class_names
+        instance = next(i for i in layout.instances if i.id == label.id)
+        centre, _ = frame.camera.project(instance.world_from_object[:3, 3])
+        x0, y0, x1, y1 = label.box
+        assert x0 - 2 <= centre[0, 0] <= x1 + 2 and y0 - 2 <= centre[0, 1] <= y1 + 2
+    assert set(frame.seconds) >= {"render", "composite", "label"}
+    assert frame._repr_png_().startswith(b"\x89PNG")
+
+
+def test_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    first = ms.render_frame(scene, 2, layout=layout)
+    ms.render_frame(scene, 3, layout=layout)
+    again = ms.render_frame(ms.load_scene(scene.path), 2, layout=layout)
+    assert first.image.tobytes() == again.image.tobytes()
+    assert first.instance.tobytes() == again.instance.tobytes()
+
+
+@pytest.mark.parametrize("shadow", ["none", "image"])
+def test_shadow_modes_differ_from_traced(
+    write_scene: WriteScene, scene_data: dict[str, Any], settled: dict[str, Any], scene: ms.Scene, shadow: str
+) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    other = ms.load_scene(write_scene({**scene_data, "composite": {"shadow": shadow}}, f"{shadow}.yaml"))
+    traced, changed = ms.render_frame(scene, 0, layout=layout), ms.render_frame(other, 0, layout=layout)
+    assert not np.array_equal(traced.image, changed.image)
+    np.testing.assert_array_equal(traced.instance, changed.instance)
+
+
+def test_exported_xml_renders_the_same_picture(
+    scene: ms.Scene, settled: dict[str, Any], tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    monkeypatch.setattr("mitsplat.xml_scene.settle_layout", lambda *_: layout)
+    export_xml(scene, 1, tmp_path / "one.xml")
+    picture = render_xml(tmp_path / "one.xml", tmp_path / "out")
+    frame = ms.render_frame(scene, 1, layout=layout)
+    ours = np.asarray(Image.open(picture), dtype=np.float64)
+    covered = frame.layers["alpha"] > 0.99
+    assert covered.any()
+    assert np.abs(ours - frame.image)[covered].mean() < 1.0
+
+
+def test_bad_xml_is_one_sentence(tmp_path: Any) -> None:
+    (tmp_path / "bad.xml").write_text('<scene version="3.0.0"><shape type="splats"/></scene>')
+    with pytest.raises(InputError, match="filename"):
+        render_xml(tmp_path / "bad.xml", tmp_path)
+    with pytest.raises(InputError, match="no such file"):
+        render_xml(tmp_path / "absent.xml", tmp_path)
+
+
+def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:
+    with pytest.raises(InputError):
+        ms.render_frame(scene, 12)

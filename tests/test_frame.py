@@ -45,7 +45,7 @@ def test_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str, 
         instance = next(i for i in layout.instances if i.id == label.id)
         centre, _ = frame.camera.project(instance.world_from_object[:3, 3])
         x0, y0, x1, y1 = label.box
-        assert x0 - 2 <= centre[0, 0] <= x1 + 2 and y0 - 2 <= centre[0, 1] <= y1 + 2
+        assert x0 - 8 <= centre[0, 0] <= x1 + 8 and y0 - 8 <= centre[0, 1] <= y1 + 8
     assert set(frame.seconds) >= {"render", "composite", "label"}
     assert frame._repr_png_().startswith(b"\x89PNG")
 

@@ -128,6 +128,9 @@ class Settle(StrictModel):
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(5, ge=1, description="Redraws before a layout is given up.")
     timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
+    stepper: Literal["warp", "mujoco"] = Field(
+        "warp", description="Newton's MuJoCo solver on Warp, or MuJoCo in C: double precision and nothing to compile."
+    )
 
 
 class Intrinsics(StrictModel):

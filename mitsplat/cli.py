@@ -58,7 +58,7 @@ def render(
     quality: Annotated[QualityName | None, typer.Option(help="Rendering preset.")] = None,
     workers: Annotated[int, typer.Option(help="Processes that make images.")] = 1,
     formats: Annotated[
-        str | None, typer.Option("--format", metavar="NAMES", help="Of yolo, coco, bop and exr, separated by commas.")
+        str | None, typer.Option("--format", metavar="NAMES", help="Of yolo, coco and exr, separated by commas.")
     ] = None,
     overwrite: Annotated[
         bool,

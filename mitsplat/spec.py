@@ -322,7 +322,7 @@ class Output(StrictModel):
     height: int = Field(720, ge=1, le=16384, description="Image height [px].")
     layouts: int = Field(4, ge=1, description="How many times the objects are dropped.")
     views: int = Field(10, ge=1, description="Images of each layout.")
-    formats: tuple[Literal["yolo", "coco", "bop", "exr"], ...] = Field(
+    formats: tuple[Literal["yolo", "coco", "exr"], ...] = Field(
         ("yolo",), min_length=1, description="Label formats, and exr for every layer."
     )
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")

@@ -195,7 +195,7 @@ def test_doctor_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         (["--size", "-1x3"], "--size must be WIDTHxHEIGHT"),
         (["--size", "0x3"], "scene.yaml: output.width: must be >= 1 (got 0)"),
         (["--seed", "-1"], "scene.yaml: seed: must be >= 0 (got -1)"),
-        (["--format", "yolo,zip"], "output.formats[1]: must be 'yolo', 'coco', 'bop' or 'exr' (got \"zip\")"),
+        (["--format", "yolo,zip"], "output.formats[1]: must be 'yolo', 'coco' or 'exr' (got \"zip\")"),
         (["-n", "13"], "(got 13)"),
         (["-n", "0"], "(got 0)"),
         (["--workers", "0"], "(got 0)"),

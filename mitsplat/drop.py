@@ -5,6 +5,8 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -14,7 +16,7 @@ from mitsplat.assets import Asset
 from mitsplat.clearance import Clearance, PlacedSurface, Surface, all_clearances, clearance
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
-from mitsplat.physics import Body, Collider, Outcome, World, run_to_rest
+from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, run_to_rest
 from mitsplat.scene import Scene
 from mitsplat.settle import FloatArray, Instance, Layout, Progress, RestCertificate
 from mitsplat.spec import Region
@@ -27,43 +29,70 @@ _REACH = 5e-3  # gaps beyond this are not measured [m]
 _DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _WIDEST_GAP, _SHARE = 3e-4, 5e-4, 1e-3, 0.005
 
 
+@dataclass(frozen=True)
+class _Request:
+    """A scene, and whom to tell what making its :class:`Drop` takes, which is no part of what is asked for."""
+
+    scene: Scene
+    progress: Progress = field(compare=False)
+
+
+def drop_of(scene: Scene, progress: Progress) -> Drop:
+    """The :class:`Drop` of a scene, the same as the last time if the scene is."""
+    return _make_drop(_Request(scene, progress))
+
+
+@lru_cache(maxsize=1)
+def _make_drop(request: _Request) -> Drop:
+    return Drop(request.scene, request.progress)
+
+
 class Drop:
-    """Everything that the attempts at one layout share."""
+    """Drops the objects of a scene; keeps what its layouts share, of which the simulation itself costs most to make.
 
-    def __init__(self, scene: Scene, index: int, progress: Progress) -> None:
-        self.scene, self.index = scene, index
-        counts = _random(scene.spec.seed, "object counts", index)
-        self.assets = [
-            position
-            for position, entry in enumerate(scene.spec.objects)
-            for _ in range(int(counts.integers(*_range(entry.count), endpoint=True)))
-        ]
+    Args:
+        scene: What to drop, from where, and on what.
+        progress: Told in a few words what takes long.
+    """
+
+    def __init__(self, scene: Scene, progress: Progress) -> None:
+        self.scene = scene
         self._parts: dict[int, tuple[Body, Surface]] = {}
-        dropped = [self._part(scene.assets[position], progress) for position in self.assets]
-        self.bodies = [body for body, _ in dropped]
-        self.surfaces = [surface for _, surface in dropped]
-        self.colliders: list[Collider] = []
-        self.obstacles: list[PlacedSurface] = []
+        self._worlds: dict[tuple[tuple[int, ...], float], World] = {}
+        self._objects = [self._part(asset, progress) for asset in scene.assets]
+        self._colliders: list[Collider] = []
+        self._obstacles: list[PlacedSurface] = []
         walls = self._add_colliders(progress)
-        self.bounds = _enclosure(scene.spec.region, [item.bounds for item in self.obstacles], walls)
+        self._bounds = _enclosure(scene.spec.region, [item.bounds for item in self._obstacles], walls)
 
-    def settle(self) -> Layout:
-        """Draw poses until a layout holds."""
-        if not self.bodies:
-            return Layout(self.index, (), RestCertificate(True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, attempts=0))
+    def settle(self, index: int) -> Layout:
+        """Draw poses until a layout holds.
+
+        Raises:
+            InputError: If objects find no room, or no draw holds.
+        """
         spec, refused, capacity = self.scene.spec, [], 1.0
+        counts = _random(spec.seed, "object counts", index)
+        assets = tuple(
+            position
+            for position, entry in enumerate(spec.objects)
+            for _ in range(int(counts.integers(*_range(entry.count), endpoint=True)))
+        )
+        if not assets:
+            return Layout(index, (), RestCertificate(True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, attempts=0))
         for attempt in range(spec.settle.attempts):
-            rng = _random(spec.seed, "object poses", self.index, attempt)
-            poses = self._arrangement(rng)
-            outcome = self._simulate(poses, capacity)
+            poses = self._arrangement(assets, _random(spec.seed, "object poses", index, attempt))
+            world = self._world(assets, capacity)
+            world.reset(poses)
+            outcome = run_to_rest(world, max_time=spec.settle.max_time, bounds=self._bounds)
             reason = outcome.refused
-            if reason == "contact buffer overflow":
+            if reason == OVERFLOW:
                 capacity *= 2
             if not reason:
-                resting = [self._placed(i, pose) for i, pose in enumerate(outcome.poses)]
-                clearances = all_clearances(resting, self.obstacles, reach=_REACH)
+                resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
+                clearances = all_clearances(resting, self._obstacles, reach=_REACH)
                 gaps = _support_gaps(resting, clearances)
-                reason = _fault(clearances, gaps, self.obstacles)
+                reason = _fault(clearances, gaps, self._obstacles)
             if reason:
                 refused.append(reason)
                 continue
@@ -78,12 +107,24 @@ class Drop:
                 attempts=attempt + 1,
                 refused=tuple(refused),
             )
-            return Layout(self.index, self._instances(outcome.poses), certificate)
+            return Layout(index, self._instances(assets, outcome.poses), certificate)
         reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused).items())
         raise InputError(
-            f"{self.scene.path}: layout {self.index} must come to rest in settle.attempts = {spec.settle.attempts} "
+            f"{self.scene.path}: layout {index} must come to rest in settle.attempts = {spec.settle.attempts} "
             f"draws (got {reasons})"
         )
+
+    def _world(self, assets: tuple[int, ...], capacity: float) -> World:
+        """The simulation of these assets; the last one is kept."""
+        if (assets, capacity) not in self._worlds:
+            settle, bodies = self.scene.spec.settle, [self._objects[asset][0] for asset in assets]
+            self._worlds.clear()
+            self._worlds[assets, capacity] = (
+                MujocoWorld(bodies, self._colliders, timestep=settle.timestep)
+                if settle.stepper == "mujoco"
+                else WarpWorld(bodies, self._colliders, timestep=settle.timestep, capacity=capacity)
+            )
+        return self._worlds[assets, capacity]
 
     def _part(self, asset: Asset, progress: Progress) -> tuple[Body, Surface]:
         """Body and surface of an asset, made once for all entries that share its mesh."""
@@ -97,13 +138,13 @@ class Drop:
         return self._parts[id(asset.mesh)]
 
     def _add_colliders(self, progress: Progress) -> list[int]:
-        """Fill ``colliders`` and ``obstacles``, which are parallel; positions of the invisible ones: the enclosure."""
+        """Fill colliders and obstacles, which are parallel; positions of the invisible ones: the enclosure."""
         scene, walls = self.scene, []
         for shape, shape_mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
             if not shape.collider:
                 continue
             if not (shape.visible or shape.proxy):
-                walls.append(len(self.colliders))
+                walls.append(len(self._colliders))
             mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
             if shape.box is None:
                 collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
@@ -112,76 +153,63 @@ class Drop:
                 pose[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
                 pose[:3, 3] = shape.box.position
                 collider = Collider(shape.friction, box=(shape.box.size, pose))
-            self.colliders.append(collider)
-            self.obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
+            self._colliders.append(collider)
+            self._obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
         surroundings = scene.environment
         if surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
             pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
-            self.colliders.append(Collider(surroundings.friction, pieces=pieces))
-            self.obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
-        if not self.colliders:
+            self._colliders.append(Collider(surroundings.friction, pieces=pieces))
+            self._obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
+        if not self._colliders:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
         return walls
 
-    def _arrangement(self, rng: np.random.Generator) -> FloatArray:
+    def _arrangement(self, assets: Sequence[int], rng: np.random.Generator) -> FloatArray:
         """Poses (N, 4, 4) in the region, orientations uniform in SO(3), bounding boxes apart, colliders not touched."""
         for _ in range(_ARRANGEMENTS):
-            poses = self._place_all(rng)
+            poses = self._place_all(assets, rng)
             if poses is not None:
                 return poses
         size = np.subtract(self.scene.spec.region.max, self.scene.spec.region.min)
         raise InputError(
-            f"{self.scene.path}: region must hold the objects of a layout side by side ({len(self.bodies)} do not find "
-            f"room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m: make it larger, or counts lower)"
+            f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
+            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m)"
         )
 
-    def _place_all(self, rng: np.random.Generator) -> FloatArray | None:
-        poses = np.tile(np.eye(4), (len(self.bodies), 1, 1))
-        low, high = (np.array(corner) for corner in (self.scene.spec.region.min, self.scene.spec.region.max))
+    def _place_all(self, assets: Sequence[int], rng: np.random.Generator) -> FloatArray | None:
+        region = self.scene.spec.region
+        poses = np.tile(np.eye(4), (len(assets), 1, 1))
         taken: list[FloatArray] = []
         # Large ones first, for which room is scarce.
-        for i in sorted(range(len(self.bodies)), key=lambda i: -self.bodies[i].size):
+        for i in sorted(range(len(assets)), key=lambda i: -self._objects[assets[i]][0].size):
             poses[i, :3, :3] = Rotation.random(rng=rng).as_matrix()
-            turned = self.bodies[i].outline @ poses[i, :3, :3].T
+            turned = self._objects[assets[i]][0].outline @ poses[i, :3, :3].T
             bounds = np.stack([turned.min(axis=0), turned.max(axis=0)])
-            room = np.stack([low - bounds[0], high - bounds[1]])
-            if (room[0] > room[1]).any():
+            low, high = np.array(region.min) - bounds[0], np.array(region.max) - bounds[1]
+            if (low > high).any():
                 return None
             for _ in range(_PLACES):
-                poses[i, :3, 3] = rng.uniform(*room)
+                poses[i, :3, 3] = rng.uniform(low, high)
                 box = bounds + poses[i, :3, 3]
-                if not any(_boxes_meet(box, other) for other in taken) and not self._touches_collider(i, poses[i]):
+                if any(_boxes_meet(box, other) for other in taken):
+                    continue
+                placed = self._placed(assets[i], poses[i])
+                if all(clearance(placed, item, reach=_SPACING).distance > 0 for item in self._obstacles):
                     taken.append(box)
                     break
             else:
                 return None
         return poses
 
-    def _touches_collider(self, i: int, pose: FloatArray) -> bool:
-        placed = self._placed(i, pose)
-        return any(clearance(placed, item, reach=_SPACING).distance <= 0 for item in self.obstacles)
+    def _placed(self, asset: int, pose: FloatArray) -> PlacedSurface:
+        return PlacedSurface(self.scene.assets[asset].name, self._objects[asset][1], pose)
 
-    def _simulate(self, poses: FloatArray, capacity: float) -> Outcome:
-        settle = self.scene.spec.settle
-        world = World(
-            self.bodies,
-            self.colliders,
-            poses,
-            stepper=settle.stepper,
-            timestep=settle.timestep,
-            capacity=capacity,
-        )
-        return run_to_rest(world, max_time=settle.max_time, bounds=self.bounds)
-
-    def _placed(self, i: int, pose: FloatArray) -> PlacedSurface:
-        return PlacedSurface(self.scene.assets[self.assets[i]].name, self.surfaces[i], pose)
-
-    def _instances(self, poses: FloatArray) -> tuple[Instance, ...]:
-        classes = [self.scene.class_names.index(self.scene.assets[asset].class_name) for asset in self.assets]
+    def _instances(self, assets: Sequence[int], poses: FloatArray) -> tuple[Instance, ...]:
+        classes = [self.scene.class_names.index(self.scene.assets[asset].class_name) for asset in assets]
         return tuple(
             Instance(number + 1, asset, class_index, pose)
-            for number, (asset, class_index, pose) in enumerate(zip(self.assets, classes, poses, strict=True))
+            for number, (asset, class_index, pose) in enumerate(zip(assets, classes, poses, strict=True))
         )
 
 

@@ -1,15 +1,16 @@
 """Rigid bodies that fall until they rest: a Newton model, stepped by MuJoCo's solver on Warp or in C.
 
-Import it, and call what it holds, within :func:`mitsplat.settle.warp_settings`, which keeps compilation short.
+Import it, and use it, within :func:`mitsplat.settle.warp_settings`, which keeps compilation short.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import newton
@@ -23,10 +24,12 @@ from scipy.spatial.transform import Rotation
 from mitsplat.mesh import MassProperties, join_meshes
 
 FloatArray = NDArray[np.float64]
-Stepper = Literal["warp", "mujoco"]
 
 QUIET_SPEED, QUIET_SPIN = 1e-3, 0.05
 """A body below both [m/s, rad/s] may be at rest."""
+
+OVERFLOW = "contact buffer overflow"
+"""Why :func:`run_to_rest` refuses a drop that a larger capacity may save."""
 
 _GRAVITY = (0.0, 0.0, -9.81)
 _QUIET_TIME = 0.25  # how long every body must have been quiet [s]
@@ -35,8 +38,19 @@ _MOTION, _MOTION_TIME = 5e-4, 0.5  # how far a surface may have moved [m] in how
 _CONTACT_TIME = 0.005
 # Spin and roll friction [m], at most these shares of the size: round parts stop, thin ones do not stand on their rim.
 _TORSIONAL, _ROLLING = (5e-3, 0.1), (5e-4, 0.01)
-_LEAST_FRICTION = 1e-5  # below it MuJoCo divides by almost nothing
+_LEAST_FRICTION = 2e-5  # below it MuJoCo divides by almost nothing
+_CONTACT = {"mujoco:condim": 6}  # with spin and roll friction
 _STEPS = 4  # per captured graph; even, so that the two states end as they began
+_SOLVER_OPTIONS: dict[str, Any] = {
+    "integrator": "implicitfast",
+    "solver": "newton",
+    "cone": "elliptic",
+    "impratio": 100.0,
+    "enable_multiccd": True,
+    "disable_sensors": True,
+    "include_sites": False,
+    "kinematic_switchable_roots": False,
+}
 # Some kernels are compiled for the number of bodies: bodies without shape fill it up to a multiple of this.
 _BATCH = 4
 
@@ -98,63 +112,28 @@ class Outcome:
     poses: FloatArray = field(repr=False)
 
 
-class World:
-    """Bodies above colliders, in motion.
+class World(ABC):
+    """Bodies above colliders; made without motion, set in motion by :meth:`reset`.
 
-    Args:
+    Attributes:
         bodies: What falls.
-        colliders: What it falls on.
-        poses: World-from-body transforms at the start, shape (N, 4, 4).
-        stepper: ``warp`` for Newton's contacts and mujoco_warp in one captured graph, ``mujoco`` for MuJoCo in C.
-        timestep: [s].
-        capacity: Factor on the size of the contact buffers.
-
-    Newton finds the contacts for ``warp``: those of mujoco_warp flicker where many coplanar pieces touch in single
-    precision, and a cup of fifty pieces then creeps at 5 mm/s for ever.
+        interval: Simulated time of each :meth:`advance` [s].
+        time: Simulated time since :meth:`reset` [s].
     """
 
-    def __init__(
-        self,
-        bodies: Sequence[Body],
-        colliders: Sequence[Collider],
-        poses: FloatArray,
-        *,
-        stepper: Stepper = "warp",
-        timestep: float = 0.002,
-        capacity: float = 1.0,
-    ) -> None:
+    def __init__(self, bodies: Sequence[Body], *, timestep: float) -> None:
         self.bodies = tuple(bodies)
+        self.interval = _STEPS * timestep
         self.time = 0.0
-        self.interval = _STEPS * timestep  # simulated by each call of advance [s]
-        self._timestep = timestep
-        model = _build_model(self.bodies, colliders, poses)
-        contacts = max(16, int(capacity * (40 * len(bodies) + model.shape_count)))
-        self._solver = SolverMuJoCo(
-            model,
-            nconmax=contacts,
-            njmax=6 * contacts,
-            integrator="implicitfast",
-            solver="newton",
-            cone="elliptic",
-            impratio=100.0,
-            enable_multiccd=True,
-            disable_sensors=True,
-            include_sites=False,
-            kinematic_switchable_roots=False,
-            use_mujoco_cpu=stepper == "mujoco",
-            use_mujoco_contacts=stepper == "mujoco",
+
+    def reset(self, poses: FloatArray) -> None:
+        """Put the bodies at rest at world-from-body transforms, shape (N, 4, 4); nothing is left of the past."""
+        self.time = 0.0
+        coordinates = _parking(self.bodies)
+        coordinates[: len(poses)] = np.concatenate(
+            [poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1
         )
-        self._states = model.state(), model.state()
-        self._control = model.control()
-        self._pipeline: newton.CollisionPipeline | None = None
-        if stepper == "warp":
-            # Overflow is read from flags: the kernels would print it at every step.
-            self._solver.mjw_model.opt.warn_overflow = 0
-            self._pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=contacts)
-            self._contacts = self._pipeline.contacts()
-            overflow = SolverMuJoCo.ObservableKind.OVERFLOW
-            self._observables = [self._solver.observables({overflow}) for _ in range(_STEPS)]
-        self._graph: wp.Graph | None = None
+        self._reset(coordinates)
 
     def advance(self) -> None:
         """Step a few times.
@@ -162,50 +141,124 @@ class World:
         Raises:
             ContactOverflow: The contact buffers were too small in one of the steps.
         """
-        if self._pipeline is None:
-            self._step()
-        elif self._graph is None:
-            self._step()  # loads the kernels, which a capture must not
-            with wp.ScopedCapture(device="cpu") as capture:
-                self._step()
-            self._graph = capture.graph
-        else:
-            wp.capture_launch(self._graph)
+        self._advance()
         self.time += self.interval
-        if self._overflowed():
-            raise ContactOverflow
 
     @property
     def poses(self) -> FloatArray:
         """World-from-body transforms, shape (N, 4, 4)."""
-        stored = _array(self._states[0].body_q)[: len(self.bodies)]
-        poses = np.tile(np.eye(4), (len(stored), 1, 1))
-        poses[:, :3, :3] = Rotation.from_quat(stored[:, 3:]).as_matrix()
-        poses[:, :3, 3] = stored[:, :3]
+        coordinates = self._coordinates()[: len(self.bodies)]
+        poses = np.tile(np.eye(4), (len(coordinates), 1, 1))
+        poses[:, :3, :3] = Rotation.from_quat(coordinates[:, 3:]).as_matrix()
+        poses[:, :3, 3] = coordinates[:, :3]
         return poses
 
     @property
+    @abstractmethod
     def velocities(self) -> FloatArray:
         """Linear velocity of the centre of mass [m/s] and angular velocity [rad/s] in world axes, shape (N, 2, 3)."""
+
+    @abstractmethod
+    def _reset(self, coordinates: FloatArray) -> None: ...
+
+    @abstractmethod
+    def _advance(self) -> None: ...
+
+    @abstractmethod
+    def _coordinates(self) -> FloatArray:
+        """Position and xyzw quaternion of every body, those without shape included, shape (M, 7)."""
+
+
+class WarpWorld(World):
+    """Newton's contacts and mujoco_warp's solver in one captured graph.
+
+    The contacts of mujoco_warp itself flicker where many coplanar pieces touch in single precision: a cup of fifty
+    pieces then creeps at 5 mm/s for ever. Newton's come to rest.
+    """
+
+    def __init__(
+        self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float, capacity: float
+    ) -> None:
+        super().__init__(bodies, timestep=timestep)
+        self._timestep = timestep
+        model = _build_model(bodies, colliders)
+        contacts = max(16, int(capacity * (40 * len(bodies) + model.shape_count)))
+        self._solver = SolverMuJoCo(
+            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
+        )
+        # Overflow is read from flags: the kernels would print it at every step.
+        self._solver.mjw_model.opt.warn_overflow = 0
+        self._pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=contacts)
+        self._contacts = self._pipeline.contacts()
+        self._states = model.state(), model.state()
+        self._control = model.control()
+        self._observables = [self._solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW}) for _ in range(_STEPS)]
+        self._record()  # loads the kernels, which a capture must not
+        with wp.ScopedCapture(device="cpu") as capture:
+            self._record()
+        self._graph = capture.graph
+
+    @property
+    def velocities(self) -> FloatArray:
+        """See :attr:`World.velocities`."""
         return _array(self._states[0].body_qd)[: len(self.bodies)].reshape(-1, 2, 3)
 
-    def _step(self) -> None:
+    def _record(self) -> None:
         here, there = self._states
-        for i in range(_STEPS):
-            if self._pipeline is None:
-                self._solver.step(here, there, self._control, None, self._timestep)
-            else:
-                self._pipeline.collide(here, self._contacts)
-                self._solver.step(
-                    here, there, self._control, self._contacts, self._timestep, observables=self._observables[i]
-                )
+        for observables in self._observables:
+            self._pipeline.collide(here, self._contacts)
+            self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
             here, there = there, here
 
-    def _overflowed(self) -> bool:
-        if self._pipeline is None:
-            full = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
-            return any(self._solver.mj_data.warning[kind].number for kind in full)
-        return any(_array(observed.overflow).any() for observed in self._observables)
+    def _reset(self, coordinates: FloatArray) -> None:
+        state = self._states[0]
+        self._solver.reset(state)
+        still = np.zeros((len(coordinates), 6))
+        _assign(state.joint_q, coordinates.ravel())
+        _assign(state.body_q, coordinates)
+        _assign(state.joint_qd, still.ravel())
+        _assign(state.body_qd, still)
+
+    def _advance(self) -> None:
+        wp.capture_launch(self._graph)
+        if any(_array(observed.overflow).any() for observed in self._observables):
+            raise ContactOverflow
+
+    def _coordinates(self) -> FloatArray:
+        return _array(self._states[0].body_q)
+
+
+class MujocoWorld(World):
+    """The same model, stepped by MuJoCo in C: double precision, its own contacts, buffers that grow."""
+
+    def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
+        super().__init__(bodies, timestep=timestep)
+        solver = SolverMuJoCo(_build_model(bodies, colliders), use_mujoco_cpu=True, **_SOLVER_OPTIONS)
+        self._model, self._data = solver.mj_model, solver.mj_data
+        self._model.opt.timestep = timestep
+        self._centres = np.array([body.mass.centre for body in bodies])
+
+    @property
+    def velocities(self) -> FloatArray:
+        """See :attr:`World.velocities`; MuJoCo's are of the frame's origin, and turn in the body's axes."""
+        rotations = self.poses[:, :3, :3]
+        of_origin = np.array(self._data.qvel).reshape(-1, 2, 3)[: len(self.bodies)]
+        spin = np.einsum("nij,nj->ni", rotations, of_origin[:, 1])
+        arms = np.einsum("nij,nj->ni", rotations, self._centres)
+        return np.stack([of_origin[:, 0] + np.cross(spin, arms), spin], axis=1)
+
+    def _reset(self, coordinates: FloatArray) -> None:
+        mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = coordinates[:, [0, 1, 2, 6, 3, 4, 5]].ravel()
+
+    def _advance(self) -> None:
+        mujoco.mj_step(self._model, self._data, nstep=_STEPS)
+        full = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+        if any(self._data.warning[kind].number for kind in full):
+            raise ContactOverflow
+
+    def _coordinates(self) -> FloatArray:
+        return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]
 
 
 def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> Outcome:
@@ -232,7 +285,7 @@ def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, Floa
         try:
             world.advance()
         except ContactOverflow:
-            return Outcome("contact buffer overflow", world.time, np.inf, np.inf, np.inf, world.poses)
+            return Outcome(OVERFLOW, world.time, np.inf, np.inf, np.inf, world.poses)
         velocities = world.velocities
         if not np.isfinite(velocities).all():
             return Outcome("the simulation diverged", world.time, np.inf, np.inf, np.inf, velocities)
@@ -257,6 +310,10 @@ def _array(values: Any) -> FloatArray:
     return np.array(values.numpy(), dtype=np.float64)
 
 
+def _assign(array: Any, values: FloatArray) -> None:
+    array.assign(values.astype(np.float32))
+
+
 def _surface_motion(bodies: Sequence[Body], before: FloatArray, after: FloatArray) -> float:
     """Farthest that a point of any body is displaced between two sets of poses [m]."""
     moved = after - before
@@ -266,7 +323,19 @@ def _surface_motion(bodies: Sequence[Body], before: FloatArray, after: FloatArra
     )
 
 
-def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], poses: FloatArray) -> newton.Model:
+def _parking(bodies: Sequence[Body]) -> FloatArray:
+    """Where bodies wait, those without shape always: in a row above everything, far apart; shape (M, 7).
+
+    Models are built there, so that no constant of the solver depends on the poses of a drop.
+    """
+    spacing = 2 * max(body.size for body in bodies)
+    count = len(bodies) + -len(bodies) % _BATCH
+    coordinates = np.tile([0.0, 0.0, 100.0, 0.0, 0.0, 0.0, 1.0], (count, 1))
+    coordinates[:, 0] = spacing * np.arange(count)
+    return coordinates
+
+
+def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider]) -> newton.Model:
     builder = newton.ModelBuilder(gravity=_GRAVITY)
     builder.validate_inertia_detailed = True  # in Python: the other way compiles a kernel for 4 s
     SolverMuJoCo.register_custom_attributes(builder)
@@ -276,33 +345,29 @@ def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], poses: F
         if collider.box is not None:
             size, pose = collider.box
             hx, hy, hz = np.divide(size, 2).tolist()
-            builder.add_shape_box(
-                -1, xform=_transform(pose), hx=hx, hy=hy, hz=hz, cfg=config, custom_attributes={"mujoco:condim": 6}
-            )
+            xform = wp.transform(wp.vec3(*pose[:3, 3]), wp.quat(*Rotation.from_matrix(pose[:3, :3]).as_quat()))
+            builder.add_shape_box(-1, xform=xform, hx=hx, hy=hy, hz=hz, cfg=config, custom_attributes=_CONTACT)
         _add_hulls(builder, -1, [_newton_hull(piece) for piece in collider.pieces], config)
-    for body, pose in zip(bodies, poses, strict=True):
-        link = _add_body(builder, body.mass, pose)
-        _add_hulls(builder, link, body.hulls, _shape_config(body.friction, size=body.size))
-    for _ in range(-len(bodies) % _BATCH):
-        _add_body(builder, bodies[0].mass, np.eye(4))
+    for i, place in enumerate(_parking(bodies)):
+        body = bodies[i] if i < len(bodies) else None
+        mass = bodies[0].mass if body is None else body.mass
+        link = builder.add_body(
+            xform=wp.transform(wp.vec3(*place[:3]), wp.quat(*place[3:])),
+            mass=mass.mass,
+            com=wp.vec3(*mass.centre),
+            inertia=wp.mat33(*mass.inertia.ravel()),
+            lock_inertia=True,
+        )
+        if body is not None:
+            _add_hulls(builder, link, body.hulls, _shape_config(body.friction, size=body.size))
     return builder.finalize(device="cpu")
-
-
-def _add_body(builder: newton.ModelBuilder, mass: MassProperties, pose: FloatArray) -> int:
-    return builder.add_body(
-        xform=_transform(pose),
-        mass=mass.mass,
-        com=wp.vec3(*mass.centre),
-        inertia=wp.mat33(*mass.inertia.ravel()),
-        lock_inertia=True,
-    )
 
 
 def _add_hulls(
     builder: newton.ModelBuilder, link: int, hulls: Sequence[newton.Mesh], config: newton.ModelBuilder.ShapeConfig
 ) -> None:
     for hull in hulls:
-        builder.add_shape_convex_hull(link, mesh=hull, cfg=config, custom_attributes={"mujoco:condim": 6})
+        builder.add_shape_convex_hull(link, mesh=hull, cfg=config, custom_attributes=_CONTACT)
 
 
 def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeConfig:
@@ -320,7 +385,3 @@ def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeC
 
 def _newton_hull(piece: trimesh.Trimesh) -> newton.Mesh:
     return newton.Mesh(piece.vertices, np.asarray(piece.faces).ravel(), maxhullvert=-1, compute_inertia=False)
-
-
-def _transform(pose: FloatArray) -> wp.transform:
-    return wp.transform(wp.vec3(*pose[:3, 3]), wp.quat(*Rotation.from_matrix(pose[:3, :3]).as_quat()))

@@ -107,9 +107,9 @@ def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None)
         InputError: If the region is too small for the objects, or no draw of poses comes to rest within the limits.
     """
     with warp_settings(progress):
-        from mitsplat.drop import Drop
+        from mitsplat.drop import drop_of
 
-        return Drop(scene, index, progress or (lambda text: None)).settle()
+        return drop_of(scene, progress or (lambda text: None)).settle(index)
 
 
 @contextmanager
@@ -120,7 +120,7 @@ def warp_settings(progress: Progress | None = None) -> Iterator[None]:
     kept = wp.config.log_level, wp.config.enable_backward
     wp.config.log_level, wp.config.enable_backward = wp.LOG_ERROR, False
     try:
-        wp.init()
+        wp.init()  # type: ignore[no-untyped-call]
         compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
         if progress is not None and not any(compiled):
             progress("compiling physics, once (about a minute)")

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from mitsplat import __version__
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -41,6 +41,8 @@ def main(args: Sequence[str] | None = None) -> None:
         app(args)
     except InputError as error:
         _fail(str(error))
+    except MissingResourceError as error:
+        _fail(str(error), status=3)
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
 
@@ -211,9 +213,9 @@ def _common(
     pass
 
 
-def _fail(sentence: str) -> None:
+def _fail(sentence: str, *, status: int = 2) -> None:
     typer.echo(f"mitsplat: {sentence}", err=True)
-    sys.exit(2)
+    sys.exit(status)
 
 
 def _overrides(

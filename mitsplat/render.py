@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import mitsuba as mi
@@ -135,9 +136,17 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
     Raises:
         InputError: If there is no such preset.
     """
-    integrator = make_integrator(quality=quality, shadow="none")
-    scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
+    ensure_variant()
+    integrator, scene = _alone(splats, str(mi.variant()))
+    integrator.quality = resolve_quality(quality)
     return render_layers(integrator, scene, camera)
+
+
+@lru_cache(maxsize=2)
+def _alone(splats: Splats, variant: str) -> tuple[Any, Any]:
+    """Integrator and scene of splats alone, kept so that the next view of the same splats uploads nothing."""
+    scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
+    return make_integrator(shadow="none"), scene
 
 
 def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:

@@ -301,3 +301,15 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert run("--version") == 0
     assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
+
+
+def test_readme_documents_every_command_and_option() -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    commands = typer.main.get_command(app).commands
+    assert set(commands) >= {"render", "preview", "bake", "export", "schema", "doctor"}
+    for name, command in commands.items():
+        line = next((row for row in readme.splitlines() if row.startswith(f"| `mitsplat {name}")), None)
+        assert line is not None, name
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and parameter.name != "help":
+                assert any(f"`{o}`" in line or f"/{o}" in line or f"{o}/" in line for o in parameter.opts), parameter.opts

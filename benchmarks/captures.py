@@ -12,9 +12,9 @@ from mitsplat.splats import Splats
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data" / "splats"
 
 
-def crowd(count: int = 887_026) -> tuple[Splats, str]:
+def crowd(folder: Path = CAPTURES, count: int = 887_026) -> tuple[Splats, str]:
     """About 0.9 M Gaussians and what they are: eleven captures side by side, or as many on random spheres."""
-    files = sorted(CAPTURES.glob("*.splat"))
+    files = sorted(folder.glob("*.splat"))
     if not files:
         return synthetic(count), f"{count} synthetic Gaussians"
     files += [file for file in files if file.stem in ("plant", "academic_tarot_cards")]

@@ -116,7 +116,9 @@ def main() -> None:
         return
     theirs = time_gsplat(splats)
     layers = render_splats(splats, CAMERA)
-    ours = np.where(layers.rgb <= 0.0031308, 12.92 * layers.rgb, 1.055 * np.maximum(layers.rgb, 1e-9) ** (1 / 2.4) - 0.055)
+    ours = np.where(
+        layers.rgb <= 0.0031308, 12.92 * layers.rgb, 1.055 * np.maximum(layers.rgb, 1e-9) ** (1 / 2.4) - 0.055
+    )
     error = np.mean((np.clip(theirs, 0, 1) - np.clip(ours, 0, 1)) ** 2)
     print(f"difference of the two images: {-10 * np.log10(error):.1f} dB (alpha is not composited alike)")
 

@@ -119,6 +119,34 @@ def _respond(record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared
     return list(zip(result[0::2], result[1::2], strict=True))
 
 
+class Lanes:
+    """Which pixels each lane carries: a column of one tile, so that a packet of lanes is a whole tile.
+
+    Attributes:
+        pixel: Number of each of the lane's pixels, row-major.
+        inside: Whether it is in the image.
+        start, stop: Range of the tile's list.
+    """
+
+    def __init__(self, lists: TileLists, view: View, per_lane: int) -> None:
+        lanes_per_tile = TILE * TILE // per_lane
+        lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * lanes_per_tile)
+        within, tile = lane % lanes_per_tile, lane // lanes_per_tile
+        tile_y = tile // view.tiles_x
+        self.view, self.per_lane = view, per_lane
+        self.x = (tile - tile_y * view.tiles_x) * TILE + within % TILE
+        self.y = tile_y * TILE + within // TILE * per_lane
+        self.pixel = [(self.y + k) * view.width + self.x for k in range(per_lane)]
+        self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(per_lane)]
+        self.start = dr.gather(mi.UInt32, lists.start, tile)
+        self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, tile), self.start)
+
+    def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
+        """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
+        pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(self.per_lane)]
+        return [u for u, _ in pairs], [v for _, v in pairs]
+
+
 def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None = None) -> Image:
     """Blend every ray of a view front to back, and average the rays of each pixel.
 
@@ -129,31 +157,20 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
     """
     n = view.samples
-    per_lane = PIXELS_PER_LANE if quality.order == "tile" else 1
-    lanes_per_tile, columns = TILE * TILE // per_lane, TILE
-    lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * lanes_per_tile)
-    within, tile = lane % lanes_per_tile, lane // lanes_per_tile
-    tile_y = tile // view.tiles_x
-    x = (tile - tile_y * view.tiles_x) * TILE + within % columns
-    y = tile_y * TILE + within // columns * per_lane
-    pixel = [(y + k) * view.width + x for k in range(per_lane)]
-    inside = [(x < view.width) & (y + k < view.height) for k in range(per_lane)]
+    lanes = Lanes(lists, view, PIXELS_PER_LANE if quality.order == "tile" else 1)
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
-        for p, m in zip(pixel, inside, strict=True)
+        for p, m in zip(lanes.pixel, lanes.inside, strict=True)
     ]
-    start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
-    stop = dr.select(inside[0], stop, start)
-
     walk = _walk_in_tile_order if quality.order == "tile" else _walk_in_ray_order
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end = dr.opaque(mi.Float, quality.transmittance_min)
     passes = []
     for i in range(n * n):
         dx, dy = dr.opaque(mi.Float, (i % n + 0.5) / n), dr.opaque(mi.Float, (i // n + 0.5) / n)
-        slopes = [view.slopes(mi.Float(x) + dx, mi.Float(y + k) + dy) for k in range(per_lane)]
-        pixels = walk(lists, start, stop, [s[0] for s in slopes], [s[1] for s in slopes], far, view, cut, end)
-        passes.append(_collect(pixels, pixel, inside, view.width * view.height))
+        us, vs = lanes.slopes(dx, dy)
+        pixels = walk(lists, lanes.start, lanes.stop, us, vs, far, view, cut, end)
+        passes.append(_collect(pixels, lanes.pixel, lanes.inside, view.width * view.height))
         if n > 1:
             dr.eval(passes[-1])
     return passes[0] if n == 1 else _average(passes)

@@ -127,7 +127,7 @@ def bin_gaussians(
     count = dr.width(index)
     if count == 0:
         return _empty(tiles)
-    index = dr.gather(mi.UInt32, index, dr.argsort(dr.gather(mi.Float, depth, index)))
+    index = dr.gather(mi.UInt32, index, dr.argsort(dr.detach(dr.gather(mi.Float, depth, index))))
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     dr.eval(owner, local)
 
@@ -240,8 +240,9 @@ class _Source:
         response, _, _, visible, box = self.bounds(g, view, cut)
         x0, x1, y0, y1 = view.tile_box(*box)
         visible &= (x1 > x0) & (y1 > y0)
+        depth, visible = dr.detach(response.depth), dr.detach(visible)
         # Depth first as the sort key; Gaussians behind the camera that still reach in front of it come first.
-        depth = dr.maximum(response.depth, 0.0)
+        depth = dr.maximum(depth, 0.0)
         dr.eval(depth, visible)
         return depth, visible
 
@@ -281,8 +282,8 @@ class _Source:
         ]
         records, bounds = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, BOUNDS * count)
         dr.scatter(records, mi.ArrayXf(record), order)
-        dr.scatter(bounds, mi.ArrayXf([u0, v0, *conic]), order)
-        x0, x1, y0, y1 = view.tile_box(*box)
+        dr.scatter(bounds, mi.ArrayXf([dr.detach(v) for v in (u0, v0, *conic)]), order)
+        x0, x1, y0, y1 = view.tile_box(*(dr.detach(side) for side in box))
         candidates = (x1 - x0) * (y1 - y0)
         tile_box = dr.empty(mi.UInt32, 4 * count)
         dr.scatter(tile_box, mi.ArrayXu([x0, y0, x1 - x0, y1 - y0]), order)
@@ -295,7 +296,8 @@ class _Source:
         g = self.load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
         k2 = 2 * dr.log(g.pop("opacity") / cut)
         g.pop("instance")
-        c = general_response(**g)
+        c = [dr.detach(v) for v in general_response(**g)]
+        k2 = dr.detach(k2)
         rows, cuts = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, 8 * count)
         order = dr.arange(mi.UInt32, count)
         zero = dr.zeros(mi.Float, count)

@@ -82,7 +82,11 @@ class PlacedSurface:
 
 @dataclass(frozen=True)
 class Clearance:
-    """How closely a pair comes: ``distance`` [m] is negative where they overlap, by the depth of the deepest point."""
+    """How closely a pair comes: ``distance`` [m] is negative where they overlap, by the depth of the deepest point.
+
+    Points are vertices and edge samples, so faces that overlap exactly flush (two equal boxes shifted along one axis)
+    are not seen; resting objects are never so aligned.
+    """
 
     first: PlacedSurface
     second: PlacedSurface

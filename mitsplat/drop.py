@@ -22,7 +22,7 @@ from mitsplat.settle import FloatArray, Instance, Layout, Progress, RestCertific
 from mitsplat.spec import Region
 
 _PLACES = 200  # positions tried for an object before all are drawn anew
-_ARRANGEMENTS = 20
+_DRAWS = 20
 _SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m], or as a share of an object's size where that is more.
@@ -81,7 +81,7 @@ class Drop:
         if not assets:
             return Layout(index, (), RestCertificate(True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, attempts=0))
         for attempt in range(spec.settle.attempts):
-            poses = self._arrangement(assets, _random(spec.seed, "object poses", index, attempt))
+            poses = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt))
             world = self._world(assets, capacity)
             world.reset(poses)
             outcome = run_to_rest(world, max_time=spec.settle.max_time, bounds=self._bounds)
@@ -165,9 +165,9 @@ class Drop:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
         return walls
 
-    def _arrangement(self, assets: Sequence[int], rng: np.random.Generator) -> FloatArray:
+    def draw_poses(self, assets: Sequence[int], rng: np.random.Generator) -> FloatArray:
         """Poses (N, 4, 4) in the region, orientations uniform in SO(3), bounding boxes apart, colliders not touched."""
-        for _ in range(_ARRANGEMENTS):
+        for _ in range(_DRAWS):
             poses = self._place_all(assets, rng)
             if poses is not None:
                 return poses

@@ -73,10 +73,12 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     welded.update_faces(welded.nondegenerate_faces())
     welded.remove_unreferenced_vertices()
-    if welded.volume < 0:
+    # Divergence theorem: tetrahedra from the origin to each triangle.
+    volume = float(np.linalg.det(welded.triangles).sum()) / 6
+    if volume < 0:
         welded.invert()
-    if solid and welded.volume < 1e-6 * size**3:
-        raise InputError(f"{name}: the mesh must enclose a volume (got {welded.volume:.3g} m^3 at {size:g} m across)")
+    if solid and abs(volume) < 1e-6 * size**3:
+        raise InputError(f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across)")
     return welded
 
 
@@ -117,7 +119,7 @@ def contact_points(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
     """
     ends = mesh.vertices[mesh.face_adjacency_edges[mesh.face_adjacency_angles > _SHARP]]
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    parts = np.ceil(lengths / max(5e-4, 0.01 * float(mesh.extents.max()))).astype(int)
+    parts = np.ceil(lengths / max(5e-4, 0.01 * float(mesh.extents.max())) - 1e-6).astype(int)
     edge = np.repeat(np.arange(len(ends)), np.maximum(parts - 1, 0))
     step = np.arange(len(edge)) - np.searchsorted(edge, edge) + 1
     share = (step / parts[edge])[:, None]
@@ -184,7 +186,7 @@ def _cache_folder() -> Path:
 
 def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...] | None:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             count = len(stored.files) // 2
             return tuple(
                 trimesh.Trimesh(stored[f"vertices_{i}"], stored[f"faces_{i}"], process=False) for i in range(count)

@@ -182,13 +182,14 @@ class WarpWorld(World):
         super().__init__(bodies, timestep=timestep)
         self._timestep = timestep
         model = _build_model(bodies, colliders)
-        contacts = max(16, int(capacity * (40 * len(bodies) + model.shape_count)))
+        contacts = max(8, int(capacity * (40 * len(bodies) + model.shape_count)))
         self._solver = SolverMuJoCo(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
         )
         # Overflow is read from flags: the kernels would print it at every step.
         self._solver.mjw_model.opt.warn_overflow = 0
-        self._pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=contacts)
+        # One contact more than the solver takes: the pipeline stops counting when it is full, and flags nothing then.
+        self._pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=contacts + 1)
         self._contacts = self._pipeline.contacts()
         self._states = model.state(), model.state()
         self._control = model.control()

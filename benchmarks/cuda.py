@@ -13,12 +13,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import mitsplat  # noqa: F401 - before Mitsuba
-import drjit as dr  # isort: skip
-import mitsuba as mi  # isort: skip
+# isort: off
+from benchmarks.captures import CAMERA, CAPTURES, crowd  # imports mitsplat, which must come before Dr.Jit
+
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from benchmarks.captures import CAMERA, CAPTURES, crowd
+# isort: on
 from benchmarks.volprim import render_volprim, volprim_scene
 from mitsplat.quality import resolve_quality
 from mitsplat.render import make_sensor, render_splats

@@ -21,6 +21,7 @@ from mitsplat.surfels import CREASE_ANGLE
 FloatArray = npt.NDArray[np.float64]
 
 _DIELECTRIC_SPECULAR = 0.04
+_WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
 _DETAIL_CONTRAST = 0.12
 """Standard deviation of the encoded colour inside a face at which detail counts in full."""
@@ -66,7 +67,7 @@ class Part:
     def _face_colours(self, barycentric: FloatArray) -> FloatArray:
         """Linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, by the nearest texel."""
         if self.colours is not None:
-            return np.einsum("sk,fkc->fsc", barycentric, self.colours)
+            return np.asarray(np.einsum("sk,fkc->fsc", barycentric, self.colours))
         if self.uv is None or self.texture is None:
             raise InputError(f"part {self.name} has neither colours nor a texture")
         height, width = self.texture.shape[:2]
@@ -96,7 +97,7 @@ class Part:
             np.add.at(normals[:, k], row[shares], weighted[col[shares]])
         length = np.linalg.norm(normals, axis=2, keepdims=True)
         flat = mesh.face_normals[corner].reshape(-1, 3, 3)
-        return np.where(length > 0, normals / np.maximum(length, 1e-30), flat)
+        return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))
 
 
 def read_parts(
@@ -163,27 +164,33 @@ def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray) -> Par
     return Part(name, geometry, None, texture, np.asarray(visual.uv)[faces], metallic, roughness, shiny=True)
 
 
-def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any]) -> mi.Scene:
-    """Mitsuba scene of ``parts`` under emitters ``lights``; metals and plastics are ``principled`` BSDFs."""
-    shapes = {f"part_{k}": _mitsuba_mesh(part) for k, part in enumerate(parts)}
-    return mi.load_dict({"type": "scene", **shapes, **lights})
+def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
+    """Mitsuba scene of ``parts`` under emitters ``lights``.
+
+    Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
+    """
+    shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE if clay else _bsdf(part)) for k, part in enumerate(parts)}
+    scene: mi.Scene = mi.load_dict({"type": "scene", **shapes, **lights})
+    return scene
 
 
-def _mitsuba_mesh(part: Part) -> mi.Mesh:
+def _bsdf(part: Part) -> dict[str, Any]:
     if part.texture is not None:
         colour: dict[str, Any] = {"type": "bitmap", "bitmap": mi.Bitmap(part.texture), "raw": False}
     else:
         colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    if part.shiny:
-        bsdf = {
-            "type": "principled",
-            "base_color": colour,
-            "metallic": part.metallic,
-            "roughness": part.roughness,
-            "specular": 0.5,
-        }
-    else:
-        bsdf = {"type": "diffuse", "reflectance": colour}
+    if not part.shiny:
+        return {"type": "diffuse", "reflectance": colour}
+    return {
+        "type": "principled",
+        "base_color": colour,
+        "metallic": part.metallic,
+        "roughness": part.roughness,
+        "specular": 0.5,
+    }
+
+
+def _mitsuba_mesh(part: Part, bsdf: dict[str, Any]) -> mi.Mesh:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     count = len(part.mesh.faces)

@@ -67,14 +67,14 @@ QUALITY = Quality(transmittance_min=1e-3)
 def fit_splats(
     splats: Splats,
     pictures: Sequence[Picture],
-    settings: FitSettings = FitSettings(),  # noqa: B008 - frozen
+    settings: FitSettings = FitSettings(),
     *,
     progress: Callable[[int, float], None] | None = None,
 ) -> Splats:
     """Splats that look more like the pictures, by Adam on the mean squared error of encoded colours.
 
-    The error is taken over a random grey background, the same behind both, so that it also measures alpha. The number of
-    Gaussians stays as it is.
+    The error is taken over a random grey background, the same behind both, so that it also measures alpha. The number
+    of Gaussians stays as it is.
 
     Args:
         splats: Where to start.

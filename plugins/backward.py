@@ -1,12 +1,12 @@
 """Gradients of the splat renderer: a second march that walks the same lists and scatters per-Gaussian derivatives.
 
-Blending front to back, ``C = sum_i T_i a_i c_i`` with ``T_i = prod_{j<i} (1 - a_j)``. Let S_i be the sum up to and with i;
-what lies behind is ``C - S_i``, so that no list has to be walked backwards (the remaining-radiance trick):
+Blending front to back, ``C = sum_i T_i a_i c_i`` with ``T_i = prod_{j<i} (1 - a_j)``. Let S_i be the sum up to and
+with i; what lies behind is ``C - S_i``, so that no list is walked backwards (the remaining-radiance trick):
 
     dC / da_i = T_i c_i - (C - S_i) / (1 - a_i),     dC / dc_i = T_i a_i,     dA / da_i = T_end / (1 - a_i)
 
-With ``a = exp2(log2 o - q)`` and ``q = N / D`` as in module `gaussian`, the chain rule gives the derivatives of the view
-records; Dr.Jit's own differentiation carries them on through the projection to the Gaussians.
+With ``a = exp2(log2 o - q)`` and ``q = N / D`` as in module `gaussian`, the chain rule gives the derivatives of the
+view records; Dr.Jit's own differentiation carries them on through the projection to the Gaussians.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, ban
     return Cloud(count, geometry, padded, coefficients, bands, stride)
 
 
-class _March(dr.CustomOp):  # type: ignore[misc]
+class _March(dr.CustomOp):
     """The march as a function of the view records."""
 
     def eval(self, records: Any, context: Callable[[], tuple[TileLists, View, Quality]]) -> tuple[Any, ...]:

@@ -312,4 +312,5 @@ def test_readme_documents_every_command_and_option() -> None:
         assert line is not None, name
         for parameter in command.params:
             if parameter.param_type_name == "option" and parameter.name != "help":
-                assert any(f"`{o}`" in line or f"/{o}" in line or f"{o}/" in line for o in parameter.opts), parameter.opts
+                spelt = [form for o in parameter.opts for form in (f"`{o}`", f"/{o}", f"{o}/")]
+                assert any(form in line for form in spelt), parameter.opts

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import mitsuba as mi
 import numpy as np
@@ -22,16 +22,19 @@ from mitsplat.assets import Asset
 from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.fit import FitSettings, Picture, fit_splats
 from mitsplat.mesh import convex_pieces
 from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
+from mitsplat.trace import RAYS_PER_LAUNCH, encode_srgb, render_mesh, trace_radiance
 
 FloatArray = npt.NDArray[np.float64]
 
-_RAYS_PER_LAUNCH = 1 << 21
 _OPACITY = 0.98
-_DETAIL = 4.0
+_HIDDEN = 0.01
+"""Radiance of a white surface under the uniform light below which nobody sees it."""
+_DETAIL = 7.0
 """How many times denser Gaussians are where the texture changes strongly."""
 _RIDGE = 0.02
 """Weight of the penalty on view dependence, relative to the data: decides what no ray has seen."""
@@ -65,18 +68,22 @@ class BakeSettings:
         sharpening: Rounds that undo the blur which overlapping Gaussians cause.
         density: Relative density of Gaussians of a part of the mesh, by its name; 1 where unnamed.
         proxy_faces: Most faces of the proxy mesh.
+        fit_views: Path-traced pictures all around the mesh that the Gaussians are fitted to at last.
+        fit_steps: Steps of that fit; 0 skips it.
         verify_views: Views in which the result is compared with the mesh; 0 skips it.
         seed: Decides every random number.
     """
 
     gaussians: int = 20000
     sh_degree: int = 2
-    directions: int = 48
-    samples: int = 8
+    directions: int = 32
+    samples: int = 16
     bounces: int = 6
     sharpening: int = 4
     density: Mapping[str, float] | None = None
     proxy_faces: int = 10000
+    fit_views: int = 32
+    fit_steps: int = 300
     verify_views: int = 4
     seed: int = 0
 
@@ -100,7 +107,9 @@ def bake_asset(
     up: Literal["y", "z"] = "z",
     density: float = 1000.0,
     friction: float = 0.5,
+    collision: trimesh.Trimesh | None = None,
     cameras: Sequence[Camera] = (),
+    fit_cameras: Sequence[Camera] = (),
 ) -> BakeResult:
     """Bake a textured or coloured mesh into an asset of Gaussians.
 
@@ -116,7 +125,10 @@ def bake_asset(
         up: Axis that points up in the mesh (glTF: y).
         density: Mass density [kg/m^3].
         friction: Coulomb friction coefficient.
+        collision: Solid [m] to decompose into convex pieces in place of the proxy mesh: threads, say, left out.
         cameras: Views for the comparison; by default all around the mesh.
+        fit_cameras: Views of the pictures that the fit takes; by default all around the mesh, others than for the
+            comparison.
 
     Raises:
         InputError: If the mesh cannot be read or is empty, or the light is unknown.
@@ -127,23 +139,29 @@ def bake_asset(
     rng = np.random.default_rng(settings.seed)
     surface = trimesh.util.concatenate([part.mesh for part in parts])
     relative = settings.density or {}
-    surfels = place_surfels(
-        surface,
-        np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts]),
-        settings.gaussians,
-        rng,
-    )
-    surfels = surfels.subset(~_buried(scene, surfels, rng))
+    face_density = np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts])
+    clay = mitsuba_scene(parts, bake_lights("uniform"), clay=True)
+    wanted = settings.gaussians
+    for _ in range(2):
+        surfels = place_surfels(surface, face_density, wanted, rng)
+        surfels = surfels.subset(_seen(clay, surfels, settings, rng))
+        if len(surfels) > 0.9 * settings.gaussians:
+            break
+        wanted = round(wanted * settings.gaussians / max(len(surfels), 0.2 * settings.gaussians))
     if not len(surfels):
         raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
     colour = _fit_radiance(scene, surfels, settings, rng)
     splats = Splats(
-        means=surfels.points.astype(np.float32),
+        means=surfels.centres.astype(np.float32),
         quats=surfels.quats.astype(np.float32),
         scales=surfels.scales.astype(np.float32),
         opacities=np.full(len(surfels), _OPACITY, dtype=np.float32),
         sh=_sharpened(surfels, colour, settings.sharpening).astype(np.float32),
     )
+    if settings.fit_steps:
+        fit_cameras = fit_cameras or _orbit(surface, settings.fit_views, turn=0.0)
+        pictures = [_picture(scene, camera, settings, view) for view, camera in enumerate(fit_cameras)]
+        splats = fit_splats(splats, pictures, FitSettings(iterations=settings.fit_steps, seed=settings.seed))
     proxy = _proxy_mesh(parts, settings.proxy_faces)
     area = np.array([part.mesh.area for part in parts])
     asset = Asset(
@@ -151,7 +169,7 @@ def bake_asset(
         class_name=class_name or name,
         splats=splats,
         mesh=proxy,
-        pieces=convex_pieces(proxy) if kind == "object" else (),
+        pieces=convex_pieces(collision or proxy) if kind == "object" else (),
         kind=kind,
         density=density,
         friction=friction,
@@ -163,37 +181,6 @@ def bake_asset(
         return BakeResult(asset, float("nan"), float("nan"))
     cameras = cameras or _orbit(surface, settings.verify_views)
     return BakeResult(asset, *_compare(scene, splats, cameras, settings))
-
-
-def trace_radiance(
-    scene: mi.Scene, origins: FloatArray, directions: FloatArray, *, samples: int, bounces: int, seed: int
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Mean radiance (R, 3) that arrives at ``origins`` (R, 3) [m] from ``directions`` (R, 3), and where a surface is.
-
-    Every ray is traced ``samples`` times by Mitsuba's path tracer.
-    """
-    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
-    radiance, hit = np.empty((len(origins), 3)), np.empty(len(origins), dtype=bool)
-    step = max(1, _RAYS_PER_LAUNCH // samples)
-    for launch, start in enumerate(range(0, len(origins), step)):
-        chunk = slice(start, start + step)
-        rays = mi.RayDifferential3f(
-            mi.Point3f(np.repeat(origins[chunk], samples, axis=0).T.astype(np.float32)),
-            mi.Vector3f(np.repeat(directions[chunk], samples, axis=0).T.astype(np.float32)),
-        )
-        count = len(origins[chunk]) * samples
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed + launch, count)
-        spectrum, valid, _ = integrator.sample(scene, sampler, rays)
-        radiance[chunk] = np.asarray(mi.Color3f(spectrum)).T.reshape(-1, samples, 3).mean(axis=1)
-        hit[chunk] = np.asarray(valid).reshape(-1, samples)[:, 0]
-    return radiance, hit
-
-
-def encode_srgb(linear: npt.ArrayLike) -> FloatArray:
-    """Display-encoded values of linear ones (IEC 61966-2-1), continued above 1 and clipped below 0."""
-    linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def _hemisphere(count: int) -> FloatArray:
@@ -212,37 +199,56 @@ def _turned(frames: FloatArray, directions: FloatArray, rng: np.random.Generator
     local[..., 0] = cos * directions[:, 0] - sin * directions[:, 1]
     local[..., 1] = sin * directions[:, 0] + cos * directions[:, 1]
     local[..., 2] = directions[:, 2]
-    return np.einsum("nij,nmj->nmi", frames, local)
+    return np.asarray(np.einsum("nij,nmj->nmi", frames, local))
 
 
-def _buried(scene: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """Where a surfel (N,) lies inside another solid or under another surface, so that nobody sees it."""
-    directions = _turned(surfels.frames, _hemisphere(12), rng)
-    thickness = surfels.scales[:, 2]
-    origins = surfels.points[:, None] + (2.0 * thickness)[:, None, None] * surfels.normals[:, None]
-    origins = origins + (0.5 * thickness)[:, None, None] * directions
+def _seen(clay: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """Whether light from outside finds its way to a surfel (N,): not inside a solid, a closed hollow or under a label.
+
+    ``clay`` is the scene in white, under the uniform light, its faces black from behind.
+    """
+    directions = _turned(surfels.frames, _hemisphere(8), rng)
+    origins = surfels.points[:, None] + _lift(clay) * directions
+    radiance, _ = trace_radiance(
+        clay,
+        origins.reshape(-1, 3),
+        -directions.reshape(-1, 3),
+        samples=4,
+        bounces=2,
+        seed=int(rng.integers(1 << 30)),
+    )
+    return np.asarray(radiance.reshape(len(surfels), -1).mean(axis=1) > _HIDDEN)
+
+
+def _lift(scene: mi.Scene) -> float:
+    """Distance above a surface [m] at which rays towards it start: little, but more than float32's rounding."""
+    box = scene.bbox()
+    return 1e-5 * float(max(abs(v) for v in (*box.min, *box.max)))
+
+
+def _hits_nearby(
+    scene: mi.Scene, origins: FloatArray, directions: FloatArray, normals: FloatArray, reach: FloatArray
+) -> npt.NDArray[np.bool_]:
+    """Whether rays (N, M, 3) hit a surface within ``reach`` (N,) [m] that faces much as ``normals`` (N, 3) do."""
     rays = mi.Ray3f(
         mi.Point3f(origins.reshape(-1, 3).T.astype(np.float32)),
         mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)),
     )
     hit = scene.ray_intersect_preliminary(rays)
-    surface = hit.compute_surface_interaction(rays)
-    inside = np.asarray(mi.Float(surface.n @ rays.d)) > 0.0
-    near = np.asarray(hit.t).reshape(len(surfels), -1) < 2.0 * surfels.scales[:, 1:2]
-    covered = (np.asarray(hit.is_valid()) & inside).reshape(len(surfels), -1) | near
-    return np.asarray(covered.all(axis=1))
+    normal = np.asarray(hit.compute_surface_interaction(rays).n).T.reshape(origins.shape)
+    distance = np.asarray(hit.t).reshape(origins.shape[:2])
+    alike = np.einsum("nmd,nd->nm", normal, normals) > 0.8
+    return np.asarray((distance < reach[:, None]) & alike)
 
 
-def _fit_radiance(
-    scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator
-) -> FloatArray:
+def _fit_radiance(scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator) -> FloatArray:
     """Spherical-harmonic coefficients (N, K, 3) of the display-encoded radiance that leaves every surfel."""
     local = _hemisphere(settings.directions)
     weights = 0.2 + local[:, 2]
     terms = (settings.sh_degree + 1) ** 2
     penalty = _RIDGE * weights.sum() * np.diag([1e-6] + [1.0] * (terms - 1)) / (4.0 * np.pi)
     coefficients = np.empty((len(surfels), terms, 3))
-    step = max(1, _RAYS_PER_LAUNCH // (settings.directions * settings.samples))
+    step = max(1, RAYS_PER_LAUNCH // (settings.directions * settings.samples))
     for start in range(0, len(surfels), step):
         chunk = slice(start, start + step)
         frames, scales = surfels.frames[chunk], surfels.scales[chunk]
@@ -250,7 +256,9 @@ def _fit_radiance(
         # Footprint samples average the texture over the Gaussian instead of aliasing it.
         offset = np.clip(rng.normal(size=(*towards.shape[:2], 2)), -1.5, 1.5) * 0.5 * scales[:, None, :2]
         origins = surfels.points[chunk, None] + np.einsum("nij,nmj->nmi", frames[:, :, :2], offset)
-        origins += 2.0 * scales[:, None, 2:] * frames[:, None, :, 2] + 0.5 * scales[:, None, 2:] * towards
+        origins += (0.3 * scales[:, None, :1] + _lift(scene)) * towards
+        on_surface = _hits_nearby(scene, origins, -towards, frames[:, :, 2], 1.2 * scales[:, 0])
+        origins = np.where(on_surface[..., None], origins, surfels.points[chunk, None] + _lift(scene) * towards)
         radiance, _ = trace_radiance(
             scene,
             origins.reshape(-1, 3),
@@ -305,12 +313,19 @@ def _proxy_mesh(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(proxy.vertices, proxy.faces)
 
 
-def _orbit(surface: trimesh.Trimesh, count: int) -> list[Camera]:
+def _picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:
+    """A path-traced picture of the mesh to fit to."""
+    seed = settings.seed + 1000 + view
+    radiance, cover = render_mesh(scene, camera, samples=16, bounces=settings.bounces, seed=seed)
+    return Picture(camera, encode_srgb(radiance).astype(np.float32), cover.astype(np.float32))
+
+
+def _orbit(surface: trimesh.Trimesh, count: int, *, turn: float = 0.7) -> list[Camera]:
     """Views (``count``) from all around that frame the mesh."""
     centre = surface.bounds.mean(axis=0)
     radius = 0.5 * float(np.linalg.norm(surface.extents))
     height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + 0.7
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + turn
     ring = np.sqrt(1.0 - height**2)
     outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=1)
     return [
@@ -319,49 +334,19 @@ def _orbit(surface: trimesh.Trimesh, count: int) -> list[Camera]:
     ]
 
 
-def _compare(
-    scene: mi.Scene, splats: Splats, cameras: Sequence[Camera], settings: BakeSettings
-) -> tuple[float, float]:
+def _compare(scene: mi.Scene, splats: Splats, cameras: Sequence[Camera], settings: BakeSettings) -> tuple[float, float]:
     """PSNR [dB] of the splats against the path-traced mesh: whole images, and the mesh's pixels alone."""
     from mitsplat.render import render_splats
 
     errors, on_object = [], []
     for view, camera in enumerate(cameras):
-        truth, hit = render_mesh(scene, camera, samples=36, bounces=settings.bounces, seed=settings.seed + view)
+        truth, cover = render_mesh(scene, camera, samples=36, bounces=settings.bounces, seed=settings.seed + view)
         layers = render_splats(splats, camera)
         error = (np.clip(encode_srgb(layers.rgb), 0, 1) - np.clip(encode_srgb(truth), 0, 1)) ** 2
         errors.append(error.mean())
-        on_object.append(error[hit].mean() if hit.any() else np.nan)
+        on_object.append(error[cover > 0].mean() if cover.any() else np.nan)
     return _psnr(float(np.mean(errors))), _psnr(float(np.nanmean(on_object)))
 
 
 def _psnr(error: float) -> float:
     return float(-10.0 * np.log10(max(error, 1e-12)))
-
-
-def render_mesh(
-    scene: mi.Scene, camera: Camera, *, samples: int, bounces: int = 6, seed: int = 0
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Path-traced radiance (H, W, 3) of a pinhole ``camera``, black where nothing is, and the mask (H, W) of surfaces.
-
-    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid.
-    """
-    side = max(1, round(samples**0.5))
-    fine = camera.resized(camera.width * side, camera.height * side)
-    x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
-    slopes = fine.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
-    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = np.broadcast_to(camera.centre, directions.shape)
-    radiance, hit = trace_radiance(scene, origins, directions, samples=1, bounces=bounces, seed=seed)
-    shape: tuple[Any, ...] = (camera.height, side, camera.width, side)
-    radiance = np.where(hit[:, None], radiance, 0.0).reshape(*shape, 3)
-    # Pixels are averaged encoded, as splats are blended: light spilling over edges is no error of the bake.
-    mean = encode_srgb(radiance).mean(axis=(1, 3))
-    return decode_srgb(mean), hit.reshape(shape).any(axis=(1, 3))
-
-
-def decode_srgb(encoded: npt.ArrayLike) -> FloatArray:
-    """Linear values of display-encoded ones (IEC 61966-2-1)."""
-    encoded = np.asarray(encoded, dtype=np.float64)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)

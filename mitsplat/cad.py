@@ -17,6 +17,7 @@ from trimesh.visual.material import PBRMaterial
 from mitsplat.errors import InputError
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import CREASE_ANGLE
+from mitsplat.trace import decode_srgb
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -74,7 +75,7 @@ class Part:
         uv = np.einsum("sk,fkc->fsc", barycentric, self.uv) % 1.0
         column = np.minimum((uv[..., 0] * width).astype(int), width - 1)
         row = np.minimum(((1.0 - uv[..., 1]) * height).astype(int), height - 1)
-        return _linear(self.texture[row, column] / 255.0)
+        return decode_srgb(self.texture[row, column] / 255.0)
 
     def detail_density(self, gain: float, rng: np.random.Generator) -> FloatArray:
         """Relative density (F,) that the texture asks for: 1 where it is even, ``1 + gain`` where it changes most."""
@@ -146,9 +147,9 @@ def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray) -> Par
     visual = source.visual
     if isinstance(visual, ColorVisuals):
         if visual.kind == "vertex":
-            colours = _linear(visual.vertex_colors[faces][..., :3] / 255.0)
+            colours = decode_srgb(visual.vertex_colors[faces][..., :3] / 255.0)
         elif visual.kind == "face":
-            colours = np.repeat(_linear(visual.face_colors[keep][:, None, :3] / 255.0), 3, axis=1)
+            colours = np.repeat(decode_srgb(visual.face_colors[keep][:, None, :3] / 255.0), 3, axis=1)
         else:
             colours = np.full((*faces.shape, 3), 0.5)
         return Part(name, geometry, colours, None, None, metallic=0.0, roughness=1.0, shiny=False)
@@ -157,7 +158,7 @@ def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray) -> Par
     roughness = 0.6 if material.roughnessFactor is None else float(np.clip(material.roughnessFactor, 0.05, 1.0))
     factor = np.ones(3) if material.baseColorFactor is None else np.asarray(material.baseColorFactor)[:3] / 255.0
     if material.baseColorTexture is None or visual.uv is None:
-        colours = np.broadcast_to(_linear(factor), (*faces.shape, 3)).copy()
+        colours = np.broadcast_to(decode_srgb(factor), (*faces.shape, 3)).copy()
         return Part(name, geometry, colours, None, None, metallic, roughness, shiny=True)
     texture = np.asarray(material.baseColorTexture.convert("RGB"))
     texture = (texture * factor).round().astype(np.uint8)
@@ -284,9 +285,3 @@ def _studio() -> npt.NDArray[np.float32]:
     radiance = 0.35 + np.exp(7.0 * (direction @ boxes.T - 1.0)).sum(axis=-1)
     radiance /= (radiance * np.sin(polar)[:, None]).sum() / (np.sin(polar).sum() * width)
     return np.repeat(radiance[..., None], 3, axis=2).astype(np.float32)
-
-
-def _linear(encoded: npt.ArrayLike) -> FloatArray:
-    """Linear values of display-encoded ones (IEC 61966-2-1)."""
-    encoded = np.asarray(encoded, dtype=np.float64)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

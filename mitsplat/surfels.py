@@ -24,18 +24,27 @@ _NORMAL_WEIGHT = 0.6
 """Distance, in units of r, that two opposite normals add to: keeps the two sides of thin sheets apart."""
 _PROBES = 4
 """Points per Gaussian at which the surface is tested for gaps."""
-_LEAK = 0.03
+_LEAK = 0.02
 """Largest share of light that may pass between Gaussians at a probe."""
-_CLOSING_ROUNDS = 10
+_CLOSING_ROUNDS = 14
+_ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
+"""Rows of surfels along creases: their distance from the crease and from each other, in units of the local spacing."""
 _CREASE_NEIGHBOURS = 16
-_EDGE_SIGMAS = 2.1
+_EDGE_SIGMAS = 1.5
 """Standard deviations of a disc between its centre and the nearest crease."""
-_THINNEST = 0.16
+_THINNEST = 0.27
 """Least standard deviation along the surface in units of the local spacing, however near a crease is."""
 _THICKNESS = 0.035
 """Standard deviation along the normal in units of the local spacing."""
-_EDGE_REFINEMENT = 0.6
-"""Spacing at creases relative to the spacing away from them."""
+_REFINEMENT = 0.55
+"""Spacing at creases and tight bends relative to the spacing elsewhere."""
+_BEND = 0.5
+"""Angle [rad] by which a surface may bend from one surfel to the next before they move closer together."""
+_OVERHANG = 0.15
+"""How far tips of discs may stand off a bent surface, in standard deviations of an unhindered disc."""
+_SHARES = (2.0, 1.6, 1.25, 1.0, 0.8, 0.63, 0.5)
+"""Sizes of discs that are tried against the overhang, relative to an unhindered one."""
+_COUNT_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +52,7 @@ class Surfels:
     """Points of a surface with frames and extents.
 
     Attributes:
-        points: Centres, just below the surface [m], shape (N, 3).
+        points: Positions on the surface [m], shape (N, 3).
         frames: Rotations whose columns are two tangents and the outward normal, shape (N, 3, 3).
         scales: Standard deviations along the columns of ``frames`` [m], shape (N, 3).
         faces: Face that each point lies on, shape (N,).
@@ -55,6 +64,11 @@ class Surfels:
     scales: FloatArray
     faces: IntArray
     barycentric: FloatArray
+
+    @property
+    def centres(self) -> FloatArray:
+        """Where to put Gaussians so that their outer sides lie on the surface [m], shape (N, 3)."""
+        return self.points - 1.5 * self.scales[:, 2:] * self.normals
 
     @property
     def normals(self) -> FloatArray:
@@ -91,45 +105,120 @@ def place_surfels(
     area = mesh.area_faces
     density = np.broadcast_to(np.asarray(density, dtype=np.float64), area.shape)
     creases = _CreaseIndex.build(mesh, spacing=np.sqrt(area.sum() / count) / 2.0)
-    extra = _edge_share(creases, area, density, count)
-    spacing = np.sqrt(_PACKING * (area * density).sum() * (1.0 + extra) / count / density)
-
-    reach = float(spacing.max())
-    points, faces, barycentric = _draw(mesh, area / spacing**2, _CANDIDATES, rng)
-    distance = creases.distance(points, reach)
-    fine_points, fine_faces, fine_barycentric = _draw(
-        mesh, area / spacing**2, _CANDIDATES * (_EDGE_REFINEMENT**-2 - 1.0), rng
-    )
-    fine_distance = creases.distance(fine_points, reach)
-    near = fine_distance < spacing[fine_faces]
-    points = np.concatenate([points, fine_points[near]])
-    faces = np.concatenate([faces, fine_faces[near]])
-    barycentric = np.concatenate([barycentric, fine_barycentric[near]])
-    distance = np.concatenate([distance, fine_distance[near]])
-
-    radius = spacing[faces] * np.clip(distance / spacing[faces], _EDGE_REFINEMENT, 1.0)
-    normals = mesh.face_normals[faces]
-    kept = poisson_subset(points, normals, radius, rng)
-    frames, room = _shape(normals[kept], points[kept], radius[kept], creases)
-    probe = rng.choice(len(points), size=min(len(points), _PROBES * len(kept)), replace=False)
-    probe = probe[distance[probe] > 0.3 * radius[probe]]
-    radius = radius[kept, None]
-    widest = np.clip(room / _EDGE_SIGMAS, _THINNEST * radius, 1.6 * spread * radius)
+    spacing = np.sqrt(_PACKING * (area * density).sum() / count / density)
+    for _ in range(_COUNT_ROUNDS):
+        pool = _Pool.draw(mesh, spacing, creases, rng)
+        rows = creases.rows(pool, _ROW_OFFSET)
+        kept = poisson_subset(pool.points, pool.normals, pool.radius, rng, first=rows)
+        if abs(len(kept) / count - 1.0) < 0.08:
+            break
+        spacing = spacing * np.sqrt(len(kept) / count)
+    radius = pool.radius[kept, None]
+    frames, room = _frames(pool.normals[kept], pool.points[kept], pool.radius[kept], creases)
+    widest = np.clip(room / _EDGE_SIGMAS, _THINNEST * radius, _SHARES[0] * spread * radius)
+    widest = np.minimum(widest, _overhang_limit(pool, pool.points[kept], frames, radius * spread))
     scales = np.concatenate([np.minimum(widest, spread * radius), _THICKNESS * radius], axis=1)
-    scales = _closed(points[kept], frames, scales, widest, points[probe], normals[probe])
-    # Centres sink below the surface so that the outer sides of the discs lie on it.
-    centres = points[kept] - 1.5 * scales[:, 2:] * normals[kept]
-    return Surfels(centres, frames, scales, faces[kept], barycentric[kept])
+    probe = rng.choice(len(pool.points), size=min(len(pool.points), _PROBES * len(kept)), replace=False)
+    probe = probe[pool.crease_distance[probe] > 0.15 * pool.radius[probe]]
+    scales = _closed(pool.points[kept], frames, scales, widest, pool.points[probe], pool.normals[probe])
+    return Surfels(pool.points[kept], frames, scales, pool.faces[kept], pool.barycentric[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pool:
+    """Candidates, several per surfel, dense where surfels shall be dense.
+
+    Attributes:
+        points: Positions [m], shape (P, 3).
+        normals: Unit normals of their faces, shape (P, 3).
+        faces: Shape (P,).
+        barycentric: Shape (P, 3).
+        radius: Distance to keep from other surfels [m], shape (P,).
+        crease_distance: Distance to the nearest crease [m], infinite where it is far, shape (P,).
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    faces: IntArray
+    barycentric: FloatArray
+    radius: FloatArray
+    crease_distance: FloatArray
+
+    @classmethod
+    def draw(cls, mesh: trimesh.Trimesh, spacing: FloatArray, creases: _CreaseIndex, rng: np.random.Generator) -> _Pool:
+        """Candidates for surfels ``spacing`` (F,) apart, closer together near creases and where the surface bends."""
+        expected, reach = mesh.area_faces / spacing**2, float(spacing.max())
+        points, faces, barycentric = _draw(mesh, expected, _CANDIDATES, rng)
+        distance = creases.distance(points, reach)
+        tree = KDTree(points)
+        bend = _bend(tree, mesh.face_normals[faces], spacing[faces])
+        extra = _draw(mesh, expected, _CANDIDATES * (_REFINEMENT**-2 - 1.0), rng)
+        extra_distance = creases.distance(extra[0], reach)
+        extra_bend = bend[tree.query(extra[0])[1]]
+        near = (extra_distance < spacing[extra[1]]) | (extra_bend > _BEND)
+        points = np.concatenate([points, extra[0][near]])
+        faces = np.concatenate([faces, extra[1][near]])
+        barycentric = np.concatenate([barycentric, extra[2][near]])
+        distance = np.concatenate([distance, extra_distance[near]])
+        bend = np.concatenate([bend, extra_bend[near]])
+        relative = np.minimum(distance / spacing[faces], _BEND / np.maximum(bend, 1e-9))
+        radius = spacing[faces] * np.clip(relative, _REFINEMENT, 1.0)
+        return cls(points, mesh.face_normals[faces], faces, barycentric, radius, distance)
+
+
+def _bend(tree: KDTree, normals: FloatArray, reach: FloatArray) -> FloatArray:
+    """Angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of every point of ``tree``."""
+    distance, index = tree.query(tree.data, k=min(10, tree.n))
+    cosine = np.einsum("pkd,pd->pk", normals[index], normals)
+    return np.asarray(np.arccos(np.clip(np.where(distance < reach[:, None], cosine, 1.0).min(axis=1), -1.0, 1.0)))
+
+
+def _overhang_limit(pool: _Pool, points: FloatArray, frames: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Largest standard deviations (N, 2) along the tangents with which discs stay close to the surface.
+
+    Tips at two standard deviations may rise above the nearest bit of surface by a fraction of ``sigma`` (N, 1).
+    """
+    tree = KDTree(pool.points)
+    limit = np.empty((len(points), 2))
+    for axis in range(2):
+        share, undecided = np.full(len(points), _SHARES[-1]), np.arange(len(points))
+        for candidate in _SHARES[:-1]:
+            reach = 2.0 * candidate * sigma[undecided] * frames[undecided, :, axis]
+            rise = np.zeros(len(undecided))
+            for tips in (points[undecided] + reach, points[undecided] - reach):
+                _, nearest = tree.query(tips)
+                above = np.einsum("nd,nd->n", tips - pool.points[nearest], pool.normals[nearest])
+                rise = np.maximum(rise, above)
+            close = rise < _OVERHANG * sigma[undecided, 0]
+            share[undecided[close]] = candidate
+            undecided = undecided[~close]
+        limit[:, axis] = share * sigma[:, 0]
+    return limit
 
 
 def poisson_subset(
-    points: FloatArray, normals: FloatArray, radius: FloatArray, rng: np.random.Generator
+    points: FloatArray,
+    normals: FloatArray,
+    radius: FloatArray,
+    rng: np.random.Generator,
+    first: IntArray | None = None,
 ) -> IntArray:
     """Indices of a Poisson-disk subset of ``points`` (N, 3): kept points are at least their ``radius`` (N,) apart.
 
     The parallel form of dart throwing (maximal independent set by random priorities, Luby 1986), from fine radii to
-    coarse ones. Opposite ``normals`` (N, 3) count as distance.
+    coarse ones. Opposite ``normals`` (N, 3) count as distance. Points ``first`` (M,) are chosen before all others and
+    may be a little closer together.
     """
+    if first is not None and len(first):
+        seeds = first[poisson_subset(points[first], normals[first], _ROW_SPACING * radius[first], rng)]
+        chosen = np.zeros(len(points), dtype=bool)
+        chosen[seeds] = True
+        rest = np.flatnonzero(~chosen)
+        gap, nearest = KDTree(points[seeds]).query(points[rest], distance_upper_bound=float(radius.max()))
+        nearest = seeds[np.minimum(nearest, len(seeds) - 1)]
+        facing = np.einsum("nd,nd->n", normals[rest], normals[nearest]) > 0.7
+        rest = rest[(gap > 0.8 * np.minimum(radius[rest], radius[nearest])) | ~facing]
+        return np.sort(np.concatenate([seeds, rest[poisson_subset(points[rest], normals[rest], radius[rest], rng)]]))
     level = np.ceil(2.0 * np.log2(radius / radius.min()) - 1e-9).astype(int)
     kept: list[IntArray] = []
     for current in np.unique(level):
@@ -173,18 +262,11 @@ def _draw(
     return np.einsum("nk,nkd->nd", barycentric, mesh.triangles[faces]), faces, barycentric
 
 
-def _edge_share(creases: _CreaseIndex, area: FloatArray, density: FloatArray, count: int) -> float:
-    """Extra points that refinement at creases costs, as a share of ``count``."""
-    spacing = np.sqrt(area.sum() / count)
-    strip = 2.0 * creases.length * 0.5 * spacing * (_EDGE_REFINEMENT**-2 - 1.0)
-    return float(min(strip / area.sum(), _EDGE_REFINEMENT**-2 - 1.0))
-
-
-def _shape(
+def _frames(
     normals: FloatArray, points: FloatArray, radius: FloatArray, creases: _CreaseIndex
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames (N, 3, 3), first axis towards the nearest crease, and the distances (N, 2) [m] to creases along the axes."""
-    towards = creases.offsets(points, _CREASE_NEIGHBOURS)
+    """Frames (N, 3, 3), first axis towards the nearest crease, and distances (N, 2) [m] to creases along the axes."""
+    towards, beside = creases.offsets(points, _CREASE_NEIGHBOURS)
     in_plane = towards - np.einsum("nkd,nd->nk", towards, normals)[..., None] * normals[:, None]
     distance = np.linalg.norm(in_plane, axis=2)
     # What lies far above or below belongs to another surface.
@@ -195,9 +277,9 @@ def _shape(
     first = np.where(bounded, np.take_along_axis(in_plane, nearest[..., None], axis=1)[:, 0], np.cross(normals, helper))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     frames = np.stack([first, np.cross(normals, first), normals], axis=2)
-    along = np.abs(np.einsum("nkd,ndi->nki", in_plane, frames[:, :, :2]))
-    ahead = np.isfinite(distance)[..., None] & (along > 0.7 * np.minimum(distance, 1e6)[..., None])
-    return frames, np.where(ahead, along, np.inf).min(axis=1)
+    across = np.abs(np.einsum("nkd,ndi->nki", in_plane, frames[:, :, :2]))
+    ahead = (beside & np.isfinite(distance))[..., None] & (across > 0.7 * np.minimum(distance, 1e6)[..., None])
+    return frames, np.where(ahead, across, np.inf).min(axis=1)
 
 
 def _closed(
@@ -226,26 +308,57 @@ def _closed(
 
 @dataclass(frozen=True, eq=False)
 class _CreaseIndex:
-    """Nearest-point queries against the creases and boundaries of a mesh, as a dense set of points on them."""
+    """Creases and boundaries of a mesh as a dense set of points on them.
+
+    Attributes:
+        tree: The points, or None without creases.
+        starts, units, lengths: Edges, one for each face beside them: start [m], direction, length [m].
+        owner: Edge that each point lies on.
+        inward: Directions across the edge into its face and out of the face, shape (E, 2, 3).
+    """
 
     tree: KDTree | None
     starts: FloatArray
     units: FloatArray
     lengths: FloatArray
     owner: IntArray
+    inward: FloatArray
 
     @classmethod
     def build(cls, mesh: trimesh.Trimesh, spacing: float) -> _CreaseIndex:
-        sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE_ANGLE]
-        boundary = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
-        edges = np.concatenate([sharp, boundary]).astype(int)
+        is_sharp = mesh.face_adjacency_angles > CREASE_ANGLE
+        sharp, beside = mesh.face_adjacency_edges[is_sharp], mesh.face_adjacency[is_sharp]
+        open_rows = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+        # A crease counts once for each of its faces.
+        edges = np.concatenate([sharp, sharp, mesh.edges_sorted[open_rows]]).astype(int)
+        face = np.concatenate([beside[:, 0], beside[:, 1], mesh.edges_face[open_rows]]).astype(int)
         start, along = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]]
         length = np.linalg.norm(along, axis=1)
         steps = np.maximum(1, np.ceil(length / spacing).astype(int))
         owner = np.repeat(np.arange(len(edges)), steps)
         fraction = (np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[owner]
         tree = KDTree(start[owner] + fraction[:, None] * along[owner]) if len(edges) else None
-        return cls(tree, start, along / np.maximum(length, 1e-12)[:, None], length, owner)
+        unit = along / np.maximum(length, 1e-12)[:, None]
+        inward = np.cross(mesh.face_normals[face], unit)
+        inward *= np.sign(np.einsum("nd,nd->n", mesh.triangles_center[face] - start, inward))[:, None]
+        return cls(tree, start, unit, length, owner, np.stack([inward, mesh.face_normals[face]], axis=1))
+
+    def rows(self, pool: _Pool, offset: float) -> IntArray:
+        """Those candidates (M,) that come nearest to rows along the creases, ``offset`` local spacings inside."""
+        if self.tree is None:
+            return np.empty(0, dtype=np.int64)
+        near = np.flatnonzero(np.isfinite(pool.crease_distance))
+        if not len(near):
+            return near
+        local = KDTree(pool.points[near])
+        inward, normal = self.inward[self.owner, 0], self.inward[self.owner, 1]
+        spacing = pool.radius[near][local.query(self.tree.data)[1]]
+        distance, index = local.query(self.tree.data + offset * spacing[:, None] * inward, k=np.arange(1, 5))
+        index = near[np.minimum(index, len(near) - 1)]
+        alike = np.einsum("nkd,nd->nk", pool.normals[index], normal) > 0.9
+        alike &= distance < 0.4 * spacing[:, None]
+        first = np.argmax(alike, axis=1)
+        return np.unique(index[np.arange(len(index)), first][alike.any(axis=1)])
 
     @property
     def length(self) -> float:
@@ -258,13 +371,16 @@ class _CreaseIndex:
             return np.full(len(points), np.inf)
         return np.asarray(self.tree.query(points, distance_upper_bound=reach)[0])
 
-    def offsets(self, points: FloatArray, count: int) -> FloatArray:
-        """Vectors (N, ``count``, 3) to the nearest points of the nearest creases, far away without creases."""
+    def offsets(self, points: FloatArray, count: int) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Vectors (N, ``count``, 3) to the nearest points of the nearest creases, far away without creases.
+
+        And whether those points (N, ``count``) are inside their edges: ends say nothing about the distance across.
+        """
         if self.tree is None:
-            return np.full((len(points), count, 3), 1e6)
+            return np.full((len(points), count, 3), 1e6), np.zeros((len(points), count), dtype=bool)
         _, index = self.tree.query(points, k=np.arange(1, count + 1))
         segment = self.owner[np.minimum(index, len(self.owner) - 1)]
         from_start = points[:, None] - self.starts[segment]
         position = np.einsum("nkd,nkd->nk", from_start, self.units[segment])
-        position = np.clip(position, 0.0, self.lengths[segment])
-        return position[..., None] * self.units[segment] - from_start
+        inside = np.clip(position, 0.0, self.lengths[segment])
+        return inside[..., None] * self.units[segment] - from_start, inside == position

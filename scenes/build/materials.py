@@ -78,12 +78,16 @@ def beech(rng: np.random.Generator, width: int, height: int, stave: int) -> Pixe
             image[rows, columns] = block
             left = right
     stains = smooth_noise(rng, (height, width), 45.0)
-    return scratched(np.clip(image * (1.0 + 0.025 * stains[..., None]), 0, 255), rng, count=160, length=(6, 70), gain=0.2)
+    return scratched(
+        np.clip(image * (1.0 + 0.025 * stains[..., None]), 0, 255), rng, count=160, length=(6, 70), gain=0.2
+    )
 
 
 def concrete(rng: np.random.Generator, size: int) -> Pixels:
     """Sealed grey floor."""
-    return tint((148, 146, 141), 0.05 * smooth_noise(rng, (size, size), 14.0) + 0.03 * smooth_noise(rng, (size, size), 2.0))
+    return tint(
+        (148, 146, 141), 0.05 * smooth_noise(rng, (size, size), 14.0) + 0.03 * smooth_noise(rng, (size, size), 2.0)
+    )
 
 
 def draw_text(
@@ -102,7 +106,7 @@ def label(
     band: Colour | None = None,
     barcode: int | None = None,
 ) -> Pixels:
-    """Printed label: ``lines`` of (text, height as a share of the label's), a coloured band on top, a bar code below."""
+    """Printed label: ``lines`` of (text, height as a share of the label's), a coloured band above, bars below."""
     width, height = size
     image = Image.new("RGB", size, paper)
     draw = ImageDraw.Draw(image)
@@ -180,15 +184,23 @@ def planar_uv(mesh: trimesh.Trimesh, low: tuple[float, float], high: tuple[float
 
 def decal(image: Pixels, size: tuple[float, float], pose: npt.NDArray[np.float64]) -> trimesh.Trimesh:
     """Open sheet of ``size`` with a printed ``image``, centred on the xy plane of ``pose`` (4, 4), facing +z."""
-    grid = trimesh.Trimesh(
-        [[x, y, 0.0] for y in (-0.5, 0.5) for x in (-0.5, 0.5)] * np.array([*size, 1.0]), [[0, 1, 3], [0, 3, 2]]
-    )
     half = 0.5 * size[0], 0.5 * size[1]
-    sheet = wear(subdivided(grid, max(size) / 24.0), image, np.empty((0, 2)), roughness=0.5)
-    sheet.visual.uv = planar_uv(sheet, (-half[0], -half[1]), half).reshape(-1, 2)
-    return sheet.apply_transform(pose)
+    sheet = grid(np.linspace(-half[0], half[0], 25), np.linspace(-half[1], half[1], 25))
+    return wear(sheet, image, planar_uv(sheet, (-half[0], -half[1]), half), roughness=0.5).apply_transform(pose)
 
 
 def subdivided(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
     """Faces split until no edge is longer than ``longest``, so that detail can be told from face to face."""
-    return trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=14))
+    while mesh.edges_unique_length.max() > longest:
+        mesh = mesh.subdivide()
+    return mesh
+
+
+def grid(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> trimesh.Trimesh:
+    """Flat sheet at z = 0 that faces up, with vertices at every pair of ``x`` (rising) and ``y`` (rising)."""
+    across = len(x)
+    corner = (np.arange(len(y) - 1)[:, None] * across + np.arange(across - 1)).ravel()
+    lower, upper = (corner, corner + 1, corner + across + 1), (corner, corner + across + 1, corner + across)
+    vertices = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    faces = np.concatenate([np.stack(lower, axis=1), np.stack(upper, axis=1)])
+    return trimesh.Trimesh(np.column_stack([vertices, np.zeros(len(vertices))]), faces)

@@ -1,0 +1,103 @@
+"""Bake the shipped scene's assets: ``python -m scenes.build [NAME ...] [--out FOLDER]``, all of them without a name."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+import mitsplat
+from mitsplat.bake import BakeResult, BakeSettings, bake_asset
+from mitsplat.camera import Camera
+from mitsplat.render import ensure_variant
+from mitsplat.spec import SceneSpec
+from mitsplat.yaml_input import load_yaml
+from scenes.build.parts import PARTS, build_part, collision_solid
+from scenes.build.workcell import build_workcell, densities
+
+SCENES = Path(__file__).resolve().parents[1]
+ENVIRONMENT = "workcell"
+
+
+def bake_part(name: str, seed: int) -> BakeResult:
+    """One object, in the soft boxes of a studio, so that metal looks like metal before the scene's lights come on."""
+    return bake_asset(
+        build_part(name, seed),
+        name=name,
+        light="studio",
+        density=PARTS[name][1],
+        friction=0.35,
+        collision=collision_solid(name, seed),
+        settings=BakeSettings(gaussians=16000, sh_degree=2, directions=24, samples=16, seed=seed),
+    )
+
+
+def bake_environment(seed: int) -> BakeResult:
+    """The workcell under the lights of ``workcell.yaml``, which is the one place that states them."""
+    scene = build_workcell(seed)
+    lights = load_yaml(SCENES / "workcell.yaml", SceneSpec).lights
+    target = (0.0, -0.08, 0.01)
+    views = [
+        Camera.look_at(eye, target, width=640, height=360, fov_x=50.0)
+        for eye in ((0.0, -0.62, 0.33), (-0.34, -0.45, 0.36))
+    ]
+    return bake_asset(
+        scene,
+        name=ENVIRONMENT,
+        kind="environment",
+        light=lights,
+        settings=BakeSettings(
+            gaussians=270000,
+            sh_degree=1,
+            directions=20,
+            samples=16,
+            bounces=4,
+            density=densities(scene),
+            fit_steps=128,
+            seed=seed,
+        ),
+        cameras=views,
+        fit_cameras=[
+            Camera.look_at(target + np.array(offset), target, width=640, height=360, fov_x=62.0)
+            for offset in _fit_offsets()
+        ],
+    )
+
+
+def _fit_offsets() -> list[tuple[float, float, float]]:
+    """Where the environment is looked at from: the range of the scene's camera, and a little beyond."""
+    directions = [(a, e, r) for r in (0.4, 0.68) for e in (25.0, 60.0) for a in (220.0, 250.0, 290.0, 320.0)]
+    return [
+        (
+            r * np.cos(np.radians(a)) * np.cos(np.radians(e)),
+            r * np.sin(np.radians(a)) * np.cos(np.radians(e)),
+            r * np.sin(np.radians(e)),
+        )
+        for a, e, r in directions
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[[], ENVIRONMENT, *PARTS], metavar="NAME")
+    parser.add_argument("--out", type=Path, default=SCENES / "assets")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    ensure_variant()
+    for name in arguments.names or [ENVIRONMENT, *PARTS]:
+        start = time.perf_counter()
+        result = bake_environment(arguments.seed) if name == ENVIRONMENT else bake_part(name, arguments.seed)
+        folder = arguments.out / name
+        result.asset.save(folder, splats="splats.spz")
+        stored = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
+        print(
+            f"{name}: {len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB (object {result.psnr_object:.1f} dB), "
+            f"{stored:.2f} MB, {time.perf_counter() - start:.0f} s, mitsplat {mitsplat.__version__}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,278 @@
+"""Baking against closed forms: what leaves a surface is known, and so is where the surface is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+import mitsplat
+from mitsplat.assets import Asset
+from mitsplat.bake import BakeSettings, bake_asset
+from mitsplat.cad import bake_lights, emitter_dict, mitsuba_scene, read_parts
+from mitsplat.errors import InputError
+from mitsplat.render import ensure_variant
+from mitsplat.scene import AreaLight, EnvironmentLight
+from mitsplat.splats import Splats, evaluate_sh
+from mitsplat.surfels import CREASE_ANGLE, place_surfels, poisson_subset
+from mitsplat.trace import encode_srgb, trace_radiance
+
+FACE_COLOURS = np.array(
+    [[230, 40, 40], [40, 200, 60], [50, 70, 220], [220, 200, 40], [40, 200, 210], [200, 60, 200]], dtype=np.uint8
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _variant() -> None:
+    ensure_variant()
+
+
+def quick(**changes: object) -> BakeSettings:
+    """Settings small enough for a test; neither fitted nor compared unless asked for."""
+    small = {"gaussians": 700, "sh_degree": 1, "directions": 12, "samples": 16, "fit_steps": 0, "verify_views": 0}
+    return BakeSettings(**{**small, **changes})
+
+
+def coloured_box() -> tuple[trimesh.Trimesh, np.ndarray]:
+    """A box of one colour a side, and the index of the colour of every face."""
+    box = trimesh.creation.box(extents=(0.04, 0.03, 0.02))
+    axis = np.abs(box.face_normals).argmax(axis=1)
+    side = 2 * axis + (box.face_normals[np.arange(12), axis] > 0)
+    box.visual.face_colors = FACE_COLOURS[side]
+    return box, side
+
+
+def white(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh.visual.face_colors = [255, 255, 255, 255]
+    return mesh
+
+
+def outward_colours(splats: Splats) -> np.ndarray:
+    """Display-encoded colours seen head-on, shape (N, 3)."""
+    normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
+    return evaluate_sh(splats.sh, -normals)
+
+
+def test_white_sphere_in_a_furnace_has_radiance_one_from_everywhere() -> None:
+    """A convex diffuse body of albedo 1 under radiance 1 from everywhere emits E / pi = 1 into every direction."""
+    splats = bake_asset(white(trimesh.creation.icosphere(3, 0.02)), name="ball", settings=quick()).asset.splats
+    normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
+    for tilt in (0.0, 0.5, 1.0):
+        aside = np.cross(normals, (0.3, 0.5, 0.8))
+        towards = np.cos(tilt) * normals + np.sin(tilt) * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+        colours = evaluate_sh(splats.sh, -towards)
+        assert colours.mean() == pytest.approx(1.0, abs=0.005)
+        assert colours.std() < 0.03
+
+
+def test_traced_radiance_of_a_lit_plane_is_albedo_times_irradiance_over_pi() -> None:
+    """A small lamp of radiance L and area A, facing the plane at height h: E = L A / h^2 below it."""
+    plane = trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    plane.visual.face_colors = [255, 255, 255, 255]
+    lamp = AreaLight(position=(0, 0, 2.0), target=(0, 0, 0), size=(0.1, 0.2), radiance=50.0)
+    sky = EnvironmentLight(radiance=0.25)
+    scene = mitsuba_scene(read_parts(plane), bake_lights([lamp, sky]))
+    rays = np.tile([[0.0, 0.0, 0.5]], (64, 1)), np.tile([[0.0, 0.0, -1.0]], (64, 1))
+    radiance, hit = trace_radiance(scene, *rays, samples=64, bounces=1, seed=1)
+    assert hit.all()
+    assert radiance.mean() == pytest.approx(50.0 * 0.02 / 2.0**2 / np.pi + 0.25, rel=0.01)
+
+
+def test_every_side_of_a_box_keeps_its_colour() -> None:
+    box, _ = coloured_box()
+    splats = bake_asset(box, name="box", settings=quick(gaussians=1500, sharpening=0)).asset.splats
+    normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
+    axis = np.abs(normals).argmax(axis=1)
+    side = 2 * axis + (normals[np.arange(len(axis)), axis] > 0)
+    colours = outward_colours(splats)
+    for k, colour in enumerate(FACE_COLOURS):
+        assert (side == k).sum() > 50
+        np.testing.assert_allclose(np.median(colours[side == k], axis=0), colour / 255.0, atol=0.02)
+
+
+def test_gaussians_lie_just_below_the_surface_with_their_short_axis_along_the_normal() -> None:
+    splats = bake_asset(white(trimesh.creation.icosphere(4, 0.02)), name="ball", settings=quick()).asset.splats
+    radius = np.linalg.norm(splats.means, axis=1)
+    assert (radius < 0.02).all()
+    assert (radius > 0.02 - 0.002 * 0.02 - 2.0 * splats.scales[:, 2]).all()
+    normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
+    assert (np.einsum("nd,nd->n", normals, splats.means / radius[:, None]) > 0.99).all()
+    assert (splats.scales[:, 2] < 0.3 * splats.scales[:, :2].min(axis=1)).all()
+
+
+def test_surfels_cover_a_box_and_hardly_reach_past_its_edges() -> None:
+    half = np.array([0.02, 0.015, 0.01])
+    box = trimesh.creation.box(extents=2.0 * half)
+    surfels = place_surfels(box, 1.0, 3000, np.random.default_rng(0))
+    assert len(surfels) == pytest.approx(3000, rel=0.15)
+    spacing = np.sqrt(box.area / 3000)
+    reach = 2.0 * surfels.scales[:, None, :2] * surfels.frames[:, :, :2]
+    tips = np.concatenate([surfels.points[..., None] + reach, surfels.points[..., None] - reach])
+    beyond = (np.abs(tips) - half[:, None]).max(axis=(1, 2)) / spacing
+    assert beyond.max() < 0.8
+    assert np.quantile(beyond, 0.9) < 0.35
+    points, faces = trimesh.sample.sample_surface(box, 2000, seed=1)
+    seen = 1.0 - transmittance(surfels, points, box.face_normals[faces])
+    inner = (np.abs(np.abs(points) - half) > 0.5 * spacing).sum(axis=1) == 2
+    assert seen[inner].mean() > 0.97
+    assert np.quantile(seen[inner], 0.02) > 0.85
+
+
+def transmittance(surfels: object, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Share of light along the normal that the surfels' discs let through at ``points``, all pairs."""
+    local = np.einsum("pnj,nji->pni", points[:, None] - surfels.points, surfels.frames)
+    response = np.exp(-0.5 * ((local[..., :2] / surfels.scales[:, :2]) ** 2).sum(axis=2))
+    response *= (normals @ surfels.normals.T > 0.7) & (np.abs(local[..., 2]) < 1e-4)
+    return np.prod(1.0 - response, axis=1)
+
+
+def test_poisson_subset_is_apart_and_maximal() -> None:
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.random((4000, 2)), np.zeros(4000)])
+    normals, radius = np.tile([0.0, 0.0, 1.0], (4000, 1)), np.full(4000, 0.05)
+    kept = poisson_subset(points, normals, radius, rng)
+    gaps = np.linalg.norm(points[:, None] - points[kept], axis=2)
+    assert gaps.min(axis=1).max() <= 0.05
+    among = np.linalg.norm(points[kept][:, None] - points[kept], axis=2) + 10.0 * np.eye(len(kept))
+    assert among.min() > 0.05
+
+
+def test_thin_sheet_keeps_surfels_on_both_sides() -> None:
+    sheet = trimesh.creation.box(extents=(0.04, 0.04, 0.0004))
+    surfels = place_surfels(sheet, 1.0, 1200, np.random.default_rng(0))
+    up = surfels.normals[:, 2]
+    assert (up > 0.9).sum() > 350
+    assert (up < -0.9).sum() > 350
+
+
+def test_what_lies_inside_another_solid_gets_no_gaussians() -> None:
+    hidden, outer = trimesh.creation.icosphere(2, 0.005), trimesh.creation.box(extents=(0.03, 0.03, 0.03))
+    nested = trimesh.Scene({"hidden": white(hidden), "outer": white(outer)})
+    splats = bake_asset(nested, name="nested", settings=quick()).asset.splats
+    assert np.abs(splats.means).max(axis=1).min() > 0.0145
+
+
+def test_same_seed_same_asset_other_seed_another() -> None:
+    box, _ = coloured_box()
+    first, again, other = (
+        bake_asset(box, name="box", settings=quick(gaussians=300, seed=seed)).asset.splats for seed in (3, 3, 4)
+    )
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    assert len(first) != len(other) or not np.array_equal(first.means, other.means)
+
+
+def test_baked_sphere_looks_like_its_mesh_from_unseen_views() -> None:
+    ball = trimesh.creation.icosphere(4, 0.02)
+    ball.visual.face_colors = [190, 150, 90, 255]
+    result = bake_asset(ball, name="ball", settings=quick(gaussians=3000, samples=16, verify_views=2))
+    assert result.psnr > 30.0
+    assert result.psnr_object > 24.0
+
+
+def test_texture_lands_where_its_coordinates_say(tmp_path: Path) -> None:
+    """Lower half of the image (small v) red, upper half blue; v grows with y on the sheet."""
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    pixels = np.zeros((64, 64, 3), dtype=np.uint8)
+    pixels[:32], pixels[32:] = (0, 0, 255), (255, 0, 0)
+    sheet = trimesh.creation.box(extents=(0.04, 0.04, 0.01))
+    corners = sheet.triangles.reshape(-1, 3)
+    sheet = trimesh.Trimesh(corners, np.arange(36).reshape(-1, 3), process=False)
+    material = PBRMaterial(baseColorTexture=Image.fromarray(pixels), roughnessFactor=1.0, metallicFactor=0.0)
+    sheet.visual = TextureVisuals(uv=0.9 * corners[:, :2] / 0.04 + 0.5, material=material)
+    sheet.export(tmp_path / "sheet.glb")
+    for source in (sheet, tmp_path / "sheet.glb"):
+        splats = bake_asset(source, name="sheet", settings=quick(gaussians=400)).asset.splats
+        colours, y = outward_colours(splats), splats.means[:, 1]
+        assert (colours[y < -0.004][:, 0] > colours[y < -0.004][:, 2]).all()
+        assert (colours[y > 0.004][:, 2] > colours[y > 0.004][:, 0]).all()
+
+
+def test_units_and_up_axis_apply_to_splats_and_mesh_alike() -> None:
+    box = white(trimesh.creation.box(extents=(40.0, 20.0, 10.0)))
+    asset = bake_asset(box, name="box", metres_per_unit=0.001, up="y", settings=quick(gaussians=300)).asset
+    assert asset.mesh is not None
+    np.testing.assert_allclose(asset.mesh.extents, (0.04, 0.01, 0.02), rtol=1e-6)
+    np.testing.assert_allclose(np.ptp(asset.splats.bounds, axis=0), (0.04, 0.01, 0.02), atol=1e-3)
+
+
+def test_kind_and_light_decide_pieces_and_capture_light(tmp_path: Path) -> None:
+    box, _ = coloured_box()
+    thing = bake_asset(box, name="thing", settings=quick(gaussians=200)).asset
+    assert (thing.capture_light, len(thing.pieces)) == ("uniform", 1)
+    assert thing.specular == 0.0
+    place = bake_asset(
+        box, name="place", kind="environment", light=[EnvironmentLight()], settings=quick(gaussians=200)
+    ).asset
+    assert (place.capture_light, place.pieces) == ("scene", ())
+    thing.save(tmp_path / "thing")
+    assert len(Asset.load(tmp_path / "thing").splats) == len(thing.splats)
+
+
+def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
+    ball = trimesh.creation.icosphere(4, 1.0)
+    (part,) = read_parts(ball)
+    np.testing.assert_allclose(part.corner_normals(), part.mesh.triangles, atol=0.01)
+    (part,) = read_parts(trimesh.creation.box())
+    assert np.pi / 2 > CREASE_ANGLE
+    np.testing.assert_allclose(part.corner_normals(), np.repeat(part.mesh.face_normals[:, None], 3, axis=1), atol=1e-6)
+
+
+def test_studio_has_mean_radiance_one() -> None:
+    ball = white(trimesh.creation.icosphere(2, 0.02))
+    scene = mitsuba_scene(read_parts(ball), bake_lights("studio"))
+    outward = np.random.default_rng(0).normal(size=(2000, 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    radiance, _ = trace_radiance(scene, 0.03 * outward, -outward, samples=16, bounces=2, seed=0)
+    assert radiance.mean() == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"mesh": "missing.glb"}, "missing.glb: no such mesh file"),
+        ({"mesh": trimesh.Trimesh()}, "at least one face"),
+        ({"light": "candle"}, "uniform, studio or a scene's lights .got 'candle'."),
+        ({"light": []}, "at least one light"),
+        ({"metres_per_unit": 0.0}, "metres_per_unit must be > 0 .got 0.0."),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(arguments: dict[str, object], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        bake_asset(**{"mesh": trimesh.creation.box(), "name": "x", "settings": quick(), **arguments})
+
+
+@pytest.mark.parametrize(("field", "value"), [("gaussians", 0), ("sh_degree", 4), ("samples", 0)])
+def test_bad_settings_are_refused(field: str, value: int) -> None:
+    with pytest.raises(InputError, match=field):
+        BakeSettings(**{field: value})
+
+
+def test_damaged_mesh_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "broken.glb").write_bytes(b"glTF\x02\x00\x00\x00 and no more")
+    with pytest.raises(InputError, match=r"broken\.glb: not a mesh that can be read"):
+        bake_asset(tmp_path / "broken.glb", name="x", settings=quick())
+
+
+def test_encoding_is_the_srgb_curve() -> None:
+    np.testing.assert_allclose(encode_srgb([0.0, 0.0031308, 0.21404, 1.0]), [0.0, 0.04045, 0.5, 1.0], atol=1e-4)
+
+
+def test_area_light_faces_its_target_even_from_straight_above() -> None:
+    import mitsuba as mi
+
+    for position in ((0.0, 0.0, 2.0), (1.0, 0.5, 1.0)):
+        lamp = mi.load_dict(emitter_dict(AreaLight(position=position, target=(0, 0, 0), size=(0.4, 0.2))))
+        sample = lamp.sample_position(0.0, mi.Point2f(0.5, 0.5))
+        facing = -np.array(position) / np.linalg.norm(position)
+        np.testing.assert_allclose(np.ravel(sample.n), facing, atol=1e-5)
+
+
+def test_bake_is_public() -> None:
+    assert mitsplat.bake_asset is bake_asset

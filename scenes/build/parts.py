@@ -38,6 +38,8 @@ def welded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Without the slivers of zero length that Boolean operations leave."""
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
     for digits in (4, 3, 2):
+        # Rounded, so that no two are left whose distance a change of units could lose.
+        mesh.vertices = mesh.vertices.round(digits)
         mesh.merge_vertices(digits_vertex=digits)
         mesh.update_faces(mesh.nondegenerate_faces())
         if mesh.is_volume:
@@ -145,7 +147,7 @@ def disc_decal(image: m.Pixels, radius: float, z: float, inner: float = 0.0) -> 
     flat = trimesh.Trimesh(np.column_stack([vertices, np.zeros(len(vertices))]), faces)
     if flat.face_normals[:, 2].mean() < 0:
         flat.invert()
-    flat = m.subdivided(flat, radius / 4.0).apply_translation((0, 0, z))
+    flat = m.subdivided(flat, radius / 2.0).apply_translation((0, 0, z))
     return m.wear(flat, image, m.planar_uv(flat, (-radius, -radius), (radius, radius)), roughness=0.5, metallic=0.0)
 
 
@@ -318,7 +320,6 @@ def proximity_sensor(rng: np.random.Generator, screw: Screw) -> Parts:
     gland = turned([(0, -15), (3, -15), (3, -9), (6.4, -8.4), (7.2, -6), (7.2, 1), (0, 1)])
     face = turned([(0, 43), (8.2, 43), (8.2, 49), (7.4, 50), (0, 50)])
     nut = hex_blank(24.0, 4.5, both=True).apply_translation((0, 0, 27))
-    nickel = m.brushed(m.STAINLESS, rng, strength=0.03)
     return {
         "barrel": m.wear(
             barrel, m.brushed(m.STAINLESS, rng, strength=0.03), m.lathe_uv(barrel, 40.0), roughness=0.3, metallic=1.0

@@ -295,3 +295,19 @@ def test_an_environment_carries_objects(scene_data, write_scene):
 def test_no_objects_make_an_empty_layout(scene_data, write_scene):
     scene_data["objects"] = []
     assert settle_layout(load_scene(write_scene(scene_data)), 0).instances == ()
+
+
+def test_a_light_part_carries_a_heavy_one():
+    """A plate a hundred times as heavy rests on two nuts: none of them sinks by more than 0.1 mm."""
+    from mitsplat.physics import run_to_rest
+
+    nut, plate = trimesh.creation.box((0.01, 0.01, 0.005)), trimesh.creation.box((0.15, 0.05, 0.0135))
+    bodies = [body_of(nut), body_of(nut), body_of(plate)]
+    assert bodies[2].mass.mass > 100 * bodies[0].mass.mass
+    poses = [pose_at((-0.05, 0, 0.003)), pose_at((0.05, 0, 0.003)), pose_at((0, 0, 0.014))]
+    world = world_of("warp", bodies, [table()], poses)
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    assert [lowest(mesh, pose) for mesh, pose in zip((nut, nut, plate), outcome.poses, strict=True)] == pytest.approx(
+        [0.0, 0.0, 0.005], abs=1e-4
+    )

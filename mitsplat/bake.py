@@ -107,7 +107,7 @@ def bake_asset(
     up: Literal["y", "z"] = "z",
     density: float = 1000.0,
     friction: float = 0.5,
-    collision: trimesh.Trimesh | None = None,
+    pieces: Sequence[trimesh.Trimesh] = (),
     cameras: Sequence[Camera] = (),
     fit_cameras: Sequence[Camera] = (),
 ) -> BakeResult:
@@ -125,7 +125,7 @@ def bake_asset(
         up: Axis that points up in the mesh (glTF: y).
         density: Mass density [kg/m^3].
         friction: Coulomb friction coefficient.
-        collision: Solid [m] to decompose into convex pieces in place of the proxy mesh: threads, say, left out.
+        pieces: Convex pieces of an object for physics [m], z up; by default the proxy mesh is decomposed.
         cameras: Views for the comparison; by default all around the mesh.
         fit_cameras: Views of the pictures that the fit takes; by default all around the mesh, others than for the
             comparison.
@@ -169,7 +169,7 @@ def bake_asset(
         class_name=class_name or name,
         splats=splats,
         mesh=proxy,
-        pieces=convex_pieces(collision or proxy) if kind == "object" else (),
+        pieces=tuple(pieces) or (convex_pieces(proxy) if kind == "object" else ()),
         kind=kind,
         density=density,
         friction=friction,

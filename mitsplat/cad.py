@@ -140,7 +140,8 @@ def read_parts(
 def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray) -> Part:
     geometry = trimesh.Trimesh(source.vertices, source.faces, process=False)
     geometry.merge_vertices(merge_tex=True, merge_norm=True)
-    keep = geometry.nondegenerate_faces()
+    # Only what has collapsed: dropping slivers would open holes.
+    keep = np.diff(np.sort(geometry.faces, axis=1), axis=1).all(axis=1)
     geometry.update_faces(keep)
     geometry.apply_transform(transform)
     faces = source.faces[keep]

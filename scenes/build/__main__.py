@@ -6,6 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
 import mitsplat
@@ -14,7 +15,7 @@ from mitsplat.camera import Camera
 from mitsplat.render import ensure_variant
 from mitsplat.spec import SceneSpec
 from mitsplat.yaml_input import load_yaml
-from scenes.build.parts import PARTS, build_part, collision_solid
+from scenes.build.parts import PARTS, build_part
 from scenes.build.workcell import build_workcell, densities
 
 SCENES = Path(__file__).resolve().parents[1]
@@ -23,14 +24,15 @@ ENVIRONMENT = "workcell"
 
 def bake_part(name: str, seed: int) -> BakeResult:
     """One object, in the soft boxes of a studio, so that metal looks like metal before the scene's lights come on."""
+    part, pieces = build_part(name, seed)
     return bake_asset(
-        build_part(name, seed),
+        part,
         name=name,
         light="studio",
         density=PARTS[name][1],
         friction=0.35,
-        collision=collision_solid(name, seed),
-        settings=BakeSettings(gaussians=16000, sh_degree=2, directions=24, samples=16, seed=seed),
+        pieces=pieces,
+        settings=BakeSettings(gaussians=16000, sh_degree=2, fit_views=48, fit_steps=600, seed=seed),
     )
 
 
@@ -55,7 +57,7 @@ def bake_environment(seed: int) -> BakeResult:
             samples=16,
             bounces=4,
             density=densities(scene),
-            fit_steps=128,
+            fit_steps=320,
             seed=seed,
         ),
         cameras=views,
@@ -84,7 +86,10 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], ENVIRONMENT, *PARTS], metavar="NAME")
     parser.add_argument("--out", type=Path, default=SCENES / "assets")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--variant", help="Mitsuba variant, such as cuda_ad_rgb; llvm_ad_rgb by default")
     arguments = parser.parse_args()
+    if arguments.variant:
+        mi.set_variant(arguments.variant)
     ensure_variant()
     for name in arguments.names or [ENVIRONMENT, *PARTS]:
         start = time.perf_counter()

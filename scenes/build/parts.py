@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +13,10 @@ from trimesh.creation import cylinder, extrude_polygon, revolve
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 from scenes.build import materials as m
+from scenes.build.collision import COLLISION
 
 Parts = dict[str, trimesh.Trimesh]
 Profile = list[tuple[float, float]]
-Screw = Callable[..., trimesh.Trimesh]
-"""Makes a threaded rod from z = 0 of (major diameter, pitch, length): :func:`thread` or :func:`plain_rod`."""
 MM = 1e-3
 SECTIONS = 72
 
@@ -36,14 +35,16 @@ def common(*solids: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def welded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Without the slivers of zero length that Boolean operations leave."""
-    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
-    for digits in (4, 3, 2):
-        # Rounded, so that no two are left whose distance a change of units could lose.
-        mesh.vertices = mesh.vertices.round(digits)
-        mesh.merge_vertices(digits_vertex=digits)
-        mesh.update_faces(mesh.nondegenerate_faces())
-        if mesh.is_volume:
-            return mesh
+    # Rounded where possible, so that no two vertices are left whose distance a change of units could lose.
+    for rounded in (True, False):
+        tidy = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        for digits in (4, 3, 2):
+            if rounded:
+                tidy.vertices = tidy.vertices.round(digits)
+            tidy.merge_vertices(digits_vertex=digits)
+            tidy.update_faces(tidy.nondegenerate_faces())
+            if tidy.is_volume:
+                return tidy
     raise ValueError("a Boolean operation left a part that is not watertight")
 
 
@@ -95,11 +96,6 @@ def thread(major: float, pitch: float, length: float, *, rows: int = 5, sections
     return trimesh.Trimesh(vertices, faces)
 
 
-def plain_rod(major: float, pitch: float, length: float, **_: int) -> trimesh.Trimesh:
-    """What physics needs of a thread: a coarse rod of its pitch diameter."""
-    return cylinder(radius=0.5 * major - 0.3 * pitch, segment=[[0, 0, 0], [0, 0, length]], sections=20)
-
-
 def rounded_box(size: tuple[float, float, float], radius: float) -> trimesh.Trimesh:
     """Box centred at the origin with rounded edges."""
     ball = trimesh.creation.uv_sphere(radius=radius, count=[16, 16]).vertices
@@ -107,11 +103,9 @@ def rounded_box(size: tuple[float, float, float], radius: float) -> trimesh.Trim
     return trimesh.Trimesh((corners[:, None] + ball).reshape(-1, 3)).convex_hull
 
 
-def hex_nut(
-    across_flats: float, height: float, major: float, pitch: float, rng: np.random.Generator, screw: Screw
-) -> Parts:
+def hex_nut(across_flats: float, height: float, major: float, pitch: float, rng: np.random.Generator) -> Parts:
     blank = hex_blank(across_flats, height, both=True)
-    tool = screw(major + 0.1, pitch, height + 2.0 * pitch).apply_translation((0, 0, -pitch))
+    tool = thread(major + 0.1, pitch, height + 2.0 * pitch).apply_translation((0, 0, -pitch))
     sink = turned(
         [(0, -1), (0.5 * major + 0.9, -1), (0.5 * major + 0.9, 0), (0.4 * major, 0.14 * major), (0, 0.14 * major)]
     )
@@ -124,12 +118,12 @@ def hex_nut(
     }
 
 
-def hex_bolt(rng: np.random.Generator, screw: Screw) -> Parts:
+def hex_bolt(rng: np.random.Generator) -> Parts:
     """M16 x 50 with a washer face under the head and a grade mark on it."""
     head = hex_blank(24.0, 10.0, both=False)
     shank = turned([(0, -14), (8, -14), (8, -0.4), (8.8, 0), (11, 0), (11, 0.6), (0, 0.6)])
     tip = turned([(0, -50), (6.4, -50), (8.1, -48), (8.1, -12), (0, -12)])
-    threaded = common(screw(16.0, 2.0, 38.0, rows=5, sections=40).apply_translation((0, 0, -50)), tip)
+    threaded = common(thread(16.0, 2.0, 38.0, rows=5, sections=40).apply_translation((0, 0, -50)), tip)
     solid = join(head, shank, threaded)
     steel = m.wear(
         solid, m.brushed(m.BLACK_OXIDE, rng, strength=0.05), m.box_uv(solid, 45.0), roughness=0.38, metallic=0.9
@@ -151,7 +145,7 @@ def disc_decal(image: m.Pixels, radius: float, z: float, inner: float = 0.0) -> 
     return m.wear(flat, image, m.planar_uv(flat, (-radius, -radius), (radius, radius)), roughness=0.5, metallic=0.0)
 
 
-def washer(rng: np.random.Generator, _: Screw) -> Parts:
+def washer(rng: np.random.Generator) -> Parts:
     """M20 washer, yellow-passivated."""
     solid = turned(
         [(10.5, 0.3), (10.8, 0), (18.2, 0), (18.5, 0.4), (18.5, 2.6), (18.1, 3), (10.8, 3), (10.5, 2.7), (10.5, 0.3)],
@@ -161,7 +155,7 @@ def washer(rng: np.random.Generator, _: Screw) -> Parts:
     return {"body": m.wear(solid, image, m.lathe_uv(solid, 30.0), roughness=0.33, metallic=1.0)}
 
 
-def l_bracket(rng: np.random.Generator, _: Screw) -> Parts:
+def l_bracket(rng: np.random.Generator) -> Parts:
     """50 x 50 x 32 mm angle of 4 mm with two holes in each leg, anodised blue."""
     outline = Polygon([(0, 0), (50, 0), (50, 4), (4, 4), (4, 50), (0, 50)])
     outline = outline.buffer(-1.2, join_style="mitre").buffer(1.2, 8).buffer(3.0, 8).buffer(-3.0, 8)
@@ -192,7 +186,7 @@ def gear_outline(module: float, teeth: int) -> Polygon:
     return Polygon(np.concatenate(points)).buffer(0)
 
 
-def spur_gear(rng: np.random.Generator, _: Screw) -> Parts:
+def spur_gear(rng: np.random.Generator) -> Parts:
     """Module 2, 24 teeth, with a hub, a keyway and a recessed web."""
     bore = Point(0, 0).buffer(6.0, 24).union(box(-2, 0, 2, 7.8))
     wheel = extrude_polygon(gear_outline(2.0, 24).difference(bore), 12.0)
@@ -202,7 +196,7 @@ def spur_gear(rng: np.random.Generator, _: Screw) -> Parts:
     return {"body": m.wear(solid, m.brushed(m.STEEL, rng), m.lathe_uv(solid, 50.0), roughness=0.35, metallic=1.0)}
 
 
-def bearing(outer: float, inner: float, width: float, code: str, rng: np.random.Generator, _: Screw) -> Parts:
+def bearing(outer: float, inner: float, width: float, code: str, rng: np.random.Generator) -> Parts:
     """Deep-groove ball bearing with printed rubber seals (ISO 15 sizes)."""
     outer_radius, inner_radius, edge = 0.5 * outer, 0.5 * inner, 0.7
     wall = 0.17 * (outer - inner)
@@ -248,7 +242,7 @@ def bearing(outer: float, inner: float, width: float, code: str, rng: np.random.
     }
 
 
-def cable_clip(rng: np.random.Generator, _: Screw) -> Parts:
+def cable_clip(rng: np.random.Generator) -> Parts:
     """P-clip for a 16 mm hose, moulded in red nylon."""
     band = Point(0, 0).buffer(11.0, 32).difference(Point(0, 0).buffer(8.0, 32)).difference(box(0, -11.5, 12, -9.2))
     tab = box(0, -11, 30, -8).buffer(-0.5).buffer(0.5).union(box(0, -11, 4, -8.0))
@@ -258,7 +252,7 @@ def cable_clip(rng: np.random.Generator, _: Screw) -> Parts:
     return {"body": m.wear(solid, m.cast(m.NYLON_RED, rng, strength=0.04), m.box_uv(solid, 40.0), roughness=0.45)}
 
 
-def relay_box(rng: np.random.Generator, _: Screw) -> Parts:
+def relay_box(rng: np.random.Generator) -> Parts:
     """Plug-in relay: grey cover, black socket with blades, printed labels and an orange test button."""
     cover = rounded_box((36, 28, 46), 1.8).apply_translation((0, 0, 29))
     socket = rounded_box((37.5, 29.5, 9), 1.0).apply_translation((0, 0, 4.5))
@@ -292,15 +286,15 @@ def relay_box(rng: np.random.Generator, _: Screw) -> Parts:
     }
 
 
-def brass_fitting(rng: np.random.Generator, screw: Screw) -> Parts:
+def brass_fitting(rng: np.random.Generator) -> Parts:
     """Hexagonal double nipple with helical pipe threads."""
     flats = hex_blank(24.0, 9.0, both=True)
     upper = common(
-        screw(19.0, 1.8, 15.0, rows=5, sections=40).apply_translation((0, 0, 8.5)),
+        thread(19.0, 1.8, 15.0, rows=5, sections=40).apply_translation((0, 0, 8.5)),
         turned([(0, 8), (9.7, 8), (9.7, 22), (8.4, 23.4), (0, 23.4)]),
     )
     lower = common(
-        screw(16.5, 1.8, 13.0, rows=5, sections=40).apply_translation((0, 0, -12.4)),
+        thread(16.5, 1.8, 13.0, rows=5, sections=40).apply_translation((0, 0, -12.4)),
         turned([(0, -12.3), (7.2, -12.3), (8.5, -11), (8.5, 1), (0, 1)]),
     )
     solid = cut(join(flats, upper, lower), rod(5.0, -20, 30), turned([(0, 21), (5, 21), (7.2, 24), (0, 24)]))
@@ -311,10 +305,10 @@ def brass_fitting(rng: np.random.Generator, screw: Screw) -> Parts:
     }
 
 
-def proximity_sensor(rng: np.random.Generator, screw: Screw) -> Parts:
+def proximity_sensor(rng: np.random.Generator) -> Parts:
     """M18 inductive sensor: nickel-plated threaded barrel, blue face, cable gland with a stub of cable."""
     barrel = common(
-        screw(18.0, 1.6, 44.0, rows=4, sections=40),
+        thread(18.0, 1.6, 44.0, rows=4, sections=40),
         turned([(0, 0), (8.5, 0), (9.1, 0.7), (9.1, 43), (8.6, 44), (0, 44)]),
     )
     gland = turned([(0, -15), (3, -15), (3, -9), (6.4, -8.4), (7.2, -6), (7.2, 1), (0, 1)])
@@ -332,15 +326,15 @@ def proximity_sensor(rng: np.random.Generator, screw: Screw) -> Parts:
     }
 
 
-PARTS: dict[str, tuple[Callable[[np.random.Generator, Screw], Parts], float]] = {
-    "hex_nut_m16": (lambda *how: hex_nut(24.0, 14.8, 16.0, 2.0, *how), 7850.0),
-    "hex_nut_m20": (lambda *how: hex_nut(30.0, 18.0, 20.0, 2.5, *how), 7850.0),
+PARTS: dict[str, tuple[Callable[[np.random.Generator], Parts], float]] = {
+    "hex_nut_m16": (lambda rng: hex_nut(24.0, 14.8, 16.0, 2.0, rng), 7850.0),
+    "hex_nut_m20": (lambda rng: hex_nut(30.0, 18.0, 20.0, 2.5, rng), 7850.0),
     "hex_bolt": (hex_bolt, 7850.0),
     "washer": (washer, 7850.0),
     "l_bracket": (l_bracket, 2700.0),
     "spur_gear": (spur_gear, 7850.0),
-    "bearing_6204": (lambda *how: bearing(47.0, 20.0, 14.0, "6204-2RS", *how), 5500.0),
-    "bearing_6206": (lambda *how: bearing(62.0, 30.0, 16.0, "6206-2RS", *how), 5500.0),
+    "bearing_6204": (lambda rng: bearing(47.0, 20.0, 14.0, "6204-2RS", rng), 5500.0),
+    "bearing_6206": (lambda rng: bearing(62.0, 30.0, 16.0, "6206-2RS", rng), 5500.0),
     "cable_clip": (cable_clip, 1140.0),
     "relay_box": (relay_box, 1250.0),
     "brass_fitting": (brass_fitting, 8500.0),
@@ -349,33 +343,19 @@ PARTS: dict[str, tuple[Callable[[np.random.Generator, Screw], Parts], float]] = 
 """Class name: how to make it, and its density [kg/m^3]."""
 
 
-def build_part(name: str, seed: int) -> trimesh.Scene:
-    """One part as a scene of materials, in metres, its centre of volume at the origin."""
-    parts = _make(name, seed, thread)
-    centre = _solid(parts).center_mass
-    for part in parts.values():
-        part.apply_translation(-centre).apply_scale(MM)
-    return trimesh.Scene(parts)
-
-
-def collision_solid(name: str, seed: int) -> trimesh.Trimesh:
-    """The same part for physics: one solid in the same frame, without threads."""
-    centre = _solid(_make(name, seed, thread)).center_mass
-    return _solid(_make(name, seed, plain_rod)).apply_translation(-centre).apply_scale(MM)
-
-
-def _make(name: str, seed: int, screw: Screw) -> Parts:
+def build_part(name: str, seed: int) -> tuple[trimesh.Scene, Sequence[trimesh.Trimesh]]:
+    """One part as a scene of materials, and its convex pieces; in metres, the centre of volume at the origin."""
     make, _ = PARTS[name]
-    return make(np.random.default_rng([seed, sorted(PARTS).index(name)]), screw)
-
-
-def _solid(parts: Parts) -> trimesh.Trimesh:
-    """Union of the closed parts, labels left out."""
-    return join(*(solid for solid in map(merged, parts.values()) if solid.is_volume))
+    parts = make(np.random.default_rng([seed, sorted(PARTS).index(name)]))
+    pieces = COLLISION[name]()
+    centre = join(*(solid for solid in map(merged, parts.values()) if solid.is_volume)).center_mass
+    for mesh in (*parts.values(), *pieces):
+        mesh.apply_translation(-centre).apply_scale(MM)
+    return trimesh.Scene(parts), pieces
 
 
 def merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Geometry alone, vertices at one position merged."""
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
-    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.update_faces(np.diff(np.sort(mesh.faces, axis=1), axis=1).all(axis=1))
     return mesh

@@ -104,8 +104,8 @@ def place_surfels(
     """
     area = mesh.area_faces
     density = np.broadcast_to(np.asarray(density, dtype=np.float64), area.shape)
-    creases = _CreaseIndex.build(mesh, spacing=np.sqrt(area.sum() / count) / 2.0)
     spacing = np.sqrt(_PACKING * (area * density).sum() / count / density)
+    creases = _CreaseIndex.build(mesh, spacing / 2.0)
     for _ in range(_COUNT_ROUNDS):
         pool = _Pool.draw(mesh, spacing, creases, rng)
         rows = creases.rows(pool, _ROW_OFFSET)
@@ -116,7 +116,10 @@ def place_surfels(
     radius = pool.radius[kept, None]
     frames, room = _frames(pool.normals[kept], pool.points[kept], pool.radius[kept], creases)
     widest = np.clip(room / _EDGE_SIGMAS, _THINNEST * radius, _SHARES[0] * spread * radius)
-    widest = np.minimum(widest, _overhang_limit(pool, pool.points[kept], frames, radius * spread))
+    bent = pool.uneven[kept]
+    widest[bent] = np.minimum(
+        widest[bent], _overhang_limit(pool, pool.points[kept][bent], frames[bent], radius[bent] * spread)
+    )
     scales = np.concatenate([np.minimum(widest, spread * radius), _THICKNESS * radius], axis=1)
     probe = rng.choice(len(pool.points), size=min(len(pool.points), _PROBES * len(kept)), replace=False)
     probe = probe[pool.crease_distance[probe] > 0.15 * pool.radius[probe]]
@@ -135,6 +138,7 @@ class _Pool:
         barycentric: Shape (P, 3).
         radius: Distance to keep from other surfels [m], shape (P,).
         crease_distance: Distance to the nearest crease [m], infinite where it is far, shape (P,).
+        uneven: Whether a crease or a bend may be near, shape (P,).
     """
 
     points: FloatArray
@@ -143,18 +147,25 @@ class _Pool:
     barycentric: FloatArray
     radius: FloatArray
     crease_distance: FloatArray
+    uneven: npt.NDArray[np.bool_]
 
     @classmethod
     def draw(cls, mesh: trimesh.Trimesh, spacing: FloatArray, creases: _CreaseIndex, rng: np.random.Generator) -> _Pool:
         """Candidates for surfels ``spacing`` (F,) apart, closer together near creases and where the surface bends."""
-        expected, reach = mesh.area_faces / spacing**2, float(spacing.max())
+        expected = mesh.area_faces / spacing**2
         points, faces, barycentric = _draw(mesh, expected, _CANDIDATES, rng)
-        distance = creases.distance(points, reach)
-        tree = KDTree(points)
-        bend = _bend(tree, mesh.face_normals[faces], spacing[faces])
-        extra = _draw(mesh, expected, _CANDIDATES * (_REFINEMENT**-2 - 1.0), rng)
-        extra_distance = creases.distance(extra[0], reach)
-        extra_bend = bend[tree.query(extra[0])[1]]
+        distance, bend = np.full(len(points), np.inf), np.zeros(len(points))
+        # The middle of flat regions, often most of a surface, needs no closer look.
+        uneven = _uneven_faces(mesh, spacing, creases)
+        reach = float(spacing[uneven].max(initial=0.0))
+        look = uneven[faces]
+        distance[look] = creases.distance(points[look], reach)
+        extra = _draw(mesh, expected * uneven, _CANDIDATES * (_REFINEMENT**-2 - 1.0), rng)
+        extra_distance, extra_bend = creases.distance(extra[0], reach), np.zeros(len(extra[0]))
+        if look.any():
+            tree = KDTree(points[look])
+            bend[look] = _bend(tree, mesh.face_normals[faces[look]], spacing[faces[look]])
+            extra_bend = bend[look][tree.query(extra[0])[1]]
         near = (extra_distance < spacing[extra[1]]) | (extra_bend > _BEND)
         points = np.concatenate([points, extra[0][near]])
         faces = np.concatenate([faces, extra[1][near]])
@@ -163,7 +174,19 @@ class _Pool:
         bend = np.concatenate([bend, extra_bend[near]])
         relative = np.minimum(distance / spacing[faces], _BEND / np.maximum(bend, 1e-9))
         radius = spacing[faces] * np.clip(relative, _REFINEMENT, 1.0)
-        return cls(points, mesh.face_normals[faces], faces, barycentric, radius, distance)
+        return cls(points, mesh.face_normals[faces], faces, barycentric, radius, distance, uneven[faces])
+
+
+def _uneven_faces(mesh: trimesh.Trimesh, spacing: FloatArray, creases: _CreaseIndex) -> npt.NDArray[np.bool_]:
+    """Faces (F,) within about a ``spacing`` (F,) of a crease or a bend."""
+    uneven = np.zeros(len(mesh.faces), dtype=bool)
+    uneven[mesh.face_adjacency[mesh.face_adjacency_angles > 1e-3]] = True
+    size = np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max(axis=1)
+    reach = size + 1.5 * spacing
+    uneven |= creases.distance(mesh.triangles_center, float(reach.max())) < reach
+    for _ in range(2):
+        uneven[mesh.face_adjacency[uneven[mesh.face_adjacency].any(axis=1)]] = True
+    return uneven
 
 
 def _bend(tree: KDTree, normals: FloatArray, reach: FloatArray) -> FloatArray:
@@ -254,8 +277,9 @@ def _draw(
     mesh: trimesh.Trimesh, expected: FloatArray, factor: float, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """``factor`` times ``expected`` (F,) points per face: positions, faces, barycentric coordinates."""
-    weights = expected / expected.sum()
-    faces = np.sort(rng.choice(len(weights), size=max(1, int(factor * expected.sum())), p=weights))
+    total = expected.sum()
+    count = int(np.ceil(factor * total))
+    faces = np.sort(rng.choice(len(expected), size=count, p=expected / total if total > 0 else None))
     u, v = rng.random((2, len(faces)))
     root = np.sqrt(u)
     barycentric = np.stack([1.0 - root, root * (1.0 - v), root * v], axis=1)
@@ -300,8 +324,9 @@ def _closed(
         leaking = np.prod(1.0 - response, axis=1) > _LEAK
         if not leaking.any():
             break
-        strongest = np.take_along_axis(index[leaking], np.argsort(-response[leaking], axis=1)[:, :2], axis=1)
-        grown = np.unique(strongest)
+        # A gap that is closed stays closed, since discs only grow.
+        index, local, facing, response = index[leaking], local[leaking], facing[leaking], response[leaking]
+        grown = np.unique(np.take_along_axis(index, np.argpartition(-response, 1, axis=1)[:, :2], axis=1))
         scales[grown, :2] = np.minimum(1.08 * scales[grown, :2], widest[grown])
     return scales
 
@@ -325,7 +350,8 @@ class _CreaseIndex:
     inward: FloatArray
 
     @classmethod
-    def build(cls, mesh: trimesh.Trimesh, spacing: float) -> _CreaseIndex:
+    def build(cls, mesh: trimesh.Trimesh, spacing: FloatArray) -> _CreaseIndex:
+        """Points on the creases as far apart as ``spacing`` (F,) [m] says for the faces beside them."""
         is_sharp = mesh.face_adjacency_angles > CREASE_ANGLE
         sharp, beside = mesh.face_adjacency_edges[is_sharp], mesh.face_adjacency[is_sharp]
         open_rows = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
@@ -334,7 +360,7 @@ class _CreaseIndex:
         face = np.concatenate([beside[:, 0], beside[:, 1], mesh.edges_face[open_rows]]).astype(int)
         start, along = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]]
         length = np.linalg.norm(along, axis=1)
-        steps = np.maximum(1, np.ceil(length / spacing).astype(int))
+        steps = np.maximum(1, np.ceil(length / spacing[face]).astype(int))
         owner = np.repeat(np.arange(len(edges)), steps)
         fraction = (np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[owner]
         tree = KDTree(start[owner] + fraction[:, None] * along[owner]) if len(edges) else None

@@ -26,16 +26,18 @@ SINK = 0.0006
 
 DENSITY = {
     "mat": 1.0,
-    "worktop": 0.30,
-    "worktop_edge": 0.2,
-    "pegboard": 0.085,
-    "floor": 0.0015,
-    "room": 0.0008,
-    "frame": 0.03,
-    "paper": 1.0,
+    "worktop": 0.17,
+    "worktop_edge": 0.03,
+    "pegboard": 0.07,
+    "floor": 0.0008,
+    "room": 0.0004,
+    "frame": 0.006,
+    "rail": 0.05,
+    "bin": 0.07,
+    "paper": 0.6,
 }
 """Gaussians per area relative to the mat's; every part that is not named has :data:`DENSITY_ELSEWHERE`."""
-DENSITY_ELSEWHERE = 0.30
+DENSITY_ELSEWHERE = 0.10
 
 
 def build_workcell(seed: int) -> trimesh.Scene:
@@ -49,7 +51,7 @@ def build_workcell(seed: int) -> trimesh.Scene:
 
 def densities(scene: trimesh.Scene) -> dict[str, float]:
     """Relative density of Gaussians by part; what is printed needs more."""
-    return {name: DENSITY.get(name, 1.2 if name.endswith("label") else DENSITY_ELSEWHERE) for name in scene.geometry}
+    return {name: DENSITY.get(name, 0.8 if name.endswith("label") else DENSITY_ELSEWHERE) for name in scene.geometry}
 
 
 def block(size: Vector, centre: Vector) -> trimesh.Trimesh:

@@ -156,7 +156,7 @@ class Drop:
             self._colliders.append(collider)
             self._obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
         surroundings = scene.environment
-        if surroundings is not None and surroundings.mesh is not None:
+        if scene.spec.environment_collides and surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
             pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
             self._colliders.append(Collider(surroundings.friction, pieces=pieces))

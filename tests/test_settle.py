@@ -285,7 +285,8 @@ def test_an_environment_carries_objects(scene_data, write_scene):
     step = trimesh.creation.box((0.6, 0.6, 0.04)).apply_translation((0, 0, -0.005))
     environment = replace(scene.assets[0], name="cell", mesh=step, pieces=(step,), kind="environment")
     region = scene.spec.region.model_copy(update={"min": (-0.2, -0.2, 0.03)})
-    raised = replace(scene, environment=environment, spec=scene.spec.model_copy(update={"region": region}))
+    spec = scene.spec.model_copy(update={"region": region, "environment_collides": True})
+    raised = replace(scene, environment=environment, spec=spec)
     layout = settle_layout(raised, 0)
     for instance in layout.instances:
         mesh = scene.assets[instance.asset].mesh

@@ -340,7 +340,8 @@ class SceneSpec(StrictModel):
     name: str = Field(min_length=1, description="Name of the dataset.")
     environment: str | None = Field(None, description="Asset folder of the surroundings, relative to the scene file.")
     environment_collides: bool = Field(
-        False, description="Whether objects also rest on the environment's mesh, whose convex pieces take minutes to make."
+        False,
+        description="Whether objects also rest on the environment's mesh, whose convex pieces take minutes to make.",
     )
     shapes: tuple[Shape, ...] = Field((), description="Tabletop, walls and other things that do not move.")
     objects: tuple[ObjectSpec, ...] = Field((), description="What is dropped and labelled.")

@@ -36,7 +36,11 @@ sequences")."""
 NOISE_LIMIT = 6.0
 """Squared standard deviations within which two neighbours' shadows may be averaged."""
 
-REFERENCE_SAMPLES = 4096
+OPEN_LATTICE = (377, 233)
+"""Points and generator of the Fibonacci lattice that integrates light without occluders: consecutive Fibonacci numbers
+give the best two-dimensional lattices (Niederreiter 1992, section 5.3), here within 0.5 % for two lights."""
+
+REFERENCE_LATTICE = (4181, 2584)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,35 +133,46 @@ class Surface:
     valid: Any
 
 
-def trace_light(
-    scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int, reference: Any
-) -> tuple[Any, Any, Any]:
-    """Light factor and highlight (Color3f) of every visible point, and the share of light that dynamic objects leave.
+def light_factor(
+    scene: Any, proxies: Proxies, surface: Surface, group: Any, view: View, *, samples: int, seed: int, reference: Any
+) -> tuple[Any, Any]:
+    """Light factor and highlight (Color3f) of every visible point, see the module docstring.
 
-    See the module docstring for what the factor means.
+    Sums over rays are averaged over neighbours before they are divided, so that points with little light do not turn
+    black by chance. A relit point takes its irradiance without occluders from one fixed set of directions, which has no
+    noise, and only the share that arrives from its rays.
 
     Args:
         scene: Mitsuba scene whose emitters give the light.
         proxies: What can stand in its way.
         surface: Visible points of an image.
-        width: Image width [px].
+        group: Instance id per pixel; light is not averaged across its borders.
+        view: Camera.
         samples: Shadow rays per pixel.
         seed: Offset into the low-discrepancy sequence.
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
     """
+    lit, base, shine, draws = _trace_light(scene, proxies, surface, view.width, samples=samples, seed=seed)
+    lit, base, shine = _smooth_light(lit, base, shine, draws, surface, group, view)
+    share = dr.select(base > 0, lit / base, 1)
+    factor = dr.select(surface.relit, share * _open_irradiance(scene, surface) / reference, share)
+    return dr.select(surface.valid, factor, 1), shine * (dr.pi / (samples * reference))
+
+
+def _trace_light(
+    scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int
+) -> tuple[Any, Any, Any, Any]:
+    """Sums over shadow rays: light that arrives, light to compare with, highlight; and the rays that found light."""
     count = dr.width(surface.valid)
     pixel = dr.arange(mi.UInt32, count)
     x, y = pixel % width, pixel // width
     start = dr.opaque(mi.UInt32, seed * samples * BLOCK * BLOCK % (1 << 20)) + _bayer(x, y)
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.p = surface.position
-    si.n = mi.Normal3f(surface.normal)
-    si.sh_frame = mi.Frame3f(surface.normal)
+    si = _receiver(surface.position, surface.normal)
     origin = dr.fma(surface.normal, surface.offset, surface.position)
     alpha2 = dr.square(dr.square(surface.roughness))
     cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
 
-    def body(i: Any, lit: Any, unshadowed: Any, shine: Any) -> tuple[Any, Any, Any, Any]:
+    def body(i: Any, lit: Any, base: Any, shine: Any, draws: Any) -> tuple[Any, Any, Any, Any, Any]:
         index = mi.Float((start + i * (BLOCK * BLOCK)) & 0xFFFFF) + 1.0
         point = mi.Point2f(*[index * step - dr.floor(index * step) for step in R2])
         sample, radiance = scene.sample_emitter_direction(si, point, False, surface.valid)
@@ -170,26 +185,53 @@ def trace_light(
         blocked = mi.Bool(False)
         if proxies.static is not None:
             blocked = proxies.static.scene.ray_test(ray, active=active)
-        static_light = dr.select(active & ~blocked, radiance * cosine, 0)
+        open_light = dr.select(active, radiance * cosine, 0)
+        static_light = dr.select(blocked, 0, open_light)
         shadowed = mi.Bool(False)
         if proxies.dynamic is not None:
             shadowed = proxies.dynamic.scene.ray_test(ray, active=active & ~blocked)
         light = dr.select(shadowed, 0, static_light)
-        unshadowed += static_light
+        compared = dr.select(surface.relit, open_light, static_light)
         lit += light
+        base += compared
         shine += light * _ggx(surface, sample.d, cosine, cos_camera, alpha2)
-        return i + 1, lit, unshadowed, shine
+        draws += dr.select(dr.sum(compared) > 0, 1.0, 0.0)
+        return i + 1, lit, base, shine, draws
 
     rounds = dr.opaque(mi.UInt32, samples)
-    black = mi.Color3f(0)
-    _, lit, unshadowed, shine = dr.while_loop(
-        (dr.zeros(mi.UInt32, count), black, mi.Color3f(0), mi.Color3f(0)), lambda i, *_: i < rounds, body, label="light"
-    )
-    weight = 1.0 / mi.Float(rounds)
-    captured = dr.select(unshadowed > 0, lit / unshadowed, 1)
-    factor = dr.select(surface.relit, lit * weight / reference, captured)
-    share = dr.select(dr.sum(unshadowed) > 0, dr.sum(lit) / dr.sum(unshadowed), 1)
-    return dr.select(surface.valid, factor, 1), shine * (weight * dr.pi / reference), share
+    state = dr.zeros(mi.UInt32, count), mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.Float(0)
+    _, lit, base, shine, draws = dr.while_loop(state, lambda i, *_: i < rounds, body, label="light")
+    return lit, base, shine, draws
+
+
+def _open_irradiance(scene: Any, surface: Surface) -> Any:
+    """Irradiance (Color3f) of relit points without any occluder, from the same directions for all."""
+    wanted = surface.relit & surface.valid
+    si = _receiver(surface.position, surface.normal)
+
+    def body(i: Any, total: Any) -> tuple[Any, Any]:
+        sample, radiance = scene.sample_emitter_direction(si, _lattice(i, OPEN_LATTICE), False, wanted)
+        return i + 1, total + radiance * dr.maximum(dr.dot(surface.normal, sample.d), 0)
+
+    rounds = dr.opaque(mi.UInt32, OPEN_LATTICE[0])
+    state = dr.zeros(mi.UInt32, dr.width(wanted)), mi.Color3f(0)
+    _, total = dr.while_loop(state, lambda i, total: wanted & (i < rounds), body, label="open light")
+    return total / OPEN_LATTICE[0]
+
+
+def _receiver(position: Any, normal: Any) -> Any:
+    """Surface interaction that light is sampled for."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
+    si.p = position
+    si.n = mi.Normal3f(normal)
+    si.sh_frame = mi.Frame3f(si.n)
+    return si
+
+
+def _lattice(i: Any, lattice: tuple[int, int]) -> Any:
+    """Point ``i`` of a centred rank-1 lattice in the unit square."""
+    count, generator = lattice
+    return mi.Point2f((mi.Float(i) + 0.5) / count, (mi.Float(i * generator % count) + 0.5) / count)
 
 
 def _ggx(surface: Surface, to_light: Any, cos_light: Any, cos_camera: Any, alpha2: Any) -> Any:
@@ -211,12 +253,9 @@ def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[fl
 
     Where next to nothing reaches that element, it is the mean over all orientations, a quarter of the fluence.
     """
-    i = dr.arange(mi.Float, REFERENCE_SAMPLES) + 1.0
-    si = dr.zeros(mi.SurfaceInteraction3f, REFERENCE_SAMPLES)
-    si.p = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point])
-    si.n = mi.Normal3f(*normal)
-    si.sh_frame = mi.Frame3f(si.n)
-    sample, radiance = scene.sample_emitter_direction(si, mi.Point2f(*[i * s - dr.floor(i * s) for s in R2]), False)
+    i = dr.arange(mi.UInt32, REFERENCE_LATTICE[0])
+    si = _receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))
+    sample, radiance = scene.sample_emitter_direction(si, _lattice(i, REFERENCE_LATTICE), False)
     irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
     mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])
     return dr.maximum(dr.select(irradiance > 1e-3 * mean, irradiance, mean), 1e-12)
@@ -231,22 +270,23 @@ def _bayer(x: Any, y: Any) -> Any:
     return result
 
 
-def smooth_light(
-    factor: Any, highlight: Any, share: Any, surface: Surface, group: Any, view: View, *, samples: int, radius: int = 4
-) -> tuple[Any, Any]:
-    """Average light over neighbours on the same surface: a separable filter that keeps edges.
+def _smooth_light(
+    lit: Any, base: Any, shine: Any, draws: Any, surface: Surface, group: Any, view: View, *, radius: int = 4
+) -> tuple[Any, Any, Any]:
+    """Average sums of light over neighbours on the same surface: a separable filter that keeps edges.
 
     A neighbour counts where it belongs to the same ``group``, its normal agrees, it lies in the tangent plane, and its
-    ``share`` of unshadowed light differs by no more than the noise of ``samples`` binary draws explains, so that a hard
-    shadow keeps its edge while a penumbra becomes smooth. Where all neighbours are equal the result is the same value
-    exactly, so that unshadowed points stay at 1.
+    share of light differs by no more than the noise of its ``draws`` explains, so that a hard shadow keeps its edge
+    while a penumbra becomes smooth. Equal sums stay equal, so that the ratio of an unshadowed point is exactly 1.
     """
     count = dr.width(group)
     pixel = dr.arange(mi.UInt32, count)
     x, y = mi.Int32(pixel % view.width), mi.Int32(pixel // view.width)
     footprint = surface.offset * 8
-    values = [*factor, *highlight]
-    draws = 0.5 * samples  # of the samples, those that are not below the horizon
+    values = [*lit, *base, *shine]
+    total_base = dr.sum(base)
+    share = dr.select(total_base > 0, dr.sum(lit) / total_base, 1)
+    draws = dr.maximum(draws, 1)
     likely = (share * draws + 0.5) / (draws + 1)
     variance = likely * (1 - likely) / draws
     dr.eval(values, surface.position, surface.normal, share, variance)
@@ -275,4 +315,4 @@ def smooth_light(
             ]
         values = [m + s / weights for m, s in zip(total, sums, strict=True)]
         dr.eval(values)
-    return mi.Color3f(*values[:3]), mi.Color3f(*values[3:])
+    return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])

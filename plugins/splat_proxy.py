@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsplat.errors import InputError
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
-from mitsplat.plugins.light import Occluder, Proxies, Surface, reference_irradiance, smooth_light, trace_light
+from mitsplat.plugins.light import Occluder, Proxies, Surface, light_factor, reference_irradiance
 from mitsplat.plugins.march import Image, march
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import CloudSet, Placement, bin_gaussians, merge_clouds
@@ -165,16 +165,16 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             if behind:
                 surface.relit |= front
             reference = reference_irradiance(scene, self.reference)
-            traced = trace_light(
+            light, highlight = light_factor(
                 scene,
                 contents.proxies,
                 surface,
-                view.width,
+                instance,
+                view,
                 samples=self.shadow_samples,
                 seed=seed,
                 reference=reference,
             )
-            light, highlight = smooth_light(*traced, surface, instance, view, samples=self.shadow_samples)
         layers = {
             "rgb": colour * light + highlight * alpha,
             "alpha": alpha,

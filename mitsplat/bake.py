@@ -15,6 +15,7 @@ from typing import Literal
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+import shapely
 import trimesh
 from scipy.spatial import KDTree
 
@@ -24,6 +25,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.fit import FitSettings, Picture, fit_splats
 from mitsplat.mesh import convex_pieces
+from mitsplat.plugins.light import Occluder, Proxies
 from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
@@ -38,6 +40,9 @@ _DETAIL = 7.0
 """How many times denser Gaussians are where the texture changes strongly."""
 _RIDGE = 0.02
 """Weight of the penalty on view dependence, relative to the data: decides what no ray has seen."""
+
+_LABEL_GAP = 0.01
+"""Distance from a solid, relative to its own size, within which a sheet is a label on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,15 +307,44 @@ def _sharpened(surfels: Surfels, target: FloatArray, rounds: int) -> FloatArray:
 
 
 def _proxy_mesh(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
-    """One surface of all parts, of at most about ``most_faces`` faces; decals on solids are left out."""
+    """One surface of all parts, of at most about ``most_faces`` faces; labels on solids are left out.
+
+    Decimation eats open sheets from their edges, so they keep all faces, the flat ones only as many as they need.
+    """
     solids = [part.mesh for part in parts if part.mesh.is_volume]
-    open_parts = [part.mesh for part in parts if not part.mesh.is_volume and not part.is_decal]
+    sheets = [part.mesh for part in parts if not part.mesh.is_volume]
     if len(solids) > 1:
         solids = [trimesh.boolean.union(solids, engine="manifold")]
-    proxy = trimesh.util.concatenate(solids + (open_parts or ([] if solids else [part.mesh for part in parts])))
-    if len(proxy.faces) > most_faces:
-        proxy = proxy.simplify_quadric_decimation(face_count=most_faces)
+    if solids:
+        sheets = [sheet for sheet in sheets if not _lies_on(sheet, solids[0])]
+    sheets = [_flattened(sheet) for sheet in sheets]
+    room = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
+    solids = [s if len(s.faces) <= room else s.simplify_quadric_decimation(face_count=room) for s in solids]
+    proxy = trimesh.util.concatenate(solids + sheets)
     return trimesh.Trimesh(proxy.vertices, proxy.faces)
+
+
+def _flattened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A sheet in a plane with no more faces than its outline needs; any other sheet as it is."""
+    normal = sheet.face_normals[0]
+    height = (sheet.vertices - sheet.vertices[0]) @ normal
+    if (sheet.face_normals @ normal < 0.999).any() or np.ptp(height) > 1e-5 * sheet.scale:
+        return sheet
+    to_plane = trimesh.geometry.plane_transform(sheet.vertices[0], normal)
+    corners = trimesh.transform_points(sheet.vertices, to_plane)[sheet.faces, :2]
+    outline = shapely.coverage_union_all(shapely.polygons(corners)).simplify(1e-6 * sheet.scale)
+    flat = [trimesh.creation.triangulate_polygon(polygon, engine="earcut") for polygon in shapely.get_parts(outline)]
+    vertices, faces = trimesh.util.append_faces([v for v, _ in flat], [f for _, f in flat])
+    vertices = np.pad(vertices, ((0, 0), (0, 1)))
+    return trimesh.Trimesh(trimesh.transform_points(vertices, np.linalg.inv(to_plane)), faces)
+
+
+def _lies_on(sheet: trimesh.Trimesh, solid: trimesh.Trimesh) -> bool:
+    """Whether an open sheet hugs a solid, as a label does: everywhere within a hundredth of its size."""
+    origins, down = sheet.triangles_center, -sheet.face_normals
+    rays = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(down.T.astype(np.float32)))
+    hit, _ = Proxies([Occluder(solid, 0, dynamic=False)]).nearest(rays)
+    return bool((np.array(hit.distance) < _LABEL_GAP * sheet.scale).all())
 
 
 def _picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:

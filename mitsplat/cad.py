@@ -53,11 +53,6 @@ class Part:
     shiny: bool
 
     @property
-    def is_decal(self) -> bool:
-        """Whether the part is an open sheet with a texture, as labels are."""
-        return self.texture is not None and not self.mesh.is_volume
-
-    @property
     def specular(self) -> float:
         """Reflectance at normal incidence, grey."""
         if not self.shiny:

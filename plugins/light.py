@@ -14,7 +14,7 @@ darker where less light arrives.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,9 @@ sequences")."""
 
 NOISE_LIMIT = 6.0
 """Squared standard deviations within which two neighbours' shadows may be averaged."""
+
+GUESS_WEIGHT = 1e-3
+"""How much a point counts that is not known to lie on a surface, beside ones that are."""
 
 OPEN_LATTICE = (377, 233)
 """Points and generator of the Fibonacci lattice that integrates light without occluders: consecutive Fibonacci numbers
@@ -66,20 +69,30 @@ class Proxies:
         self.static = _TraceScene.build([o for o in occluders if not o.dynamic], visible)
         self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic])
 
-    def nearest(self, ray: Any) -> tuple[Any, Any, Any]:
-        """Distance along a ray (infinite for a miss), normal towards its origin, and instance id of what it meets."""
-        distance, normal, instance = mi.Float(dr.inf), mi.Normal3f(0), mi.UInt32(0)
-        for scene in (self.static, self.dynamic):
-            if scene is None:
-                continue
-            si = scene.scene.ray_intersect(ray)
-            closer = si.t < distance
-            facing = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
-            proxy = closer & (si.shape == scene.mesh) if scene.mesh is not None else mi.Bool(False)
-            number = dr.gather(mi.UInt32, scene.instances, si.prim_index, proxy)
-            instance = dr.select(closer, number, instance)
-            distance, normal = dr.select(closer, si.t, distance), dr.select(closer, facing, normal)
-        return distance, normal, instance
+    def nearest(self, ray: Any) -> tuple[Hit, Hit]:
+        """What rays meet first, and what they would meet without the dynamic proxies."""
+        static = _TraceScene.nearest(self.static, ray, Hit.nothing())
+        return _TraceScene.nearest(self.dynamic, ray, static), static
+
+
+@dataclass(frozen=True, eq=False)
+class Hit:
+    """Where rays meet a proxy.
+
+    Attributes:
+        distance: Along the ray [m], infinite for a miss.
+        normal: Unit normal towards the ray's origin.
+        instance: Instance id, 0 for a miss.
+    """
+
+    distance: Any
+    normal: Any
+    instance: Any
+
+    @classmethod
+    def nothing(cls) -> Hit:
+        """A miss."""
+        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.UInt32(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +102,21 @@ class _TraceScene:
     scene: Any
     mesh: Any
     instances: Any
+
+    def nearest(self: _TraceScene | None, ray: Any, other: Hit) -> Hit:
+        """The nearer of ``other`` and what the rays meet here."""
+        if self is None:
+            return other
+        si = self.scene.ray_intersect(ray)
+        closer = si.t < other.distance
+        facing = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+        proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
+        number = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)
+        return Hit(
+            dr.select(closer, si.t, other.distance),
+            dr.select(closer, facing, other.normal),
+            dr.select(closer, number, other.instance),
+        )
 
     @classmethod
     def build(cls, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> _TraceScene | None:
@@ -120,6 +148,7 @@ class Surface:
         offset: How far shadow rays start off the surface [m].
         relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
         roughness, specular: GGX roughness and reflectance at normal incidence.
+        known: Whether the proxy of what is seen says so; else position and normal are a guess.
         valid: Whether there is a point at all.
     """
 
@@ -130,6 +159,7 @@ class Surface:
     relit: Any
     roughness: Any
     specular: Any
+    known: Any
     valid: Any
 
 
@@ -152,8 +182,8 @@ def light_factor(
         seed: Offset into the low-discrepancy sequence.
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
     """
-    lit, base, shine, draws = _trace_light(scene, proxies, surface, view.width, samples=samples, seed=seed)
-    lit, base, shine = _smooth_light(lit, base, shine, draws, surface, group, view)
+    lit, base, shine, squares = _trace_light(scene, proxies, surface, view.width, samples=samples, seed=seed)
+    lit, base, shine = _smooth_light(lit, base, shine, squares, surface, group, view)
     share = dr.select(base > 0, lit / base, 1)
     factor = dr.select(surface.relit, share * _open_irradiance(scene, surface) / reference, share)
     return dr.select(surface.valid, factor, 1), shine * (dr.pi / (samples * reference))
@@ -162,7 +192,7 @@ def light_factor(
 def _trace_light(
     scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int
 ) -> tuple[Any, Any, Any, Any]:
-    """Sums over shadow rays: light that arrives, light to compare with, highlight; and the rays that found light."""
+    """Sums over shadow rays: light that arrives, light to compare with, highlight; and squares of the second."""
     count = dr.width(surface.valid)
     pixel = dr.arange(mi.UInt32, count)
     x, y = pixel % width, pixel // width
@@ -172,7 +202,7 @@ def _trace_light(
     alpha2 = dr.square(dr.square(surface.roughness))
     cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
 
-    def body(i: Any, lit: Any, base: Any, shine: Any, draws: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
         index = mi.Float((start + i * (BLOCK * BLOCK)) & 0xFFFFF) + 1.0
         point = mi.Point2f(*[index * step - dr.floor(index * step) for step in R2])
         sample, radiance = scene.sample_emitter_direction(si, point, False, surface.valid)
@@ -195,13 +225,13 @@ def _trace_light(
         lit += light
         base += compared
         shine += light * _ggx(surface, sample.d, cosine, cos_camera, alpha2)
-        draws += dr.select(dr.sum(compared) > 0, 1.0, 0.0)
-        return i + 1, lit, base, shine, draws
+        squares += dr.square(dr.sum(compared))
+        return i + 1, lit, base, shine, squares
 
     rounds = dr.opaque(mi.UInt32, samples)
     state = dr.zeros(mi.UInt32, count), mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.Float(0)
-    _, lit, base, shine, draws = dr.while_loop(state, lambda i, *_: i < rounds, body, label="light")
-    return lit, base, shine, draws
+    _, lit, base, shine, squares = dr.while_loop(state, lambda i, *_: i < rounds, body, label="light")
+    return lit, base, shine, squares
 
 
 def _open_irradiance(scene: Any, surface: Surface) -> Any:
@@ -271,48 +301,62 @@ def _bayer(x: Any, y: Any) -> Any:
 
 
 def _smooth_light(
-    lit: Any, base: Any, shine: Any, draws: Any, surface: Surface, group: Any, view: View, *, radius: int = 4
+    lit: Any, base: Any, shine: Any, squares: Any, surface: Surface, group: Any, view: View, *, radius: int = 4
 ) -> tuple[Any, Any, Any]:
     """Average sums of light over neighbours on the same surface: a separable filter that keeps edges.
 
     A neighbour counts where it belongs to the same ``group``, its normal agrees, it lies in the tangent plane, and its
-    share of light differs by no more than the noise of its ``draws`` explains, so that a hard shadow keeps its edge
-    while a penumbra becomes smooth. Equal sums stay equal, so that the ratio of an unshadowed point is exactly 1.
+    share of light differs by no more than noise explains, so that a hard shadow keeps its edge while a penumbra becomes
+    smooth. A few rays per pixel say too little about that share; both are taken from 3 x 3 pixels. Their noise is that
+    of as many binary draws as equal weights would need for the same variance (Kish 1965, section 11.7). Equal sums stay
+    equal, so that the ratio of an unshadowed point is exactly 1.
+
+    At a silhouette a pixel may show one thing and its ray meet the proxy of another. Such a point has its light from
+    the known neighbours that show the same thing.
     """
-    count = dr.width(group)
-    pixel = dr.arange(mi.UInt32, count)
+    pixel = dr.arange(mi.UInt32, dr.width(group))
     x, y = mi.Int32(pixel % view.width), mi.Int32(pixel // view.width)
     footprint = surface.offset * 8
+
+    def average(values: list[Any], radius: int, alike: Callable[[Any, Any], Any] = lambda _, same: same) -> list[Any]:
+        for horizontal in (True, False):
+            weights = dr.select(surface.known, 1, GUESS_WEIGHT)
+            sums = [mi.Float(0) for _ in values]
+            for step in [s for r in range(1, radius + 1) for s in (-r, r)]:
+                nx, ny = (x + step, y) if horizontal else (x, y + step)
+                inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height) & surface.valid
+                other = mi.UInt32(ny * view.width + nx)
+                position = dr.gather(mi.Point3f, surface.position, other, inside)
+                normal = dr.gather(mi.Vector3f, surface.normal, other, inside)
+                same = inside & (dr.gather(mi.UInt32, group, other, inside) == group)
+                plane = dr.abs(dr.dot(surface.normal, position - surface.position))
+                known = dr.gather(mi.Bool, surface.known, other, same)
+                near = (dr.dot(surface.normal, normal) > 0.95) & (plane < footprint * abs(step)) & alike(other, same)
+                same &= (near & (known == surface.known)) | (known & ~surface.known)
+                # Halves at the ends: the filter spans one period of the dither, not one pixel more.
+                weight = dr.select(same, dr.select(known, 1.0, GUESS_WEIGHT), 0) * (0.5 if abs(step) == radius else 1.0)
+                weights += weight
+                # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
+                sums = [
+                    dr.fma(weight, dr.gather(mi.Float, v, other, same) - v, s)
+                    for v, s in zip(values, sums, strict=True)
+                ]
+            values = [v + s / weights for v, s in zip(values, sums, strict=True)]
+            dr.eval(values)
+        return values
+
     values = [*lit, *base, *shine]
-    total_base = dr.sum(base)
-    share = dr.select(total_base > 0, dr.sum(lit) / total_base, 1)
-    draws = dr.maximum(draws, 1)
+    dr.eval(values, squares, surface.position, surface.normal)
+    near_lit, near_base, near_squares = average([dr.sum(lit), dr.sum(base), squares], 1)
+    share = dr.select(near_base > 0, near_lit / near_base, 1)
+    draws = dr.maximum(9 * dr.square(near_base) / dr.maximum(near_squares, 1e-20), 1)
     likely = (share * draws + 0.5) / (draws + 1)
     variance = likely * (1 - likely) / draws
-    dr.eval(values, surface.position, surface.normal, share, variance)
-    for horizontal in (True, False):
-        middle = values
-        total = [mi.Float(v) for v in values]
-        weights = mi.Float(1)
-        sums = [mi.Float(0) for _ in values]
-        for step in [s for r in range(1, radius + 1) for s in (-r, r)]:
-            nx, ny = (x + step, y) if horizontal else (x, y + step)
-            inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height) & surface.valid
-            other = mi.UInt32(ny * view.width + nx)
-            position = dr.gather(mi.Point3f, surface.position, other, inside)
-            normal = dr.gather(mi.Vector3f, surface.normal, other, inside)
-            same = inside & (dr.gather(mi.UInt32, group, other, inside) == group)
-            plane = dr.abs(dr.dot(surface.normal, position - surface.position))
-            same &= (dr.dot(surface.normal, normal) > 0.95) & (plane < footprint * abs(step))
-            noise = variance + dr.gather(mi.Float, variance, other, same)
-            same &= dr.square(dr.gather(mi.Float, share, other, same) - share) <= NOISE_LIMIT * noise
-            weight = dr.select(same, 1.0, 0.0)
-            weights += weight
-            # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
-            sums = [
-                dr.fma(weight, dr.gather(mi.Float, v, other, same) - m, s)
-                for v, m, s in zip(values, middle, sums, strict=True)
-            ]
-        values = [m + s / weights for m, s in zip(total, sums, strict=True)]
-        dr.eval(values)
+    dr.eval(share, variance)
+
+    def alike(other: Any, same: Any) -> Any:
+        noise = variance + dr.gather(mi.Float, variance, other, same)
+        return dr.square(dr.gather(mi.Float, share, other, same) - share) <= NOISE_LIMIT * noise
+
+    values = average(values, radius, alike)
     return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])

@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsplat.errors import InputError
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
-from mitsplat.plugins.light import Occluder, Proxies, Surface, light_factor, reference_irradiance
+from mitsplat.plugins.light import Hit, Occluder, Proxies, Surface, light_factor, reference_irradiance
 from mitsplat.plugins.march import Image, march
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import CloudSet, Placement, bin_gaussians, merge_clouds
@@ -145,10 +145,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         rays = view.rays()
         behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
         splat = self._trace_splats(contents, view, behind.depth if behind else None)
-        distance, normal, proxy_instance = contents.proxies.nearest(rays)
-        hit = distance < dr.inf
-        proxy_depth = dr.select(hit, distance * view.cosine(rays), 0)
-        dr.eval(splat, proxy_depth, normal, proxy_instance)
+        hit, static = contents.proxies.nearest(rays)
+        proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
+        dr.eval(splat, proxy_depth, hit, static)
 
         covered = dr.maximum(splat.alpha, 1e-6)
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
@@ -161,7 +160,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             instance = dr.select(front, 0, instance)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
-            surface = _surface(contents, view, rays, alpha, depth, instance, proxy_depth, normal, proxy_instance)
+            surface = _surface(contents, view, rays, alpha, depth, instance, hit, static)
             if behind:
                 surface.relit |= front
             reference = reference_irradiance(scene, self.reference)
@@ -182,8 +181,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             "depth": depth,
             "instance": instance,
             "proxy_depth": proxy_depth,
-            "proxy_instance": proxy_instance,
-            "normal": mi.Vector3f(normal),
+            "proxy_instance": hit.instance,
+            "normal": mi.Vector3f(hit.normal),
             "light": light,
             "highlight": highlight,
         }
@@ -273,32 +272,32 @@ def _trace_meshes(scene: Any, view: View, rays: Any) -> _Behind:
 
 
 def _surface(
-    contents: _Contents,
-    view: View,
-    rays: Any,
-    alpha: Any,
-    depth: Any,
-    instance: Any,
-    proxy_depth: Any,
-    proxy_normal: Any,
-    proxy_instance: Any,
+    contents: _Contents, view: View, rays: Any, alpha: Any, depth: Any, instance: Any, hit: Hit, static: Hit
 ) -> Surface:
     """Points that light is traced at: on the proxy where it agrees with what is seen, else at the seen depth."""
-    same = (proxy_instance == instance) & (proxy_depth > 0)
+    cosine = view.cosine(rays)
+    met = hit.distance < dr.inf
+    known = ~met | (hit.instance == instance)
+    # What shows through or beside a dynamic object's proxy lies on a static one.
+    behind = instance == 0
+    same = dr.select(behind, static.distance < dr.inf, met & known)
+    proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
+    normal = dr.select(behind, static.normal, hit.normal)
     # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
     on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
     z = dr.select(on_proxy, proxy_depth, depth)
-    position = rays(z / view.cosine(rays))
+    position = rays(z / cosine)
     valid = (alpha > 1 / 255) & (z > 0)
     reach = dr.max(dr.abs(position))
     return Surface(
         position=position,
-        normal=mi.Vector3f(dr.select(same, proxy_normal, mi.Normal3f(-rays.d))),
+        normal=mi.Vector3f(dr.select(same, normal, mi.Normal3f(-rays.d))),
         to_camera=-rays.d,
         offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
         relit=dr.gather(mi.Bool, contents.relit, instance),
         roughness=dr.gather(mi.Float, contents.roughness, instance),
         specular=dr.gather(mi.Float, contents.specular, instance),
+        known=known,
         valid=valid,
     )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import mitsplat
@@ -276,3 +277,33 @@ def test_area_light_faces_its_target_even_from_straight_above() -> None:
 
 def test_bake_is_public() -> None:
     assert mitsplat.bake_asset is bake_asset
+
+
+def sheet(extent: float, height: float, texture: np.ndarray, *, steps: int = 1) -> trimesh.Trimesh:
+    """A square open sheet with a texture, of ``2 * steps**2`` faces."""
+    line = np.linspace(0.0, 1.0, steps + 1)
+    u, v = (a.ravel() for a in np.meshgrid(line, line))
+    corner = (np.arange(steps)[:, None] * (steps + 1) + np.arange(steps)).ravel()
+    right, up = corner + 1, corner + steps + 1
+    faces = np.vstack([np.stack([corner, right, up + 1], axis=1), np.stack([corner, up + 1, up], axis=1)])
+    mesh = trimesh.Trimesh(
+        np.stack([extent * (u - 0.5), extent * (v - 0.5), np.full_like(u, height)], axis=1), faces, process=False
+    )
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(texture), roughnessFactor=1.0)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.stack([u, v], axis=1), material=material)
+    return mesh
+
+
+def test_proxy_keeps_a_textured_table_and_leaves_out_a_label() -> None:
+    texture = np.full((8, 8, 3), 200, np.uint8)
+    table = sheet(1.0, 0.0, texture, steps=40)
+    box = white(trimesh.creation.box(bounds=[[-0.05, -0.05, 0.0], [0.05, 0.05, 0.1]]))
+    label = sheet(0.06, 0.1002, texture)
+    ball = white(trimesh.creation.icosphere(4, 0.05).apply_translation((0.3, 0, 0.05)))
+    scene = trimesh.Scene({"table": table, "box": box, "label": label, "ball": ball})
+    proxy = bake_asset(scene, name="bench", kind="environment", settings=quick(proxy_faces=500)).asset.mesh
+    assert proxy is not None
+    assert len(proxy.faces) <= 500
+    flat = (np.abs(proxy.triangles_center[:, 2]) < 1e-6) & (proxy.face_normals[:, 2] > 0.999)
+    assert proxy.area_faces[flat].sum() == pytest.approx(1.0, rel=1e-6)
+    assert proxy.bounds[1, 2] == pytest.approx(0.1, abs=1e-4)

@@ -168,3 +168,61 @@ def test_layers_say_where_the_proxy_is() -> None:
     np.testing.assert_allclose(layers.proxy_depth, 1.0, atol=1e-5)
     np.testing.assert_allclose(layers.normal, np.broadcast_to([0, 0, 1.0], layers.normal.shape), atol=1e-5)
     assert (layers.proxy_instance == 7).all() and (layers.instance == 7).all()
+
+
+def nothing() -> Splats:
+    return floor().select(np.zeros(1600, bool))
+
+
+def test_few_rays_leave_no_speckles_in_a_faint_shadow() -> None:
+    """A strong lamp and a weak sky, four rays a pixel: the edge of a wide penumbra, where few rays meet the object."""
+    make_integrator()
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 1.4], target=[0, 0, 0], up=[0, 1, 0]).scale(0.3),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 14.0}},
+    }
+    blocker = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.4], [0.05, 0.05, 0.41]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "blocker": make_splats_shape(nothing(), proxy=blocker, instance=1),
+        "lamp": lamp,
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    }
+    camera = Camera.look_at((0.0, -1.5, 0.35), (0, 0, 0), width=160, height=90, fov_x=25)
+    few, many = (render(shapes, camera, samples=n).light[..., 0] for n in (4, 1024))
+    assert many.min() < 0.8
+    assert np.abs(few - many).max() < 0.2
+    assert np.sqrt(np.mean((few - many) ** 2)) < 0.02
+
+
+def test_relit_surface_shows_no_pattern_of_the_sampling() -> None:
+    make_integrator()
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[1, 0, 1.4], target=[0, 0, 0], up=[0, 1, 0]).scale(0.3),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 14.0}},
+    }
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab(), instance=1, capture_light="uniform"),
+        "lamp": lamp,
+        "sky": WHITE_SKY,
+    }
+    light = render(shapes, down_camera(size=48), samples=4).light[..., 0]
+    assert np.abs(np.diff(light, 2, axis=0)).max() < 1e-3
+    assert np.abs(np.diff(light, 2, axis=1)).max() < 1e-3
+
+
+def test_point_seen_beside_its_proxy_takes_the_light_of_its_neighbours() -> None:
+    """A proxy wider than its object by a few pixels: the floor seen there is not under the object."""
+    make_integrator()
+    base = trimesh.creation.box(bounds=[[-0.125, -0.125, 0.0], [0.125, 0.125, 0.05]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "object": make_splats_shape(floor(0.1, 0.8, 0.05), proxy=base, instance=1, capture_light="uniform"),
+        "sky": WHITE_SKY,
+    }
+    layers = render(shapes, down_camera(size=64), samples=64)
+    seam = (layers.instance == 0) & (layers.proxy_instance == 1)
+    assert seam.sum() > 20
+    assert layers.light[seam].min() > 0.3

@@ -26,12 +26,14 @@ from mitsplat.mesh import MassProperties, join_meshes
 FloatArray = NDArray[np.float64]
 
 QUIET_SPEED, QUIET_SPIN = 1e-3, 0.05
-"""A body below both [m/s, rad/s] may be at rest."""
+"""A body below both [m/s, rad/s], on the mean over ``_MEAN_TIME``, may be at rest."""
 
 OVERFLOW = "contact buffer overflow"
 """Why :func:`run_to_rest` refuses a drop that a larger capacity may save."""
 
 _GRAVITY = (0.0, 0.0, -9.81)
+# Contacts of rounded hulls flicker from step to step: velocities of bodies that stay where they are.
+_MEAN_TIME = 0.05  # [s]
 _QUIET_TIME = 0.25  # how long every body must have been quiet [s]
 _MOTION, _MOTION_TIME = 5e-4, 0.5  # how far a surface may have moved [m] in how long [s]
 # Critically damped contact: MuJoCo's stiffness 1/t^2 and damping 2/t.
@@ -279,6 +281,7 @@ def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, Floa
     """
     centres = np.array([body.mass.centre for body in world.bodies])
     frames = max(2, round(_MOTION_TIME / world.interval) + 1)
+    mean_frames = max(1, round(_MEAN_TIME / world.interval))
     past: deque[FloatArray] = deque(maxlen=frames)
     moved_at = 0.0
 
@@ -291,15 +294,18 @@ def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, Floa
             world.advance()
         except ContactOverflow:
             return Outcome(OVERFLOW, world.time, np.inf, np.inf, np.inf, world.poses)
-        velocities = world.velocities
-        if not np.isfinite(velocities).all():
-            return Outcome("the simulation diverged", world.time, np.inf, np.inf, np.inf, velocities)
         poses = world.poses
+        if not np.isfinite(poses).all() or not np.isfinite(world.velocities).all():
+            return Outcome("the simulation diverged", world.time, np.inf, np.inf, np.inf, poses)
         past.append(poses)
-        speed, spin = np.linalg.norm(velocities, axis=2).max(axis=0).tolist()
+        before = min(mean_frames, len(past) - 1)
+        if before:
+            speed, spin = _mean_speeds(past[-1 - before], poses, centres, before * world.interval)
+        else:
+            speed = spin = np.inf
         if speed >= QUIET_SPEED or spin >= QUIET_SPIN:
             moved_at = world.time
-        positions = np.einsum("nij,nj->ni", poses[:, :3, :3], centres) + poses[:, :3, 3]
+        positions = _positions(poses, centres)
         outside = ((positions < bounds[0]) | (positions > bounds[1])).any(axis=1)
         if outside.any():
             return end(f"{int(outside.sum())} left the enclosure")
@@ -308,6 +314,17 @@ def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, Floa
             return end("")
         if world.time >= max_time:
             return end(f"not at rest within {max_time:g} s")
+
+
+def _positions(poses: FloatArray, points: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3])
+
+
+def _mean_speeds(before: FloatArray, after: FloatArray, centres: FloatArray, seconds: float) -> tuple[float, float]:
+    """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
+    way = np.linalg.norm(_positions(after, centres) - _positions(before, centres), axis=1)
+    turn = Rotation.from_matrix(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)).magnitude()
+    return float(way.max()) / seconds, float(turn.max()) / seconds
 
 
 def _array(values: Any) -> FloatArray:

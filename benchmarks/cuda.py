@@ -45,24 +45,28 @@ def time_ours(splats: Splats) -> None:
     from mitsplat.plugins.gaussian import upload_cloud
     from mitsplat.plugins.march import march
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.plugins.tiles import Placement, bin_gaussians, merge_clouds
+    from mitsplat.plugins.tiles import Placement, TileLists, bin_gaussians, merge_clouds
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
-    view = view_of(make_sensor(CAMERA))
+    camera = view_of(make_sensor(CAMERA))
     placements = [Placement(0, np.eye(4), 1)]
     for name in ("fast", "balanced"):
         quality = resolve_quality(name)
-        options = {"alpha_min": quality.alpha_min, "sh_degree": quality.sh_degree}
-        lists = bin_gaussians(clouds, placements, view, **options)
+        view = camera.sampled(quality.samples)
 
-        def run_march(lists=lists, quality=quality) -> None:
+        def run_bin(view=view, quality=quality) -> TileLists:
+            return bin_gaussians(clouds, placements, view, quality)
+
+        lists = run_bin()
+
+        def run_march(lists=lists, view=view, quality=quality) -> None:
             image = march(lists, view, quality)
             dr.eval(image.rgb, image.alpha)
 
-        def run_all(quality=quality, options=options) -> None:
-            run_march(bin_gaussians(clouds, placements, view, **options), quality)
+        def run_all(run_bin=run_bin, run_march=run_march) -> None:
+            run_march(run_bin())
 
-        binning = median_ms(lambda options=options: bin_gaussians(clouds, placements, view, **options), dr.sync_thread)
+        binning = median_ms(run_bin, dr.sync_thread)
         marching, whole = median_ms(run_march, dr.sync_thread), median_ms(run_all, dr.sync_thread)
         print(f"mitsplat {name}: whole {whole:.2f} ms (project, bin, sort {binning:.2f}, march {marching:.2f}), "
               f"{lists.visible} visible, {lists.pairs} pairs")  # fmt: skip

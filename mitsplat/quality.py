@@ -13,8 +13,8 @@ class Quality:
     """What the renderer computes for one ray; every field that is cheaper is also less exact.
 
     Attributes:
-        order: Gaussians of a pixel are blended in the order of their centres' depth, sorted per tile (``tile``), or
-            in the order of their peaks along the ray itself, sorted per ray (``ray``).
+        order: Gaussians are blended in the order of their peaks along one ray of every 4 x 4 tile of pixels (``tile``),
+            or along the pixel's own ray (``ray``).
         alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
         transmittance_min: A ray ends when less than this share of the light behind would still be seen.
         sh_degree: Highest spherical-harmonic band that is evaluated.
@@ -41,8 +41,8 @@ class Quality:
 
 
 PRESETS: dict[str, Quality] = {
-    "fast": Quality(transmittance_min=1e-2, sh_degree=2),
-    "balanced": Quality(),
+    "fast": Quality(alpha_min=2e-3, transmittance_min=1e-2, sh_degree=2),
+    "balanced": Quality(order="ray", alpha_min=1e-3),
     "exact": Quality(order="ray", alpha_min=1e-5, transmittance_min=1e-6),
 }
 

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
-from mitsplat.plugins.march import PIXELS_PER_LANE, Lanes, march
+from mitsplat.plugins.march import Lanes, march
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
 from mitsplat.quality import Quality
@@ -44,7 +44,7 @@ def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[l
         raise ValueError("gradients need quality.order 'tile' and one sample per pixel")
     clouds = CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
     eye = Placement(0, _IDENTITY, 1)
-    lists = bin_gaussians(clouds, [eye], view, alpha_min=quality.alpha_min, sh_degree=quality.sh_degree)
+    lists = bin_gaussians(clouds, [eye], view, quality)
     # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
     *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
     return rgb, alpha
@@ -104,7 +104,7 @@ class _March(dr.CustomOp):
 
 def march_backward(lists: TileLists, view: View, quality: Quality, image: Any, gradient: list[Any]) -> Any:
     """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha."""
-    lanes = Lanes(lists, view, PIXELS_PER_LANE)
+    lanes = Lanes(lists, view)
     us, vs = lanes.slopes(0.5, 0.5)
     result = dr.zeros(mi.Float, RECORD * max(1, lists.visible))
     if lists.pairs == 0:

@@ -1,6 +1,6 @@
 """The march: every ray walks its tile's list front to back and blends what it meets.
 
-One lane carries a column of pixels of one tile, because fetching a record costs several times more than evaluating it
+One lane carries a column of one tile's pixels, because fetching a record costs several times more than evaluating it
 for a packet of rays: the more pixels share a fetch, the better, until registers run out.
 """
 
@@ -17,11 +17,8 @@ from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists
 from mitsplat.quality import Quality
 
-PIXELS_PER_LANE = 8
-"""Pixels of one column that a lane carries, a divisor of the tile's edge."""
-
 SORT_SLOTS = 8
-"""Gaussians that the per-ray order collects in one walk over a list."""
+"""Gaussians that the per-ray order collects in one walk over a part of a list."""
 
 
 @dataclass(eq=False)
@@ -120,7 +117,7 @@ def _respond(record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared
 
 
 class Lanes:
-    """Which pixels each lane carries: a column of one tile, so that a packet of lanes is a whole tile.
+    """Which pixels each lane carries: one column of a tile.
 
     Attributes:
         pixel: Number of each of the lane's pixels, row-major.
@@ -128,22 +125,21 @@ class Lanes:
         start, stop: Range of the tile's list.
     """
 
-    def __init__(self, lists: TileLists, view: View, per_lane: int) -> None:
-        lanes_per_tile = TILE * TILE // per_lane
-        lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * lanes_per_tile)
-        within, tile = lane % lanes_per_tile, lane // lanes_per_tile
+    def __init__(self, lists: TileLists, view: View) -> None:
+        lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * TILE)
+        tile = lane // TILE
         tile_y = tile // view.tiles_x
-        self.view, self.per_lane = view, per_lane
-        self.x = (tile - tile_y * view.tiles_x) * TILE + within % TILE
-        self.y = tile_y * TILE + within // TILE * per_lane
-        self.pixel = [(self.y + k) * view.width + self.x for k in range(per_lane)]
-        self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(per_lane)]
+        self.view = view
+        self.x = (tile - tile_y * view.tiles_x) * TILE + lane % TILE
+        self.y = tile_y * TILE
+        self.pixel = [(self.y + k) * view.width + self.x for k in range(TILE)]
+        self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(TILE)]
         self.start = dr.gather(mi.UInt32, lists.start, tile)
         self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, tile), self.start)
 
     def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
         """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
-        pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(self.per_lane)]
+        pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(TILE)]
         return [u for u, _ in pairs], [v for _, v in pairs]
 
 
@@ -157,7 +153,7 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
     """
     n = view.samples
-    lanes = Lanes(lists, view, PIXELS_PER_LANE if quality.order == "tile" else 1)
+    lanes = Lanes(lists, view)
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
         for p, m in zip(lanes.pixel, lanes.inside, strict=True)
@@ -207,7 +203,7 @@ def _walk_in_tile_order(
     cut: Any,
     end: Any,
 ) -> list[Pixel]:
-    """Blend in the order of the tile's list: by depth of the Gaussians' centres."""
+    """Blend in the order of the tile's list: that of the peaks along one of its rays."""
     near = view.near_plane
     shared_column = not view.distortion
 
@@ -248,49 +244,96 @@ def _walk_in_ray_order(
 ) -> list[Pixel]:
     """Blend in the exact order of the peaks along each ray.
 
-    Every walk over the list collects the next :data:`SORT_SLOTS` peaks behind the last one blended, so any number of
-    Gaussians in any order comes out right; equal depths keep the list's order.
+    Every walk collects the next :data:`SORT_SLOTS` peaks behind the last one blended. It ends where no later entry can
+    have a peak in front of those, and the next one begins at the first entry that found no slot: a walk sees a short
+    part of the list, and any number of Gaussians in any order comes out right. Equal depths keep the list's order.
     """
     near, shared_column = view.near_plane, not view.distortion
     width = dr.width(start)
+    none = 0xFFFFFFFF
 
-    def fetch(number: Any, active: Any) -> Any:
-        return dr.gather(mi.ArrayXf, lists.records, number, active, shape=(RECORD, width))
+    def insert(slots: _Slots, left: Any, z: Any, alpha: Any, i: Any) -> tuple[_Slots, Any]:
+        """Slots in order of depth with one more peak, and the first entry that was left without."""
+        result: _Slots = []
+        behind = mi.Bool(False)
+        for slot_z, slot_alpha, slot_i in slots:
+            # Whatever lies behind the new peak moves on by one, also among equals: they keep their order.
+            behind |= z < slot_z
+            result.append((dr.minimum(z, slot_z), dr.select(behind, alpha, slot_alpha), dr.select(behind, i, slot_i)))
+            z, alpha, i = dr.maximum(z, slot_z), dr.select(behind, slot_alpha, alpha), dr.select(behind, slot_i, i)
+        return result, dr.select(z < dr.inf, dr.minimum(left, i), left)
 
-    def collect(last_z: Any, last_i: Any, limit: Any) -> tuple[list[Any], list[Any]]:
-        def body(i: Any, zs: list[Any], entries: list[Any]) -> tuple[Any, list[Any], list[Any]]:
-            ((log_alpha, z),) = _respond(
-                fetch(dr.gather(mi.UInt32, lists.entries, i), True), lists, us, vs, shared_column
-            )
-            behind = (z > last_z) | ((z == last_z) & (i > last_i))
-            hit = (log_alpha > cut) & (z > near) & (z < far[0]) & behind
-            moving_z, moving_i = dr.select(hit, z, dr.inf), mi.UInt32(i)
-            sorted_z, sorted_i = [], []
-            for slot_z, slot_i in zip(zs, entries, strict=True):
-                first = moving_z < slot_z
-                sorted_z.append(dr.minimum(moving_z, slot_z))
-                sorted_i.append(dr.select(first, moving_i, slot_i))
-                moving_z, moving_i = dr.maximum(moving_z, slot_z), dr.select(first, slot_i, moving_i)
-            return i + 1, sorted_z, sorted_i
+    def collect(begin: Any, limit: Any, seen: Any, last: list[tuple[Any, Any]]) -> tuple[Any, list[_Slots], list[Any]]:
+        def unfilled(i: Any, slots: list[_Slots], left: list[Any]) -> Any:
+            nearest = dr.gather(mi.Float, lists.nearest, i, i < limit)
+            wanted = mi.Bool(False)
+            for own in slots:
+                wanted |= nearest <= own[-1][0]
+            return (i < limit) & wanted
 
-        empty = [mi.Float(dr.inf) for _ in range(SORT_SLOTS)], [mi.UInt32(0) for _ in range(SORT_SLOTS)]
-        _, zs, entries = dr.while_loop((mi.UInt32(start), *empty), lambda i, *_: i < limit, body, label="collect")
-        return zs, entries
+        def body(i: Any, slots: list[_Slots], left: list[Any]) -> tuple[Any, list[_Slots], list[Any]]:
+            record = dr.gather(mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, width))
+            new_slots, new_left = [], []
+            responses = _respond(record, lists, us, vs, shared_column)
+            for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
+                responses, slots, left, far, last, strict=True
+            ):
+                # An entry that no walk has seen counts wherever it lies: rounding may put it in front of its bound.
+                new = (z > last_z) | ((z == last_z) & (i > last_i)) | (i >= seen)
+                hit = (log_alpha > cut) & (z > near) & (z < z_far) & new
+                own, first_left = dr.if_stmt(
+                    (own, first_left, z, dr.exp2(log_alpha), mi.UInt32(i)),
+                    hit,
+                    insert,
+                    lambda own, first_left, *_: (own, first_left),
+                    label="insert",
+                )
+                new_slots.append(own)
+                new_left.append(first_left)
+            return i + 1, new_slots, new_left
 
-    def body(pixel: Pixel, last_z: Any, last_i: Any, active: Any) -> tuple[Pixel, Any, Any, Any]:
-        zs, entries = collect(last_z, last_i, dr.select(active, stop, start))
-        for z, i in zip(zs, entries, strict=True):
-            found = active & (z < dr.inf) & (pixel[T] > end)
-            record = fetch(dr.gather(mi.UInt32, lists.entries, i, found), found)
-            ((log_alpha, _),) = _respond(record, lists, us, vs, shared_column)
-            weight = dr.select(found, pixel[T] * dr.exp2(log_alpha), 0.0)
-            pixel = _blend(pixel, weight, pixel[T] - weight, [record[6], record[7], record[8]], z, record[15])
-        active = active & (zs[-1] < dr.inf) & (pixel[T] > end)
-        return pixel, zs[-1], entries[-1], active
+        def empty() -> _Slots:
+            return [(mi.Float(dr.inf), mi.Float(0), mi.UInt32(0)) for _ in range(SORT_SLOTS)]
 
-    state = _new_pixel(), mi.Float(-dr.inf), mi.UInt32(0), start < stop
-    pixel, *_ = dr.while_loop(state, lambda pixel, z, i, active: active, body, label="march by ray")
-    return [pixel]
+        state = mi.UInt32(begin), [empty() for _ in us], [mi.UInt32(none) for _ in us]
+        i, slots, left = dr.while_loop(state, unfilled, body, label="collect")
+        return i, slots, left
+
+    def body(
+        pixels: list[Pixel], last: list[tuple[Any, Any]], begin: Any, seen: Any, active: Any
+    ) -> tuple[list[Pixel], list[tuple[Any, Any]], Any, Any, Any]:
+        reached, slots, left = collect(begin, dr.select(active, stop, begin), seen, last)
+        blended, new_last, unfinished, next_begin = [], [], mi.Bool(False), mi.UInt32(reached)
+        for pixel, own, first_left, (last_z, last_i) in zip(pixels, slots, left, last, strict=True):
+            for z, alpha, i in own:
+                found = active & (z < dr.inf) & (pixel[T] > end)
+                number = dr.gather(mi.UInt32, lists.entries, i, found)
+                record = dr.gather(mi.ArrayXf, lists.records, number, found, shape=(RECORD, width))
+                weight = dr.select(found, pixel[T] * alpha, 0.0)
+                pixel = _blend(pixel, weight, pixel[T] - weight, [record[6], record[7], record[8]], z, record[15])
+            # A ray that has ended takes nothing more: no peak lies behind infinity.
+            open_ray = pixel[T] > end
+            z, _, i = own[-1]
+            last_i = dr.select(z < last_z, last_i, i)
+            blended.append(pixel)
+            new_last.append((dr.select(open_ray, dr.maximum(z, last_z), dr.inf), last_i))
+            next_begin = dr.select(open_ray, dr.minimum(next_begin, first_left), next_begin)
+            unfinished |= open_ray & ((first_left != none) | (reached < stop))
+        return blended, new_last, next_begin, dr.maximum(seen, reached), active & unfinished
+
+    state = (
+        [_new_pixel() for _ in us],
+        [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in us],
+        mi.UInt32(start),
+        mi.UInt32(start),
+        start < stop,
+    )
+    pixels, *_ = dr.while_loop(state, lambda *state: state[-1], body, label="march by ray")
+    return pixels
+
+
+_Slots = list[tuple[Any, Any, Any]]
+"""Peaks in order of depth: depth, opacity and entry."""
 
 
 def _collect(pixels: list[Pixel], rays: list[Any], inside: list[Any], count: int) -> Image:

@@ -194,9 +194,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             return Image.empty(view.width * view.height)
         quality = self.quality
         fine = view.sampled(quality.samples)
-        lists = bin_gaussians(
-            contents.clouds, contents.placements, fine, alpha_min=quality.alpha_min, sh_degree=quality.sh_degree
-        )
+        lists = bin_gaussians(contents.clouds, contents.placements, fine, quality)
         return march(lists, fine, quality, z_max=z_max)
 
     def _read(self, scene: Any) -> _Contents:

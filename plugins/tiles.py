@@ -2,8 +2,9 @@
 
 1. *Cull and bound* every Gaussian of every placement (one kernel): exact screen box of its cut-off ellipsoid.
 2. *Sort* the visible ones by depth; compute view records in that order (one kernel).
-3. *Pair* each with the tiles that its cut-off ellipse really meets, and sort the pairs by tile; the sort is stable, so
-   every tile's list stays in depth order.
+3. *Pair* each with the tiles that its cut-off ellipse really meets, and sort the pairs by tile and by depth there. For
+   the order per tile that is the peak's depth along the tile's ray nearest to the Gaussian's centre; for the order per
+   ray it is a lower bound over all rays of the tile, which says when a ray has seen all that can come first.
 """
 
 from __future__ import annotations
@@ -29,13 +30,14 @@ from mitsplat.plugins.gaussian import (
     rotation_axes,
 )
 from mitsplat.plugins.rays import View
+from mitsplat.quality import Quality
 
 PLACEMENT = 32
 """Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
 cloud's frame as a sum of two floats (3 + 3), padding. Two floats keep the difference exact far from the origin."""
 
-BOUNDS = 8
-"""Floats per visible Gaussian for pairing: u0, v0 and the cut-off conic about them."""
+BOUNDS = 12
+"""Floats per visible Gaussian for pairing: u0, v0, cut-off conic about them, least depth of the ellipsoid, padding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,7 @@ class TileLists:
         near: Coefficients of :func:`mitsplat.plugins.gaussian.general_response`, 16 floats each, of the Gaussians that
             reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
         entries: Record numbers, tile after tile.
+        nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
         visible, pairs: Number of records and of entries.
     """
@@ -104,23 +107,22 @@ class TileLists:
     records: Any
     near: Any | None
     entries: Any
+    nearest: Any
     start: Any
     stop: Any
     visible: int
     pairs: int
 
 
-def bin_gaussians(
-    clouds: CloudSet, placements: Sequence[Placement], view: View, *, alpha_min: float, sh_degree: int
-) -> TileLists:
-    """Tile lists of all placements seen by one camera."""
+def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality) -> TileLists:
+    """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`."""
     tiles = view.tiles_x * view.tiles_y
     table, owner, local = _placement_table(clouds, placements, view)
     total = dr.width(local)
     if total == 0:
         return _empty(tiles)
     source = _Source(clouds, table)
-    cut = dr.opaque(mi.Float, alpha_min)
+    cut = dr.opaque(mi.Float, quality.alpha_min)
 
     depth, visible = source.cull(owner, local, view, cut)
     index = dr.compress(visible)
@@ -131,15 +133,17 @@ def bin_gaussians(
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     dr.eval(owner, local)
 
-    records, near, bounds, box, candidates = source.records(owner, local, view, cut, sh_degree)
-    entries, start, stop = _pair(bounds, box, candidates, view, tiles)
-    return TileLists(records, near, entries, start, stop, count, dr.width(entries))
+    records, near, bounds, box, candidates = source.records(owner, local, view, cut, quality.sh_degree)
+    entries, nearest, start, stop = _pair(dr.detach(records), bounds, box, candidates, view, tiles, quality.order)
+    return TileLists(records, near, entries, nearest, start, stop, count, dr.width(entries))
 
 
 def _empty(tiles: int) -> TileLists:
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
-    return TileLists(dr.zeros(mi.Float, RECORD), None, dr.zeros(mi.UInt32, 1), zeros, zeros, 0, 0)
+    return TileLists(
+        dr.zeros(mi.Float, RECORD), None, dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1), zeros, zeros, 0, 0
+    )
 
 
 def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
@@ -201,7 +205,7 @@ class _Source:
         } | {"opacity": packet[3], "instance": row[10]}
 
     def bounds(self, g: dict[str, Any], view: View, cut: Any) -> tuple[Any, ...]:
-        """Response, squared cut-off, whether the plane z = 0 is near, visibility and slope box of Gaussians."""
+        """Response, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth."""
         shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
         k2 = 2 * dr.log(g["opacity"] / cut)
         k = dr.safe_sqrt(k2)
@@ -233,11 +237,11 @@ class _Source:
             dr.select(near, near_v1, response.v0 + dv1),
         )
         visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
-        return response, k2, near, visible, box
+        return response, k2, near, visible, box, centre[2] - reach[2]
 
     def cull(self, owner: Any, local: Any, view: View, cut: Any) -> tuple[Any, Any]:
         g = self.load(owner, local)
-        response, _, _, visible, box = self.bounds(g, view, cut)
+        response, _, _, visible, box, _ = self.bounds(g, view, cut)
         x0, x1, y0, y1 = view.tile_box(*box)
         visible &= (x1 > x0) & (y1 > y0)
         depth, visible = dr.detach(response.depth), dr.detach(visible)
@@ -249,7 +253,7 @@ class _Source:
     def records(self, owner: Any, local: Any, view: View, cut: Any, sh_degree: int) -> tuple[Any, ...]:
         count = dr.width(local)
         g = self.load(owner, local)
-        response, k2, near, _, box = self.bounds(g, view, cut)
+        response, k2, near, _, box, least = self.bounds(g, view, cut)
         colour = self.colour(g["mean"], local, sh_degree)
         order = dr.arange(mi.UInt32, count)
         near_rows = None
@@ -282,7 +286,7 @@ class _Source:
         ]
         records, bounds = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, BOUNDS * count)
         dr.scatter(records, mi.ArrayXf(record), order)
-        dr.scatter(bounds, mi.ArrayXf([dr.detach(v) for v in (u0, v0, *conic)]), order)
+        dr.scatter(bounds, mi.ArrayXf([dr.detach(v) for v in (u0, v0, *conic, least, *[mi.Float(0)] * 3)]), order)
         x0, x1, y0, y1 = view.tile_box(*(dr.detach(side) for side in box))
         candidates = (x1 - x0) * (y1 - y0)
         tile_box = dr.empty(mi.UInt32, 4 * count)
@@ -321,8 +325,10 @@ class _Source:
         return evaluate_sh(direction, coefficient, bands)
 
 
-def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tuple[Any, Any, Any]:
-    """Sorted (tile, Gaussian) pairs: record number per entry, and each tile's range."""
+def _pair(
+    records: Any, bounds: Any, box: Any, candidates: Any, view: View, tiles: int, order: str
+) -> tuple[Any, Any, Any, Any]:
+    """Sorted (tile, Gaussian) pairs: record number and least depth per entry, and each tile's range."""
     count = dr.width(candidates)
     offset = dr.prefix_sum(candidates)
     total = int((dr.gather(mi.UInt32, offset, count - 1) + dr.gather(mi.UInt32, candidates, count - 1))[0])
@@ -334,7 +340,7 @@ def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tup
     # Lanes past the end of the arrays compute too, on zeros: an integer division by zero would end the process.
     row = cell // dr.maximum(width, 1)
     tile = (y0 + row) * view.tiles_x + x0 + (cell - row * width)
-    u0, v0, *conic = dr.gather(mi.ArrayXf, bounds, rank, shape=(BOUNDS, total))
+    u0, v0, *conic, _, _, _, _ = dr.gather(mi.ArrayXf, bounds, rank, shape=(BOUNDS, total))
     lo_u, hi_u, lo_v, hi_v = view.tile_slopes(tile)
     meets = conic_touches_rectangle(tuple(conic), lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
     dr.eval(tile, rank, meets)
@@ -343,12 +349,21 @@ def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tup
     start, stop = dr.zeros(mi.UInt32, tiles), dr.zeros(mi.UInt32, tiles)
     if pairs == 0:
         dr.eval(start, stop)
-        return dr.zeros(mi.UInt32, 1), start, stop
+        return dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1), start, stop
     tile, rank = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, rank, kept)
-    dr.eval(tile, rank)
-    order = dr.argsort(tile)
-    tile, entries = dr.gather(mi.UInt32, tile, order), dr.gather(mi.UInt32, rank, order)
-    dr.eval(tile, entries)
+    record = dr.gather(mi.ArrayXf, records, rank, shape=(RECORD, pairs))
+    if order == "ray":
+        ellipsoid = dr.gather(mi.Float, bounds, rank * BOUNDS + 8)
+        depth = _least_depth(record, ellipsoid, view.tile_slopes(tile))
+    else:
+        depth = _depth_near_centre(record, view.tile_slopes(tile))
+    dr.eval(tile, rank, depth)
+    by_depth = dr.argsort(depth)
+    by_tile = dr.argsort(dr.gather(mi.UInt32, tile, by_depth))
+    sorted_pairs = dr.gather(mi.UInt32, by_depth, by_tile)
+    tile, entries = dr.gather(mi.UInt32, tile, sorted_pairs), dr.gather(mi.UInt32, rank, sorted_pairs)
+    depth = dr.gather(mi.Float, depth, sorted_pairs)
+    dr.eval(tile, entries, depth)
     i = dr.arange(mi.UInt32, pairs)
     last = dr.opaque(mi.UInt32, pairs - 1)
     first_of_tile = (i == 0) | (tile != dr.gather(mi.UInt32, tile, dr.maximum(i, 1) - 1))
@@ -356,4 +371,35 @@ def _pair(bounds: Any, box: Any, candidates: Any, view: View, tiles: int) -> tup
     dr.scatter(start, i, tile, first_of_tile)
     dr.scatter(stop, i + 1, tile, last_of_tile)
     dr.eval(start, stop)
-    return entries, start, stop
+    return entries, depth, start, stop
+
+
+def _depth_near_centre(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
+    """Depth of a Gaussian's peak along that ray of a tile which passes its centre most closely."""
+    lo_u, hi_u, lo_v, hi_v = slopes
+    du, dv = dr.clip(record[0], lo_u, hi_u) - record[0], dr.clip(record[1], lo_v, hi_v) - record[1]
+    top, bottom = _depth_fraction(record, du, dv)
+    return dr.select(record[2] < 0, 0, record[9] * dr.maximum(top, 0) / bottom)
+
+
+def _least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
+    """Lower bound of the depth of a Gaussian's peak along any ray of a tile.
+
+    The numerator of the depth is linear and the denominator convex in the slopes: both are bounded at the corners. Nor
+    can the peak lie in front of the cut-off ellipsoid.
+    """
+    lo_u, hi_u, lo_v, hi_v = slopes
+    least, largest = mi.Float(dr.inf), mi.Float(0)
+    for u in (lo_u, hi_u):
+        for v in (lo_v, hi_v):
+            top, bottom = _depth_fraction(record, u - record[0], v - record[1])
+            least, largest = dr.minimum(least, top), dr.maximum(largest, bottom)
+    bound = dr.maximum(record[9] * dr.maximum(least, 0) / largest, ellipsoid)
+    return dr.select(record[2] < 0, 0, dr.maximum(bound, 0))
+
+
+def _depth_fraction(record: Any, du: Any, dv: Any) -> tuple[Any, Any]:
+    """Numerator and denominator of the depth of a peak, relative to the depth of the centre."""
+    _, _, _, _, _, _, _, _, _, _, e, f, g, h, i, _ = record
+    top = dr.fma(0.5, dr.fma(du, e, dv * f), 1)
+    return top, dr.fma(dv, dr.fma(dv, i, dr.fma(du, h, f)), dr.fma(du, dr.fma(du, g, e), 1))

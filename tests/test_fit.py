@@ -9,7 +9,7 @@ import pytest
 from test_render import make_splats
 
 from mitsplat.camera import Camera
-from mitsplat.fit import FitSettings, Picture, fit_splats
+from mitsplat.fit import QUALITY, FitSettings, Picture, fit_splats
 from mitsplat.render import render_splats
 from mitsplat.splats import Splats
 
@@ -25,7 +25,7 @@ def cameras(count: int) -> list[Camera]:
 
 
 def picture(splats: Splats, camera: Camera) -> Picture:
-    layers = render_splats(splats, camera)
+    layers = render_splats(splats, camera, quality=QUALITY)
     alpha = layers.alpha[..., None]
     colour = np.clip(encode(layers.rgb / np.maximum(alpha, 1e-6)), 0, None) * alpha
     return Picture(camera, colour.astype(np.float32), layers.alpha)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -16,7 +19,9 @@ from mitsplat.errors import InputError
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.render import Layers, render_splats
 from mitsplat.splats import SH_C0, Splats
+from mitsplat.trace import encode_srgb
 
+CAPTURES = Path(__file__).parents[2] / "shared/data/splats"
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=50)
 
 
@@ -102,6 +107,15 @@ def test_coincident_layers_multiply(count: int, order: str) -> None:
     assert alpha[12, 16] == pytest.approx(1 - 0.99**count, abs=1e-4)
 
 
+def test_equal_depths_keep_their_order_when_others_come_between() -> None:
+    """More coincident layers than one walk can hold, and small Gaussians in front that the walk meets after them."""
+    layers = one((0.5, 0.5, 0.5), opacity=0.2, count=24)
+    layers = replace(layers, sh=np.random.default_rng(3).uniform(-1, 1, layers.sh.shape))
+    front = [one((0.02, 0.02, 0.02), mean=(0.0, 0.0, -0.1 - 0.02 * i), opacity=0.1) for i in range(5)]
+    splats = Splats.concatenate([layers, *front])
+    assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
 @pytest.mark.parametrize("offset", [(0, 0, 0.0), (0, 0, 0.1), (0.05, 0.02, -0.05), (0.0, 0.1, 0.0)])
 def test_camera_inside_a_gaussian_follows_the_twin(offset: tuple[float, float, float]) -> None:
     mean = np.array([0.0, 0.0, -2.0]) + offset
@@ -169,10 +183,12 @@ def test_opaque_gaussian_hides_what_is_behind() -> None:
     assert both.depth[12, 16] == pytest.approx(1.5, abs=1e-3)
 
 
-def test_opacity_at_the_cut_off_and_below_is_not_seen() -> None:
-    faint = one((0.3, 0.3, 0.3), opacity=1 / 255)
-    assert render_splats(faint, CAMERA).alpha.max() <= 1 / 255 + 1e-6
-    assert render_splats(one((0.3, 0.3, 0.3), opacity=0.9 / 255), CAMERA).alpha.max() == 0.0
+@pytest.mark.parametrize("preset", PRESETS)
+def test_opacity_at_the_cut_off_and_below_is_not_seen(preset: str) -> None:
+    cut = PRESETS[preset].alpha_min
+    assert render_splats(one((0.3, 0.3, 0.3), opacity=cut), CAMERA, quality=preset).alpha.max() <= cut * (1 + 1e-5)
+    assert render_splats(one((0.3, 0.3, 0.3), opacity=0.9 * cut), CAMERA, quality=preset).alpha.max() == 0.0
+    assert render_splats(one((0.3, 0.3, 0.3), opacity=1.1 * cut), CAMERA, quality=preset).alpha.max() > cut
 
 
 @pytest.mark.parametrize("size", [(1, 1), (401, 3), (9, 17)])
@@ -254,3 +270,25 @@ def test_unknown_quality_is_refused() -> None:
         render_splats(make_splats(1), CAMERA, quality="best")
     assert set(PRESETS) == {"fast", "balanced", "exact"}
     assert tone_curve("neutral")[0] == 0
+
+
+@pytest.mark.parametrize("name", ["plant", "academic_tarot_cards"])
+def test_presets_come_close_to_the_exact_one_on_captures(name: str) -> None:
+    file = CAPTURES / f"{name}.splat"
+    if not file.exists():
+        pytest.skip(f"no capture {file}")
+    splats = Splats.load(file)
+    centre = np.median(splats.means, axis=0)
+    size = np.percentile(np.linalg.norm(splats.means - centre, axis=1), 80)
+    eye = centre + 1.5 * size * np.array([0.3, -0.7, -1.2])
+    camera = Camera.look_at(eye, centre, up=(0, -1, 0), width=640, height=480, fov_x=50)
+
+    def shown(quality: str) -> np.ndarray:
+        """Display-encoded colour over black, as captures are compared."""
+        layers = render_splats(splats, camera, quality=quality)
+        return encode_srgb(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
+
+    exact = shown("exact")
+    assert exact.max() > 0.5
+    for quality, least in (("fast", 40), ("balanced", 50)):
+        assert -10 * np.log10(np.mean((shown(quality) - exact) ** 2)) >= least

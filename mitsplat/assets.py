@@ -14,7 +14,7 @@ A folder holds ``asset.yaml`` (:class:`AssetSpec` lists its keys) and the files 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -80,6 +80,9 @@ class AssetSpec(BaseModel):
     roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of the highlight.")
     specular: float = Field(0.04, ge=0, le=1, description="Specular reflectance at normal incidence.")
     capture_light: Literal["uniform", "scene"] = "uniform"
+    keypoints: dict[str, tuple[float, float, float]] | None = Field(
+        None, description="Named points in the units and axes of the files, for pose labels."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> AssetSpec:
@@ -110,6 +113,7 @@ class Asset:
         specular: Specular reflectance at normal incidence in [0, 1]; 0 turns the highlight off.
         capture_light: Light under which the colours were captured: ``uniform`` (a light tent, a turntable in the
             shade) is relit by the scene's lights, ``scene`` (already lit as it will be shown) is only shadowed.
+        keypoints: Named points in the asset's frame [m], for pose labels.
         folder: Where it was read from, or None.
     """
 
@@ -125,6 +129,7 @@ class Asset:
     roughness: float = 0.4
     specular: float = 0.04
     capture_light: Literal["uniform", "scene"] = "uniform"
+    keypoints: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     folder: Path | None = field(default=None, repr=False)
 
     @classmethod
@@ -156,6 +161,7 @@ class Asset:
             roughness=spec.roughness,
             specular=spec.specular,
             capture_light=spec.capture_light,
+            keypoints=spec.keypoints or {},
             folder=folder,
         )
         metres_from_file = np.eye(4)
@@ -174,6 +180,7 @@ class Asset:
         """
         folder = Path(folder)
         units = _SPZ_UNITS if splats.lower().endswith(".spz") else 1.0
+        stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
         try:
             spec = AssetSpec(
                 name=self.name,
@@ -189,12 +196,12 @@ class Asset:
                 roughness=self.roughness,
                 specular=self.specular,
                 capture_light=self.capture_light,
+                keypoints=dict(stored.keypoints) or None,
             )
         except ValidationError as error:
             first = error.errors()[0]
             rule = ": ".join([*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")])
             raise InputError(f"asset {self.name!r} cannot be saved: {rule}") from error
-        stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
         try:
             folder.mkdir(parents=True, exist_ok=True)
             stored.splats.save(folder / splats)
@@ -219,7 +226,19 @@ class Asset:
             splats=self.splats.transformed(matrix),
             mesh=None if self.mesh is None else self.mesh.copy().apply_transform(matrix),
             pieces=tuple(piece.copy().apply_transform(matrix) for piece in self.pieces),
+            keypoints=dict(
+                zip(
+                    self.keypoints,
+                    map(tuple, (self.keypoint_array @ matrix[:3, :3].T + matrix[:3, 3]).tolist()),
+                    strict=True,
+                )
+            ),
         )
+
+    @property
+    def keypoint_array(self) -> npt.NDArray[np.float64]:
+        """The keypoints' positions in their order [m], shape (K, 3)."""
+        return np.array(list(self.keypoints.values()), dtype=np.float64).reshape(-1, 3)
 
     def scaled(self, factor: float) -> Asset:
         """The asset made larger about its origin, of the same density: a given mass grows with the volume.

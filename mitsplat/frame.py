@@ -18,9 +18,16 @@ from mitsplat.assets import Asset
 from mitsplat.cad import emitter_dict
 from mitsplat.camera import Camera
 from mitsplat.composite import develop, light_image
-from mitsplat.label import Labels, label_instances
+from mitsplat.label import LabelRules, Labels, Truth, label_instances
 from mitsplat.quality import Quality
-from mitsplat.render import Layers, ensure_variant, make_integrator, make_splats_shape, render_layers
+from mitsplat.render import (
+    Layers,
+    ensure_variant,
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_silhouettes,
+)
 from mitsplat.scene import FramePlan, Scene, layout_of, plan_frame
 from mitsplat.settle import Layout, settle_layout
 from mitsplat.spec import LightSpec
@@ -102,14 +109,19 @@ def render_frame(
     with _timed(seconds, "composite"):
         rgb = light_image(layers, scene.spec.composite)
         image = develop(rgb, plan.draws, tone=scene.spec.composite.tone, seed=plan.seed)
+    rules = scene.spec.labels
+    with _timed(seconds, "silhouettes"):
+        silhouettes = render_silhouettes(stage.integrator, mitsuba_scene, plan.camera, source=rules.source)
     with _timed(seconds, "label"):
-        output = scene.spec.output
+        maps = [(layers.instance, layers.depth), (layers.proxy_instance, layers.proxy_depth)]
+        (ids, depth), (second, _) = maps if rules.source == "splats" else reversed(maps)
         labels = label_instances(
-            layers.instance,
+            Truth(ids, second, silhouettes, depth),
             layout.instances,
             scene.class_names,
-            min_pixels=output.min_pixels,
-            min_fragment=output.min_fragment,
+            LabelRules(**rules.model_dump(exclude={"source"})),
+            camera=plan.camera,
+            keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
         )
     return _frame(index, plan, layout, image, rgb, layers, labels, seconds)
 

@@ -1,37 +1,130 @@
-"""Labels of a frame: exclusive masks, boxes and outlines of the instances that can be seen.
+"""Labels of a frame: exclusive masks, boxes, outlines and poses of the instances that can be seen, and their audit.
 
-Every label derives from the integer id map of the frame, so masks are exclusive and respect occlusion. Two rules, in
-this order, decide what is too small to be labelled; what they drop is counted and never silent:
+Every label derives from the integer id map of the frame, so masks are exclusive and respect occlusion. These rules, in
+this order, decide what is labelled; what they drop or mark is counted and never silent:
 
 1. a connected part (8-connectivity) of fewer than ``min_fragment`` pixels is removed from its instance;
-2. an instance left with fewer than ``min_pixels`` pixels is dropped whole.
+2. an instance left with fewer than ``min_pixels`` pixels is dropped;
+3. an instance of which less than ``min_visible`` is visible is ``occluded``, and one whose splats and proxy agree by
+   less than ``min_agreement`` is ``disagreeing``; both are dropped or only marked, as ``below_threshold`` says.
+
+What an instance would cover if it were alone, by the same rule for a pixel and after rule 1, is its *silhouette*. Its
+visible fraction is exact: visible pixels over the silhouette's pixels in the image, no depth tolerance involved. Its
+truncation is the share of the silhouette beyond the image's border.
 
 Positions are in pixels with the image's corner at (0, 0), so pixel centres are at +0.5 and a box is half-open.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
 from scipy import ndimage
-from scipy.sparse import coo_array, csgraph
+
+from mitsplat.outline import fill_polygon, outline
 
 if TYPE_CHECKING:
+    from mitsplat.camera import Camera
     from mitsplat.settle import Instance
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
+Box = tuple[int, int, int, int]
+"""Bounds (x0, y0, x1, y1) [px], half-open."""
 
-_LEAN = 0.02
-"""How far from a pixel's edge the outline's outermost vertices stay [px], so that they truncate to that pixel."""
+BOUNDARY_TOLERANCE = 2
+"""Distance within which two boundaries count as the same [px]."""
+
+KEYPOINT_TOLERANCE = 0.005
+"""How far behind the surface that is seen a keypoint may lie and still count as visible, as a share of its depth."""
+
+UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
+"""Visibility of a keypoint, as in COCO: outside the image, behind something, seen."""
+
+
+@dataclass(frozen=True)
+class LabelRules:
+    """Thresholds of the rules above.
+
+    Attributes:
+        min_pixels: Fewest visible pixels of a labelled instance.
+        min_fragment: Fewest pixels of a connected part.
+        min_visible: Smallest visible fraction.
+        min_agreement: Smallest IoU of the instance's masks by splats and by proxies.
+        below_threshold: What happens to instances below one of the last two.
+    """
+
+    min_pixels: int = 16
+    min_fragment: int = 8
+    min_visible: float = 0.0
+    min_agreement: float = 0.0
+    below_threshold: Literal["drop", "mark"] = "mark"
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """The pixels that an instance covers when it is alone; they may lie outside the image.
+
+    Attributes:
+        box: Bounds of the mask.
+        mask: Covered pixels inside the box, shape (y1 - y0, x1 - x0).
+    """
+
+    box: Box
+    mask: BoolArray
+
+    @classmethod
+    def cropped(cls, mask: BoolArray, x: int, y: int) -> Silhouette:
+        """The silhouette of a mask with at least one pixel whose first pixel is at (x, y)."""
+        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
+        return cls((x + x0, y + y0, x + x1, y + y1), np.ascontiguousarray(mask[y0:y1, x0:x1]))
+
+    @cached_property
+    def area(self) -> int:
+        """Pixels."""
+        return int(np.count_nonzero(self.mask))
+
+    def inside(self, width: int, height: int) -> Silhouette | None:
+        """The part in an image, or None."""
+        x0, y0, x1, y1 = self.box
+        left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
+        if left >= right or top >= bottom:
+            return None
+        part = self.mask[top - y0 : bottom - y0, left - x0 : right - x0]
+        return Silhouette.cropped(part, left, top) if part.any() else None
+
+    def whole(self, width: int, height: int) -> BoolArray:
+        """The mask in an image, shape (height, width)."""
+        canvas = np.zeros((height, width), dtype=bool)
+        if part := self.inside(width, height):
+            x0, y0, x1, y1 = part.box
+            canvas[y0:y1, x0:x1] = part.mask
+        return canvas
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a rendered frame says about its instances, 0 = no instance in the maps.
+
+    Attributes:
+        instance: Ids that labels derive from, (H, W) integers.
+        second: Ids by the other source: proxies where the labels are the splats', (H, W) integers.
+        silhouettes: Every instance alone, by id and by the labels' source; an instance without pixels is absent.
+        depth: Depth along the optical axis of what is seen [m], (H, W), to tell hidden keypoints.
+    """
+
+    instance: npt.NDArray[np.integer[Any]]
+    second: npt.NDArray[np.integer[Any]]
+    silhouettes: Mapping[int, Silhouette]
+    depth: npt.NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,30 +133,55 @@ class InstanceLabel:
 
     Attributes:
         id: Value of the instance in the id map, from 1.
+        asset: Position among the scene's assets.
         class_index: Position of ``class_name`` among the scene's classes.
         class_name: Class that detectors learn.
-        box: Bounds ``(x0, y0, x1, y1)`` of the mask [px], half-open.
+        box: Bounds of the mask [px].
         mask: Visible pixels inside the box, shape (y1 - y0, x1 - x0).
-        truncated: Whether the mask touches the image's border.
+        amodal: The silhouette's part in the image, hidden pixels included.
+        silhouette_box: Bounds of the silhouette, beyond the image's border too [px].
+        silhouette_area: Its pixels.
+        agreement: IoU of the instance's masks by splats and by proxies.
+        boundary_f1: F1 score of their boundaries, see :func:`boundary_f1`.
         world_from_object: Rigid transform of the asset's coordinates to the world's [m], shape (4, 4).
+        keypoints: Position [px] and visibility of the asset's named points, shape (K, 3): :data:`VISIBLE`,
+            :data:`HIDDEN`, or :data:`UNLABELLED` at (0, 0).
+        marks: ``occluded`` and ``disagreeing``, as they apply.
     """
 
     id: int
+    asset: int
     class_index: int
     class_name: str
-    box: tuple[int, int, int, int]
+    box: Box
     mask: BoolArray
-    truncated: bool
+    amodal: Silhouette
+    silhouette_box: Box
+    silhouette_area: int
+    agreement: float
+    boundary_f1: float
     world_from_object: FloatArray
+    keypoints: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    marks: tuple[str, ...] = ()
 
     @cached_property
     def area(self) -> int:
         """Visible pixels."""
         return int(np.count_nonzero(self.mask))
 
+    @property
+    def visible_fraction(self) -> float:
+        """Visible pixels over those that the instance would have in the image if it were alone."""
+        return self.area / self.amodal.area
+
+    @property
+    def truncation(self) -> float:
+        """Share of the silhouette that the image's border cuts off."""
+        return 1 - self.amodal.area / self.silhouette_area
+
     @cached_property
     def polygon(self) -> FloatArray:
-        """The mask as one closed polygon [px], see :func:`outline`, shape (M, 2)."""
+        """The mask as one closed polygon [px], see :func:`mitsplat.outline.outline`, shape (M, 2)."""
         return outline(self.mask) + self.box[:2]
 
     @cached_property
@@ -81,8 +199,8 @@ class Labels:
     Attributes:
         width, height: Size of the image [px].
         instances: Labelled instances by ascending id.
-        dropped: Counts by reason: ``fragments`` removed by rule 1, instances too ``small`` by rule 2, and instances
-            ``hidden`` entirely or outside the image.
+        dropped: Counts by reason: ``fragments`` removed by rule 1; instances too ``small`` by rule 2, ``occluded`` or
+            ``disagreeing`` by rule 3 (the first that applies), ``hidden`` entirely, or ``outside`` the image.
     """
 
     width: int
@@ -92,19 +210,31 @@ class Labels:
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as JSON values; masks are COCO run-length codes over the whole image."""
+        size = self.width, self.height
         return {
-            "size": [self.width, self.height],
+            "size": list(size),
             "instances": [
                 {
                     "id": label.id,
+                    "asset": label.asset,
                     "class_index": label.class_index,
                     "class": label.class_name,
                     "box": list(label.box),
                     "area": label.area,
-                    "truncated": label.truncated,
+                    "amodal_box": list(label.amodal.box),
+                    "amodal_area": label.amodal.area,
+                    "silhouette_box": list(label.silhouette_box),
+                    "silhouette_area": label.silhouette_area,
+                    "visible_fraction": round(label.visible_fraction, 6),
+                    "truncation": round(label.truncation, 6),
                     "polygon_iou": round(label.polygon_iou, 6),
+                    "agreement": round(label.agreement, 6),
+                    "boundary_f1": round(label.boundary_f1, 6),
+                    "marks": list(label.marks),
+                    "keypoints": label.keypoints.round(3).tolist(),
                     "world_from_object": label.world_from_object.tolist(),
-                    "rle": self._encode(label),
+                    "rle": encode_mask(label.mask, label.box, size),
+                    "amodal_rle": encode_mask(label.amodal.mask, label.amodal.box, size),
                 }
                 for label in self.instances
             ],
@@ -115,115 +245,204 @@ class Labels:
     def from_json(cls, record: dict[str, Any]) -> Labels:
         """Inverse of :meth:`to_json`."""
         width, height = record["size"]
+
+        def decode(code: str, box: list[int]) -> BoolArray:
+            x0, y0, x1, y1 = box
+            mask = coco_mask.decode({"size": [height, width], "counts": code})
+            return np.ascontiguousarray(mask[y0:y1, x0:x1], dtype=bool)
+
         instances = []
         for entry in record["instances"]:
-            x0, y0, x1, y1 = box = tuple(entry["box"])
-            mask = coco_mask.decode({"size": [height, width], "counts": entry["rle"]})
+            amodal = Silhouette(tuple(entry["amodal_box"]), decode(entry["amodal_rle"], entry["amodal_box"]))
             instances.append(
                 InstanceLabel(
                     id=entry["id"],
+                    asset=entry["asset"],
                     class_index=entry["class_index"],
                     class_name=entry["class"],
-                    box=box,
-                    mask=np.ascontiguousarray(mask[y0:y1, x0:x1], dtype=bool),
-                    truncated=entry["truncated"],
+                    box=tuple(entry["box"]),
+                    mask=decode(entry["rle"], entry["box"]),
+                    amodal=amodal,
+                    silhouette_box=tuple(entry["silhouette_box"]),
+                    silhouette_area=entry["silhouette_area"],
+                    agreement=entry["agreement"],
+                    boundary_f1=entry["boundary_f1"],
                     world_from_object=np.array(entry["world_from_object"]),
+                    keypoints=np.array(entry["keypoints"], dtype=np.float64).reshape(-1, 3),
+                    marks=tuple(entry["marks"]),
                 )
             )
         return cls(width, height, tuple(instances), dict(record["dropped"]))
 
-    def _encode(self, label: InstanceLabel) -> str:
-        x0, y0, x1, y1 = label.box
-        canvas = np.zeros((self.height, self.width), dtype=np.uint8, order="F")
-        canvas[y0:y1, x0:x1] = label.mask
-        return str(coco_mask.encode(canvas)["counts"].decode("ascii"))
+
+def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
+    """COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height)."""
+    x0, y0, x1, y1 = box
+    canvas = np.zeros((size[1], size[0]), dtype=np.uint8, order="F")
+    canvas[y0:y1, x0:x1] = mask
+    return str(coco_mask.encode(canvas)["counts"].decode("ascii"))
 
 
 def label_instances(
-    instance_map: npt.NDArray[np.integer[Any]],
+    truth: Truth,
     instances: Sequence[Instance],
     class_names: Sequence[str],
+    rules: LabelRules,
     *,
-    min_pixels: int = 16,
-    min_fragment: int = 8,
+    camera: Camera | None = None,
+    keypoints: Mapping[int, FloatArray] | None = None,
 ) -> Labels:
-    """Labels of the ``instances`` seen in an id map of shape (H, W), 0 = no instance.
+    """Labels of the ``instances`` that a frame shows.
+
+    Args:
+        truth: The frame's maps, all of the same shape (H, W).
+        instances: Everything that was placed.
+        class_names: Names by class index.
+        rules: What is dropped or marked.
+        camera: Needed for keypoints.
+        keypoints: Points of each asset that has any, by its position, in its own coordinates [m], shape (K, 3).
 
     Raises:
-        ValueError: If the map is not a 2-D integer array or holds an id of none of the instances.
+        ValueError: If a map is not a 2-D integer array, the maps differ in shape, or one holds an id of none of the
+            instances.
     """
-    if instance_map.ndim != 2 or not np.issubdtype(instance_map.dtype, np.integer):
-        raise ValueError(f"an id map must be a 2-D integer array (got {instance_map.dtype}, {instance_map.shape})")
-    height, width = instance_map.shape
-    ids = instance_map.astype(np.int32)
-    found = {i: bounds for i, bounds in enumerate(ndimage.find_objects(ids), start=1) if bounds is not None}
-    if unknown := found.keys() - {instance.id for instance in instances}:
+    for ids in (truth.instance, truth.second):
+        if ids.ndim != 2 or not np.issubdtype(ids.dtype, np.integer) or ids.shape != truth.instance.shape:
+            raise ValueError(f"id maps must be 2-D integer arrays of one shape (got {ids.dtype}, {ids.shape})")
+    height, width = truth.instance.shape
+    ids, second = truth.instance.astype(np.int32), truth.second.astype(np.int32)
+    found, found_second = (
+        {i: bounds for i, bounds in enumerate(ndimage.find_objects(image), start=1) if bounds is not None}
+        for image in (ids, second)
+    )
+    if unknown := (found.keys() | found_second.keys()) - {instance.id for instance in instances}:
         raise ValueError(f"the id map holds {min(unknown)}, which is the id of no instance")
 
     labels = []
-    dropped = {"fragments": 0, "small": 0, "hidden": 0}
+    dropped = dict.fromkeys(("fragments", "small", "occluded", "disagreeing", "hidden", "outside"), 0)
     for instance in sorted(instances, key=lambda instance: instance.id):
+        alone = truth.silhouettes.get(instance.id)
         if instance.id not in found:
-            dropped["hidden"] += 1
+            dropped["outside" if alone is None or alone.inside(width, height) is None else "hidden"] += 1
             continue
         rows, columns = found[instance.id]
-        mask, fragments = _without_fragments(ids[rows, columns] == instance.id, min_fragment)
+        mask, fragments = _without_fragments(ids[rows, columns] == instance.id, rules.min_fragment)
         dropped["fragments"] += fragments
-        if np.count_nonzero(mask) < min_pixels:
+        if np.count_nonzero(mask) < rules.min_pixels:
             dropped["small"] += 1
             continue
-        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        x0, x1 = columns.start + int(xs[0]), columns.start + int(xs[-1]) + 1
-        y0, y1 = rows.start + int(ys[0]), rows.start + int(ys[-1]) + 1
+        seen = Silhouette.cropped(mask, columns.start, rows.start)
+        amodal, box, area = _amodal(alone, seen, rules.min_fragment, (width, height))
+        agreement, boundary = _agreement(seen, second, instance.id, found_second.get(instance.id))
+        marks = tuple(
+            name
+            for name, value, least in (
+                ("occluded", seen.area / amodal.area, rules.min_visible),
+                ("disagreeing", agreement, rules.min_agreement),
+            )
+            if value < least
+        )
+        if marks and rules.below_threshold == "drop":
+            dropped[marks[0]] += 1
+            continue
+        points = (keypoints or {}).get(instance.asset)
         labels.append(
             InstanceLabel(
                 id=instance.id,
+                asset=instance.asset,
                 class_index=instance.class_index,
                 class_name=class_names[instance.class_index],
-                box=(x0, y0, x1, y1),
-                mask=np.ascontiguousarray(mask[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1]),
-                truncated=x0 == 0 or y0 == 0 or x1 == width or y1 == height,
+                box=seen.box,
+                mask=seen.mask,
+                amodal=amodal,
+                silhouette_box=box,
+                silhouette_area=area,
+                agreement=agreement,
+                boundary_f1=boundary,
                 world_from_object=instance.world_from_object,
+                keypoints=np.zeros((0, 3))
+                if points is None or camera is None
+                else _see_keypoints(points, instance, camera, truth),
+                marks=marks,
             )
         )
     return Labels(width, height, tuple(labels), dropped)
 
 
-def outline(mask: BoolArray) -> FloatArray:
-    """A mask of at least one pixel as one closed polygon [px], shape (M, 2).
+def boundary_f1(one: BoolArray, other: BoolArray) -> float:
+    """F1 score of two masks' boundaries: pixels within :data:`BOUNDARY_TOLERANCE` of the other's count as found.
 
-    Made for how Ultralytics reads YOLO segments: one polygon per instance; positions scaled to the training size,
-    resampled along the edges and truncated to pixels; ``cv2.fillPoly`` (even-odd, edges painted). Therefore
-
-    * vertices are the *centres* of the mask's border pixels and edges run in the eight directions of the grid: at the
-      image's own size vertices and edges truncate to pixels of the mask, so the mask comes back exactly (but for a
-      pixel where a resampled point meets the middle of a diagonal step), and when scaled down no side gains more than
-      half a pixel; vertices on the border pixels' outer edges gain as much or more at every scale;
-    * holes and separate parts hang on bridges walked there and back. A bridge to a hole runs inside the mask; a
-      bridge between parts paints the pixels of the gap, so the bridges are a minimum spanning tree;
-    * at its four extremes the polygon reaches out to the pixels' outer edges by spikes without area: the box that
-      is read off the polygon is the box of the mask.
+    After Csurka et al. 2013, "What is a good evaluation measure for semantic segmentation?". A mask's boundary is its
+    pixels with a neighbour outside it; the arrays' border is none.
     """
-    height, width = mask.shape
-    rings = [
-        ring.reshape(-1, 2).astype(np.intp)
-        for ring in cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BOUNDARY_TOLERANCE + 1,) * 2)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    edges = [mask & (cv2.erode(mask.astype(np.uint8), cross) == 0) for mask in (one, other)]
+    counts = [int(np.count_nonzero(edge)) for edge in edges]
+    if not all(counts):
+        return float(counts[0] == counts[1])
+    shares = [
+        np.count_nonzero(edge & (cv2.dilate(near.astype(np.uint8), disc) > 0)) / count
+        for edge, near, count in zip(edges, reversed(edges), counts, strict=True)
     ]
-    polygon: FloatArray = _corners(_joined(rings, (height, width))) + np.float64(0.5)
-    ys, xs = np.nonzero(mask)
-    for axis, edge in ((0, xs.min()), (0, xs.max() + 1), (1, ys.min()), (1, ys.max() + 1)):
-        at = int(np.abs(polygon[:, axis] - edge).argmin())
-        spike = polygon[[at, at]]
-        spike[0, axis] = edge - np.sign(edge - spike[0, axis]) * _LEAN
-        polygon = np.insert(polygon, at + 1, spike, axis=0)
-    return polygon
+    return float(2 * shares[0] * shares[1] / sum(shares)) if sum(shares) else 0.0
 
 
-def fill_polygon(polygon: npt.ArrayLike, width: int, height: int) -> BoolArray:
-    """Pixels of a polygon (M, 2) [px] as Ultralytics' ``polygon2mask`` fills it, shape (height, width)."""
-    canvas = np.zeros((height, width), dtype=np.uint8)
-    cv2.fillPoly(canvas, [np.asarray(polygon, dtype=np.float32).astype(np.int32)], 1)
-    return canvas.astype(bool)
+def _amodal(
+    alone: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
+) -> tuple[Silhouette, Box, int]:
+    """What an instance covers in the image, and the bounds and pixels of its whole silhouette.
+
+    Where three instances mix in a pixel, one may have the largest share of it that would not cover it alone: what is
+    seen always counts as covered.
+    """
+    parts = [seen] if alone is None else [alone, seen]
+    x0, y0 = min(part.box[0] for part in parts), min(part.box[1] for part in parts)
+    x1, y1 = max(part.box[2] for part in parts), max(part.box[3] for part in parts)
+    canvas = np.zeros((y1 - y0, x1 - x0), dtype=bool)
+    for part in parts:
+        left, top, right, bottom = part.box
+        canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
+    # Fragments are judged in the image, as those of the visible mask are, and again beyond it.
+    whole = Silhouette.cropped(_without_fragments(canvas, min_fragment)[0], x0, y0)
+    inside = whole.inside(*size)
+    kept = None if inside is None else _without_fragments(inside.mask, min_fragment)[0]
+    if inside is None or kept is None or not kept.any():
+        raise AssertionError("what is seen of an instance is part of its silhouette")
+    return Silhouette.cropped(kept, *inside.box[:2]), whole.box, whole.area
+
+
+def _agreement(
+    seen: Silhouette, second: npt.NDArray[np.int32], number: int, bounds: tuple[slice, slice] | None
+) -> tuple[float, float]:
+    """IoU and boundary F1 of an instance's mask and its mask in the other id map, which is within ``bounds``."""
+    height, width = second.shape
+    x0, y0, x1, y1 = seen.box
+    if bounds is not None:
+        rows, columns = bounds
+        x0, x1 = min(x0, columns.start), max(x1, columns.stop)
+        y0, y1 = min(y0, rows.start), max(y1, rows.stop)
+    room = 1 + BOUNDARY_TOLERANCE
+    x0, y0, x1, y1 = max(x0 - room, 0), max(y0 - room, 0), min(x1 + room, width), min(y1 + room, height)
+    other = second[y0:y1, x0:x1] == number
+    one = np.zeros_like(other)
+    left, top, right, bottom = seen.box
+    one[top - y0 : bottom - y0, left - x0 : right - x0] = seen.mask
+    return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
+
+
+def _see_keypoints(points: FloatArray, instance: Instance, camera: Camera, truth: Truth) -> FloatArray:
+    """Pixels and visibilities of an asset's keypoints, shape (K, 3)."""
+    pose = instance.world_from_object
+    pixels, depth = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
+    seen = np.zeros((len(points), 3))
+    for row, (x, y), z in zip(seen, pixels, depth, strict=True):
+        if not (z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):
+            continue
+        at = int(y), int(x)
+        shown = truth.instance[at] == instance.id and z <= truth.depth[at] * (1 + KEYPOINT_TOLERANCE)
+        row[:] = x, y, VISIBLE if shown else HIDDEN
+    return seen
 
 
 def _without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:
@@ -232,73 +451,3 @@ def _without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, i
     keep = stats[:, cv2.CC_STAT_AREA] >= min_fragment
     keep[0] = False
     return keep[parts], int(count - 1 - np.count_nonzero(keep))
-
-
-def _joined(rings: list[IntArray], shape: tuple[int, int]) -> IntArray:
-    """One closed walk of pixels (x, y) through all ``rings``, each bridge walked there and back."""
-    walk = rings[0]
-    for start, ring, first in _bridges(rings, shape):
-        at = int(np.flatnonzero((walk == start).all(axis=1))[0])
-        loop = np.roll(ring, -first, axis=0)
-        step = loop[0] - start
-        ahead = np.arange(1, np.abs(step).max())[:, None]
-        bridge = start + np.sign(step) * np.minimum(ahead, np.abs(step))
-        walk = np.concatenate([walk[: at + 1], bridge, loop, loop[:1], bridge[::-1], walk[at:]])
-    return walk
-
-
-def _bridges(rings: list[IntArray], shape: tuple[int, int]) -> list[tuple[IntArray, IntArray, int]]:
-    """The bridges that join all rings over the fewest pixels, in an order in which a bridge starts on a joined ring.
-
-    A minimum spanning tree over the neighbours in the rings' discrete Voronoi diagram in the chessboard metric, which
-    counts the pixels that ``cv2.fillPoly`` paints along an edge.
-
-    Returns:
-        For each bridge the pixel (x, y) it starts at, the ring it joins and the position in that ring where it ends.
-    """
-    if len(rings) == 1:
-        return []
-    pixels = np.concatenate(rings)
-    ring_of = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
-    away = np.ones(shape, dtype=np.uint8)
-    away[pixels[:, 1], pixels[:, 0]] = 0
-    _, cell = cv2.distanceTransformWithLabels(away, cv2.DIST_C, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    pixel_of_cell = np.zeros(cell.max() + 1, dtype=np.intp)
-    pixel_of_cell[cell[pixels[:, 1], pixels[:, 0]]] = np.arange(len(pixels))
-    near = pixel_of_cell[cell]
-    position = pixels @ (1, shape[1])
-    order = np.argsort(position, kind="stable")
-    shared = np.flatnonzero(np.diff(position[order]) == 0)  # walls one pixel thick belong to the rings of both sides
-    neighbours = [
-        (order[shared], order[shared + 1]),
-        (near[:, :-1], near[:, 1:]),
-        (near[:-1], near[1:]),
-        (near[:-1, :-1], near[1:, 1:]),
-        (near[:-1, 1:], near[1:, :-1]),
-    ]
-    a, b = (np.concatenate([pair[side].ravel() for pair in neighbours]) for side in (0, 1))
-    a, b = a[ring_of[a] != ring_of[b]], b[ring_of[a] != ring_of[b]]
-    length = np.abs(pixels[a] - pixels[b]).max(axis=1)
-    low, high = np.minimum(ring_of[a], ring_of[b]), np.maximum(ring_of[a], ring_of[b])
-    shortest = np.lexsort((length, low * len(rings) + high))
-    _, first = np.unique((low * len(rings) + high)[shortest], return_index=True)
-    best = shortest[first]
-    # SciPy takes a stored zero for no edge; one more pixel for every edge leaves the tree the same.
-    graph = coo_array((length[best] + 1, (low[best], high[best])), shape=(len(rings), len(rings)))
-    ends = {(int(low[i]), int(high[i])): (int(a[i]), int(b[i])) for i in best}
-    order, parent = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(graph.tocsr()), 0, directed=False)
-    bridges = []
-    for ring in order[1:]:
-        start, end = ends[min(ring, parent[ring]), max(ring, parent[ring])]
-        if ring_of[start] == ring:
-            start, end = end, start
-        bridges.append((pixels[start], rings[ring], end - int(np.searchsorted(ring_of, ring))))
-    return bridges
-
-
-def _corners(walk: IntArray) -> IntArray:
-    """The closed ``walk`` without standing still and without pixels between two steps of one direction."""
-    walk = walk[np.any(walk != np.roll(walk, 1, axis=0), axis=1)] if len(walk) > 1 else walk
-    arriving = walk - np.roll(walk, 1, axis=0)
-    leaving = np.roll(walk, -1, axis=0) - walk
-    return walk[np.any(arriving != leaving, axis=1)] if len(walk) > 1 else walk

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
+from mitsplat.label import Silhouette
 from mitsplat.llvm import check_llvm
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.splats import Splats
@@ -29,7 +30,8 @@ class Layers:
         alpha: Opacity, (H, W) float32.
         captured: Linear colour before light, multiplied by alpha, (H, W, 3) float32.
         depth: Depth along the optical axis [m], 0 where nothing is, (H, W) float32.
-        instance: Id that has the largest share of the pixel, 0 for the environment or nothing, (H, W) uint16.
+        instance: Id that has the largest share of the pixel, 0 where that is the environment's or what is left of the
+            ray, (H, W) uint16.
         proxy_depth: The same depth of the proxy meshes, (H, W) float32.
         proxy_instance: Id of the nearest proxy mesh, (H, W) uint16.
         normal: World-space unit normal of the nearest proxy, zero where there is none, (H, W, 3) float32.
@@ -176,3 +178,8 @@ def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0)
         light=three("light"),
         highlight=three("highlight"),
     )
+
+
+def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
+    """Every instance as it would be seen alone, by its ``splats`` or by its ``proxies``, see the integrator plugin."""
+    return dict(integrator.silhouettes(scene, make_sensor(camera), source=source))

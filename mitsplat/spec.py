@@ -330,8 +330,23 @@ class Output(StrictModel):
     validation: Unit = Field(
         0.2, description="Share of layouts for validation; the second layout is the first of the smaller split."
     )
+
+
+class Labelling(StrictModel):
+    """What is labelled, see :mod:`mitsplat.label`."""
+
+    source: Literal["splats", "proxies"] = Field(
+        "splats", description="Where masks come from: what the image shows, or the proxy meshes."
+    )
     min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels are not labelled.")
     min_fragment: int = Field(8, ge=1, description="Connected parts with fewer pixels are dropped from a mask.")
+    min_visible: Unit = Field(0.05, description="Visible fraction below which an instance is occluded.")
+    min_agreement: Unit = Field(
+        0.5, description="IoU of the masks by splats and by proxies below which an instance is disagreeing."
+    )
+    below_threshold: Literal["drop", "mark"] = Field(
+        "mark", description="Whether occluded and disagreeing instances are not labelled, or labelled and marked."
+    )
 
 
 class SceneSpec(StrictModel):
@@ -352,6 +367,7 @@ class SceneSpec(StrictModel):
     lights: tuple[LightSpec, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
+    labels: Labelling = Field(Labelling(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     quality: Literal["fast", "balanced", "exact"] = Field("balanced", description="Rendering preset.")
     seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")

@@ -30,7 +30,7 @@ class Image:
         alpha: Opacity.
         depth: Depth along z [m] at which a ray has lost half its light, or, where it keeps more, the mean depth of what
             it met; 0 where it met nothing.
-        instance: Id with the largest share of the ray's opacity; 0 is the environment or nothing.
+        instance: Id with the largest share of the ray; 0 is the environment, which has what is left of the ray as well.
         share: That share of the ray, in [0, alpha].
     """
 
@@ -348,7 +348,7 @@ def _collect(pixels: list[Pixel], rays: list[Any], inside: list[Any], count: int
     def winner(pixel: Pixel) -> tuple[Any, Any]:
         second = pixel[W_2] > pixel[W_1]
         weight = dr.select(second, pixel[W_2], pixel[W_1])
-        environment = pixel[W_ENV] >= weight
+        environment = pixel[W_ENV] + pixel[T] >= weight  # what is left of the ray shows what lies behind
         number = dr.select(second, pixel[ID_2], pixel[ID_1])
         return dr.select(environment, 0.0, number), dr.select(environment, pixel[W_ENV], weight)
 

@@ -10,10 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import InputError
+from mitsplat.label import Silhouette
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Hit, Occluder, Proxies, Surface, light_factor, reference_irradiance
 from mitsplat.plugins.march import Image, march
 from mitsplat.plugins.rays import View
+from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.tiles import CloudSet, Placement, bin_gaussians, merge_clouds
 from mitsplat.quality import resolve_quality
 
@@ -188,6 +190,23 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         }
         dr.eval(layers)
         return layers
+
+    def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
+        """Every instance above 0 as it would be seen alone, by its splats or its proxies (``source``).
+
+        Positions are relative to the image and may lie outside it; an instance without pixels is absent.
+        """
+        contents = self._read(scene)
+        view = view_of(sensor)
+        if source == "splats":
+            if contents.clouds is None:
+                return {}
+            return splat_silhouettes(contents.clouds, contents.placements, view, self.quality)
+        proxies: dict[int, list[tuple[Any, np.ndarray]]] = {}
+        for shape in contents.shapes:
+            if getattr(shape, "instance", 0) and shape.proxy is not None:
+                proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
+        return proxy_silhouettes(proxies, view)
 
     def _trace_splats(self, contents: _Contents, view: View, z_max: Any | None) -> Image:
         if contents.clouds is None:

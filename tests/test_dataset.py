@@ -17,7 +17,7 @@ from mitsplat import dataset
 from mitsplat.dataset import write_dataset
 from mitsplat.engine import FrameError
 from mitsplat.errors import InputError
-from mitsplat.label import Labels, label_instances
+from mitsplat.label import LabelRules, Labels, Silhouette, Truth, label_instances
 from mitsplat.manifest import Manifest
 from mitsplat.scene import load_scene, plan_frame, random_stream
 from mitsplat.settle import Instance, Layout, RestCertificate
@@ -58,7 +58,7 @@ def render(scene, index, *, layout):
         x, y = (instance.world_from_object[:2, 3] * 0.4 + 0.5) * (camera.width, camera.height)
         cv2.circle(ids, (int(x), int(y)), 7, instance.id, cv2.FILLED)
     image = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
-    limits = scene.spec.output
+    silhouettes = {int(i): Silhouette.cropped(ids == i, 0, 0) for i in np.unique(ids[ids > 0])}
     return SimpleNamespace(
         index=index,
         plan=plan,
@@ -72,13 +72,7 @@ def render(scene, index, *, layout):
         normal=np.stack(np.meshgrid(range(camera.width), range(camera.height), [0.5]), -1)[:, :, 0].astype(np.float32),
         light=np.ones((*ids.shape, 3), dtype=np.float32),
         layers={"alpha": np.ones(ids.shape, dtype=np.float32)},
-        labels=label_instances(
-            ids,
-            layout.instances,
-            scene.class_names,
-            min_pixels=limits.min_pixels,
-            min_fragment=limits.min_fragment,
-        ),
+        labels=label_instances(Truth(ids, ids, silhouettes, ids), layout.instances, scene.class_names, LabelRules()),
         draws=plan.draws,
         seconds={"march": 0.01},
     )

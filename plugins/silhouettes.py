@@ -1,0 +1,240 @@
+"""Every instance as it would be seen alone, on a canvas that is larger than the image.
+
+A pixel belongs to an instance that is alone where it lets less than half of the light behind it through: the rule of
+the instance image, :class:`mitsplat.plugins.march.Image`, with what is left of a ray counted as environment. Opacity
+does not depend on the order of Gaussians, so all instances come from one set of tile lists: one packet of lanes walks a
+tile's list for each instance that is in it, and stops as soon as all its pixels are decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.camera import Camera
+from mitsplat.label import Silhouette
+from mitsplat.plugins.gaussian import RECORD
+from mitsplat.plugins.march import PIXELS_PER_LANE, _respond
+from mitsplat.plugins.rays import TILE, View
+from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
+from mitsplat.quality import Quality
+
+MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Widths of the canvas around the image that are tried, in images. One image on each side is BOP's; where lens
+distortion cannot be inverted that far out, the widest is taken where it can."""
+
+_INVERTED = 0.01
+"""How near to itself a pixel must come back through the inverted distortion [px]."""
+
+
+def splat_silhouettes(
+    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality
+) -> dict[int, Silhouette]:
+    """Silhouettes of the instances above 0 by their splats; instances without any pixel are absent."""
+    objects = [placement for placement in placements if placement.instance > 0]
+    if not objects:
+        return {}
+    canvas, left, top = _canvas(view)
+    fine = canvas.sampled(quality.samples)
+    lists = bin_gaussians(clouds, objects, fine, alpha_min=quality.alpha_min, sh_degree=0)
+    if lists.pairs == 0:
+        return {}
+    ids = np.unique([placement.instance for placement in objects])
+    tile, slot = _occupied(lists, fine, ids)
+    covered = _covered(lists, fine, quality, tile, dr.gather(mi.Float, mi.Float(ids.astype(np.float32)), slot))
+    return _assemble(np.array(tile), np.array(slot), np.array(covered), ids, canvas, left, top)
+
+
+def proxy_silhouettes(
+    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: View
+) -> dict[int, Any]:
+    """The same by proxy meshes: (mesh, world_from_mesh) of every instance above 0."""
+    canvas, left, top = _canvas(view)
+    found = {}
+    for instance, parts in proxies.items():
+        window = _window(canvas, parts)
+        if instance == 0 or window is None:
+            continue
+        x0, y0, x1, y1 = window
+        shape = y1 - y0, x1 - x0
+        hit = np.zeros(shape, dtype=bool)
+        for mesh, world_from_mesh in parts:
+            hit |= np.array(_trace_alone(canvas, window, mesh, world_from_mesh)).reshape(shape)
+        if hit.any():
+            found[instance] = Silhouette.cropped(hit, x0 - left, y0 - top)
+    return found
+
+
+def _canvas(view: View) -> tuple[View, int, int]:
+    """The view on a larger canvas, and where on it the image begins."""
+    share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion)
+    left, top = int(share * view.width), int(share * view.height)
+    size = {"width": view.width + 2 * left, "height": view.height + 2 * top}
+    return replace(view, **size, cx=view.cx + left, cy=view.cy + top), left, top
+
+
+@lru_cache(maxsize=8)
+def _margin(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...]
+) -> float:
+    if not distortion:
+        return MARGINS[0]
+    camera = Camera(width, height, fx, fy, cx, cy, np.eye(4), distortion)
+    for share in MARGINS[:-1]:
+        x, y = np.meshgrid(
+            np.linspace(-share * width, (1 + share) * width, 33), np.linspace(-share * height, (1 + share) * height, 33)
+        )
+        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+        slopes = camera.ray_slopes(pixels)
+        back, _ = camera.project(np.column_stack([slopes, np.ones(len(slopes))]))
+        # Farther from the centre must stay farther: past its fold a distortion is inverted to the wrong side.
+        radius = np.linalg.norm(slopes, axis=1).reshape(x.shape)
+        grows = all(
+            (np.diff(line, axis=1) > 0).all()
+            for line in (radius[:, 17:], radius[:, 16::-1], radius[17:].T, radius[16::-1].T)
+        )
+        if grows and np.abs(back - pixels).max() < _INVERTED:
+            return share
+    return MARGINS[-1]
+
+
+def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any]:
+    """Every pair of a tile and an instance (as position in ``ids``) that has a Gaussian in it."""
+    tiles, slots = view.tiles_x * view.tiles_y, len(ids)
+    slot_of_id = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
+    slot_of_id[ids] = np.arange(slots, dtype=np.uint32)
+    # The tile of every entry: one more at each tile's first entry.
+    marks = dr.zeros(mi.UInt32, lists.pairs)
+    tile = dr.arange(mi.UInt32, tiles)
+    filled = dr.compress(lists.stop > lists.start)
+    dr.scatter(marks, mi.UInt32(1), dr.gather(mi.UInt32, lists.start, filled))
+    owner = dr.gather(mi.UInt32, filled, dr.cumsum(marks) - 1)
+    instance = dr.gather(mi.Float, lists.records, lists.entries * RECORD + RECORD - 1)
+    slot = dr.gather(mi.UInt32, mi.UInt32(slot_of_id), mi.UInt32(instance))
+    seen = dr.zeros(mi.UInt32, tiles * slots)
+    count = dr.opaque(mi.UInt32, slots)
+    dr.scatter(seen, mi.UInt32(1), owner * count + slot)
+    dr.eval(seen, tile)
+    pair = dr.compress(seen != 0)
+    tile = pair // count
+    slot = pair - tile * count
+    dr.eval(tile, slot)
+    return tile, slot
+
+
+def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance: Any) -> Any:
+    """For every pair and each column of its tile, the pixels that the instance covers, as bits from the top."""
+    lanes_per_tile = TILE * TILE // PIXELS_PER_LANE
+    lane = dr.arange(mi.UInt32, dr.width(tile) * lanes_per_tile)
+    pair, within = lane // lanes_per_tile, lane % lanes_per_tile
+    tile, instance = dr.gather(mi.UInt32, tile, pair), dr.gather(mi.Float, instance, pair)
+    row = tile // view.tiles_x
+    x = mi.Float((tile - row * view.tiles_x) * TILE + within % TILE)
+    y = mi.Float(row * TILE + within // TILE * PIXELS_PER_LANE)
+    n = quality.samples
+    middle = n * n // 2  # the sample that the instance image shows
+    dx, dy = dr.opaque(mi.Float, (middle % n + 0.5) / n), dr.opaque(mi.Float, (middle // n + 0.5) / n)
+    slopes = [view.slopes(x + dx, y + k + dy) for k in range(PIXELS_PER_LANE)]
+    us, vs = [u for u, _ in slopes], [v for _, v in slopes]
+    start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
+    cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
+    near, shared_column = view.near_plane, not view.distortion
+
+    def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
+        record = dr.gather(
+            mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
+        )
+        mine = record[RECORD - 1] == instance
+        responses = _respond(record, lists, us, vs, shared_column)
+        return i + 1, [
+            dr.select(mine & (log_alpha > cut) & (z > near), t * (1 - dr.exp2(log_alpha)), t)
+            for t, (log_alpha, z) in zip(through, responses, strict=True)
+        ]
+
+    def undecided(i: Any, through: list[Any]) -> Any:
+        most = through[0]
+        for t in through[1:]:
+            most = dr.maximum(most, t)
+        return (i < stop) & (most >= 0.5)
+
+    ones = [mi.Float(1.0) for _ in range(PIXELS_PER_LANE)]
+    _, through = dr.while_loop((mi.UInt32(start), ones), undecided, body, label="silhouettes")
+    bits = mi.UInt32(0)
+    for k, t in enumerate(through):
+        bits |= dr.select(t < 0.5, mi.UInt32(1 << k), 0)
+    dr.eval(bits)
+    return bits
+
+
+def _assemble(
+    tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: View, left: int, top: int
+) -> dict[int, Silhouette]:
+    """Masks of whole instances from those of their tiles."""
+    columns = bits.astype(np.uint8).reshape(len(tile), TILE)
+    blocks = np.unpackbits(columns[..., None], axis=2, bitorder="little").swapaxes(1, 2)  # pair, row, column
+    rows, cols = tile // canvas.tiles_x, tile % canvas.tiles_x
+    found = {}
+    for number, instance in enumerate(ids):
+        chosen = np.flatnonzero((slot == number) & columns.any(axis=1))
+        if not len(chosen):
+            continue
+        y, x = rows[chosen], cols[chosen]
+        y0, x0 = int(y.min()), int(x.min())
+        grid = np.zeros((int(y.max()) - y0 + 1, int(x.max()) - x0 + 1, TILE, TILE), dtype=bool)
+        grid[y - y0, x - x0] = blocks[chosen]
+        mask = grid.swapaxes(1, 2).reshape(grid.shape[0] * TILE, grid.shape[1] * TILE)
+        mask = mask[: canvas.height - y0 * TILE, : canvas.width - x0 * TILE]
+        if mask.any():
+            found[int(instance)] = Silhouette.cropped(mask, x0 * TILE - left, y0 * TILE - top)
+    return found
+
+
+def _window(view: View, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
+    """Box of pixels on the canvas that meshes may cover, or None."""
+    camera = Camera(
+        view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.world_from_camera, view.distortion, view.near
+    )
+    points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
+    pixels, depth = camera.project(points)
+    if (depth <= view.near).any():
+        return (0, 0, view.width, view.height) if (depth > view.near).any() else None
+    low = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, (view.width, view.height)).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, (view.width, view.height)).astype(int)
+    return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (high > low).all() else None
+
+
+def _trace_alone(view: View, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray) -> Any:
+    """Whether the rays of a window of pixels meet a mesh."""
+    x0, y0, x1, y1 = window
+    lane = dr.arange(mi.UInt32, (x1 - x0) * (y1 - y0))
+    width = dr.opaque(mi.UInt32, x1 - x0)
+    row = lane // width
+    u, v = view.slopes(
+        mi.Float(lane - row * width) + dr.opaque(mi.Float, x0 + 0.5), mi.Float(row) + dr.opaque(mi.Float, y0 + 0.5)
+    )
+    mesh_from_camera = np.linalg.inv(pose) @ view.world_from_camera
+    axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in mesh_from_camera[:3].T]
+    right, down, forward, centre = axes
+    direction = mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)])
+    ray = dr.zeros(mi.Ray3f, dr.width(lane))
+    ray.o = mi.Point3f(*centre)
+    ray.d = dr.normalize(direction)
+    ray.maxt = dr.inf
+    return _scene_of(mesh, str(mi.variant())).ray_test(ray)
+
+
+@lru_cache(maxsize=128)
+def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> Any:
+    shape = mi.Mesh("alone", len(mesh.vertices), len(mesh.faces))
+    params = mi.traverse(shape)
+    params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, dtype=np.float32).ravel())
+    params["faces"] = mi.UInt32(np.asarray(mesh.faces, dtype=np.uint32).ravel())
+    params.update()
+    return mi.load_dict({"type": "scene", "mesh": shape})

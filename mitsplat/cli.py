@@ -60,7 +60,8 @@ def render(
     quality: Annotated[QualityName | None, typer.Option(help="Rendering preset.")] = None,
     workers: Annotated[int, typer.Option(help="Processes that make images.")] = 1,
     formats: Annotated[
-        str | None, typer.Option("--format", metavar="NAMES", help="Of yolo, coco and exr, separated by commas.")
+        str | None,
+        typer.Option("--format", metavar="NAMES", help="Label formats as in output.formats, separated by commas."),
     ] = None,
     overwrite: Annotated[
         bool,
@@ -89,6 +90,11 @@ def render(
         summary = write_dataset(loaded, out, frames=frames, workers=workers, overwrite=overwrite, progress=progress)
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
+    dropped, marked = (
+        ", ".join(f"{count} {reason}" for reason, count in counts.items() if count) or "none"
+        for counts in (summary.dropped, summary.marked)
+    )
+    typer.echo(f"not labelled: {dropped}; marked: {marked}")
     typer.echo(f"contact sheet: {summary.contact_sheet}")
 
 

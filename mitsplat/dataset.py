@@ -35,9 +35,10 @@ import numpy as np
 
 from mitsplat.engine import Note, run_frames
 from mitsplat.errors import InputError
+from mitsplat.files import SPLITS, Record, write_file, write_text
 from mitsplat.manifest import Manifest, append_line, cut_torn_line
 from mitsplat.sheet import contact_sheet
-from mitsplat.writers import FORMATS, SPLITS, Record, write_collection, write_file, write_frame, write_text
+from mitsplat.writers import FORMATS, Catalogue, write_collection, write_frame
 
 if TYPE_CHECKING:
     from mitsplat.assets import Asset
@@ -61,6 +62,8 @@ _UNFINISHED = re.compile(r"\.lock|\.dataset\.json\.\d+\.part")
 """Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
     *("images", "labels", "layers", "annotations", "layouts", "scene"),
+    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "bop", "colmap"),
+    *("depth", "normals", "instances", "semantic", "flow", "report.html"),
     *("data.yaml", _SHEET, _MANIFEST, _TIMINGS, _CONTENT, _LOCK),
 )
 
@@ -76,6 +79,7 @@ class DatasetSummary:
         images: Images by split.
         instances: Labelled instances by class.
         dropped: What was not labelled, by the reasons of :class:`mitsplat.label.Labels`.
+        marked: Labelled instances below a threshold, by the marks of :class:`mitsplat.label.InstanceLabel`.
         contact_sheet: Picture of some frames with their labels drawn.
     """
 
@@ -85,6 +89,7 @@ class DatasetSummary:
     images: dict[str, int]
     instances: dict[str, int]
     dropped: dict[str, int]
+    marked: dict[str, int]
     contact_sheet: Path
 
 
@@ -131,6 +136,7 @@ def write_dataset(
     formats = scene.spec.output.formats
     if unknown := set(formats) - set(FORMATS):
         raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
+    catalogue = Catalogue.of(scene)
     with _open_folder(scene, out, resume=resume, overwrite=overwrite) as manifest:
         layouts: dict[int, list[int]] = {}
         for index in range(count):
@@ -142,14 +148,14 @@ def write_dataset(
                 progress(len(manifest), max(count, len(manifest)), text)
 
         note("starting")
-        make = _FrameMaker(scene, out, render or _default_render(), settle or _default_settle())
+        make = _FrameMaker(scene, catalogue, out, render or _default_render(), settle or _default_settle())
         with closing(run_frames(make, layouts, workers=workers, note=note)) as results:
             for record, seconds in results:
                 append_line(out / _TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
                 note(f"frame {record['index']}")
         manifest.sort()
-        write_collection(out, manifest, scene.class_names, formats)
+        write_collection(out, manifest, catalogue, formats)
         contact_sheet(out, manifest, out / _SHEET)
         return _summarise(out, manifest, rendered=sum(map(len, layouts.values())))
 
@@ -171,6 +177,7 @@ class _FrameMaker:
     """Renders one frame and writes its files; the unit of work of the engine."""
 
     scene: Scene
+    catalogue: Catalogue
     out: Path
     render: Render
     settle: Settle
@@ -184,7 +191,7 @@ class _FrameMaker:
         settled = time.perf_counter()
         frame = self.render(self.scene, index, layout=layout)
         rendered = time.perf_counter()
-        record = write_frame(frame, self.out, self.scene.spec.output)
+        record = write_frame(frame, self.out, self.scene.spec, self.catalogue)
         stages = {**frame.seconds, "settle": settled - start, "write": time.perf_counter() - rendered}
         return record, {stage: round(seconds, 4) for stage, seconds in stages.items()}
 
@@ -212,7 +219,7 @@ class _FrameMaker:
 @contextmanager
 def _open_folder(scene: Scene, out: Path, *, resume: bool, overwrite: bool) -> Iterator[Manifest]:
     """Lock and prepare the folder; its manifest, without the frames that miss a file."""
-    content = _content(scene)
+    content = _content(scene, Catalogue.of(scene))
     _check_own(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -275,10 +282,7 @@ def _prepare(out: Path, scene: Scene, content: dict[str, Any]) -> None:
     _remove_partial(out)
     if not (out / _CONTENT).exists():
         write_text(out / _CONTENT, json.dumps(content, indent=1) + "\n")
-    kinds = ["images", *(["labels"] if "yolo" in scene.spec.output.formats else [])]
-    kinds += ["layers"] if "exr" in scene.spec.output.formats else []
-    for name in ("layouts", "scene", *(f"{kind}/{split}" for kind in kinds for split in SPLITS)):
-        (out / name).mkdir(parents=True, exist_ok=True)
+    (out / "layouts").mkdir(exist_ok=True)
     if not (out / "scene" / scene.path.name).exists():
         write_file(out / "scene" / scene.path.name, lambda temporary: shutil.copyfile(scene.path, temporary))
     cut_torn_line(out / _TIMINGS)
@@ -300,7 +304,7 @@ def _remove_partial(out: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _content(scene: Scene) -> dict[str, Any]:
+def _content(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
     """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
     from mitsplat import __version__
 
@@ -315,6 +319,8 @@ def _content(scene: Scene) -> dict[str, Any]:
         "mitsplat": __version__,
         "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
         "classes": list(scene.class_names),
+        "keypoints": [list(names) for names in catalogue.keypoint_names],
+        "assets": list(catalogue.assets),
         "inputs": inputs,
         "libraries": {name: importlib.metadata.version(name) for name in libraries},
     }
@@ -322,8 +328,9 @@ def _content(scene: Scene) -> dict[str, Any]:
 
 def _asset_hash(asset: Asset) -> str:
     splats, meshes = asset.splats, [mesh for mesh in (asset.mesh, *asset.pieces) if mesh is not None]
-    arrays = [splats.means, splats.quats, splats.scales, splats.opacities, splats.sh]
+    arrays: list[Any] = [splats.means, splats.quats, splats.scales, splats.opacities, splats.sh]
     arrays += [array for mesh in meshes for array in (mesh.vertices, mesh.faces)]
+    arrays += [asset.keypoint_array]
     physics = [asset.density, asset.mass or 0.0, asset.friction, asset.roughness, asset.specular]
     return _hash(*arrays, np.array(physics), np.frombuffer(asset.capture_light.encode(), dtype=np.uint8))
 
@@ -348,11 +355,12 @@ def _first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, s
 
 
 def _summarise(out: Path, manifest: Manifest, rendered: int) -> DatasetSummary:
-    images, instances, dropped = Counter[str](), Counter[str](), Counter[str]()
+    images, instances, dropped, marked = (Counter[str]() for _ in range(4))
     for record in manifest:
         images[record["split"]] += 1
         instances.update(label["class"] for label in record["labels"]["instances"])
         dropped.update(record["labels"]["dropped"])
+        marked.update(mark for label in record["labels"]["instances"] for mark in label["marks"])
     return DatasetSummary(
         path=out,
         frames=len(manifest),
@@ -360,5 +368,6 @@ def _summarise(out: Path, manifest: Manifest, rendered: int) -> DatasetSummary:
         images={split: images[split] for split in SPLITS},
         instances=dict(sorted(instances.items())),
         dropped=dict(dropped),
+        marked=dict(sorted(marked.items())),
         contact_sheet=out / _SHEET,
     )

@@ -141,6 +141,7 @@ class InstanceLabel:
         amodal: The silhouette's part in the image, hidden pixels included.
         silhouette_box: Bounds of the silhouette, beyond the image's border too [px].
         silhouette_area: Its pixels.
+        depth_area: Pixels of ``amodal`` at which the image has a depth.
         agreement: IoU of the instance's masks by splats and by proxies.
         boundary_f1: F1 score of their boundaries, see :func:`boundary_f1`.
         world_from_object: Rigid transform of the asset's coordinates to the world's [m], shape (4, 4).
@@ -158,6 +159,7 @@ class InstanceLabel:
     amodal: Silhouette
     silhouette_box: Box
     silhouette_area: int
+    depth_area: int
     agreement: float
     boundary_f1: float
     world_from_object: FloatArray
@@ -225,6 +227,7 @@ class Labels:
                     "amodal_area": label.amodal.area,
                     "silhouette_box": list(label.silhouette_box),
                     "silhouette_area": label.silhouette_area,
+                    "depth_area": label.depth_area,
                     "visible_fraction": round(label.visible_fraction, 6),
                     "truncation": round(label.truncation, 6),
                     "polygon_iou": round(label.polygon_iou, 6),
@@ -265,6 +268,7 @@ class Labels:
                     amodal=amodal,
                     silhouette_box=tuple(entry["silhouette_box"]),
                     silhouette_area=entry["silhouette_area"],
+                    depth_area=entry["depth_area"],
                     agreement=entry["agreement"],
                     boundary_f1=entry["boundary_f1"],
                     world_from_object=np.array(entry["world_from_object"]),
@@ -357,6 +361,7 @@ def label_instances(
                 amodal=amodal,
                 silhouette_box=box,
                 silhouette_area=area,
+                depth_area=_with_depth(amodal, truth),
                 agreement=agreement,
                 boundary_f1=boundary,
                 world_from_object=instance.world_from_object,
@@ -443,6 +448,11 @@ def _see_keypoints(points: FloatArray, instance: Instance, camera: Camera, truth
         shown = truth.instance[at] == instance.id and z <= truth.depth[at] * (1 + KEYPOINT_TOLERANCE)
         row[:] = x, y, VISIBLE if shown else HIDDEN
     return seen
+
+
+def _with_depth(amodal: Silhouette, truth: Truth) -> int:
+    x0, y0, x1, y1 = amodal.box
+    return int(np.count_nonzero(amodal.mask & (truth.depth[y0:y1, x0:x1] > 0)))
 
 
 def _without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:

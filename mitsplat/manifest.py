@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mitsplat.errors import InputError
-from mitsplat.writers import Record, write_file
+from mitsplat.files import Record, write_file
 
 
 class Manifest:

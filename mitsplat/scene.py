@@ -118,6 +118,7 @@ class FramePlan:
         layout, view: Index of its layout, and of the view in it.
         split: Split that the whole layout belongs to.
         camera: Where the image is taken from.
+        next_camera: Where the layout's next image is taken from, None for its last.
         lights: Lights as they are in this frame: paths and random factors applied.
         draws: Random values by name: exposure [stops], hue [degrees], saturation, white_balance [K], noise.
         seed: Seed of the pixel noise.
@@ -128,6 +129,7 @@ class FramePlan:
     view: int
     split: Literal["train", "val"]
     camera: Camera
+    next_camera: Camera | None
     lights: tuple[LightSpec, ...]
     draws: dict[str, float]
     seed: int
@@ -191,6 +193,7 @@ def plan_frame(scene: Scene, index: int) -> FramePlan:
         view=view,
         split=_split(layout, spec.output.validation),
         camera=_camera(spec, view, index),
+        next_camera=_camera(spec, view + 1, index + 1) if view + 1 < spec.output.views else None,
         lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*getattr(ranges, name)))

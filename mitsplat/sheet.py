@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.coco import image_file
+from mitsplat.files import Record, write_file
 from mitsplat.label import InstanceLabel, Labels
-from mitsplat.writers import Record, write_file
 
 Image = npt.NDArray[np.uint8]
 
@@ -65,7 +66,7 @@ def contact_sheet(root: Path, records: Collection[Record], path: Path, *, count:
 
 
 def _tile(root: Path, record: Record) -> Image:
-    file = next(root / file for file in record["files"] if file.startswith("images/"))
+    file = root / image_file(record)
     image = cv2.imread(str(file))
     if image is None:
         raise OSError(f"{file} cannot be read as an image")

@@ -5,7 +5,7 @@ Lengths are metres, angles degrees, z is up; conventions are those of :mod:`mits
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, model_validator
 
@@ -315,6 +315,27 @@ class Composite(StrictModel):
     tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
 
 
+FormatName = Literal[
+    "yolo",
+    "yolo-detect",
+    "yolo-obb",
+    "yolo-pose",
+    "coco",
+    "amodal",
+    "panoptic",
+    "poses",
+    "bop",
+    "colmap",
+    "depth",
+    "normals",
+    "instances",
+    "semantic",
+    "flow",
+    "exr",
+]
+FORMATS: tuple[str, ...] = get_args(FormatName)
+
+
 class Output(StrictModel):
     """What is written."""
 
@@ -322,7 +343,7 @@ class Output(StrictModel):
     height: int = Field(720, ge=1, le=16384, description="Image height [px].")
     layouts: int = Field(4, ge=1, description="How many times the objects are dropped.")
     views: int = Field(10, ge=1, description="Images of each layout.")
-    formats: tuple[Literal["yolo", "coco", "exr"], ...] = Field(
+    formats: tuple[FormatName, ...] = Field(
         ("yolo",), min_length=1, description="Label formats, and exr for every layer."
     )
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")

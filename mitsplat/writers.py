@@ -1,13 +1,19 @@
-"""Files of a dataset: image, YOLO label and EXR of one frame; COCO annotations and ``data.yaml`` of all of them.
+"""Files of a dataset: those of one frame, and those that describe all of them, by format.
 
-The formats, by their names in a scene file's ``output.formats``:
+Every format derives from the frame's labels in memory, or from their record in the manifest. By their names in a scene
+file's ``output.formats``:
 
-``yolo``
-    ``labels/<split>/NNNNNN.txt``, one line per instance: class index and the outline of
-    :func:`mitsplat.label.outline`, normalised to [0, 1]; ``data.yaml`` for Ultralytics.
-``coco``
-    ``annotations/instances_<split>.json``: boxes, areas and run-length masks. File names are relative to
-    ``images/<split>``, category ids are class indices + 1.
+``yolo``, ``yolo-detect``, ``yolo-obb``, ``yolo-pose``
+    See :mod:`mitsplat.yolo`.
+``coco``, ``amodal``, ``panoptic``, ``poses``
+    See :mod:`mitsplat.coco`.
+``bop``
+    See :mod:`mitsplat.bop`; for cameras without lens distortion.
+``colmap``
+    See :mod:`mitsplat.colmap`.
+``depth``, ``normals``, ``instances``, ``semantic``, ``flow``
+    ``<format>/<split>/NNNNNN.png`` (``.flo``), see :mod:`mitsplat.maps`; a depth picture's unit is ``depth_scale``
+    millimetres of the frame's line in the manifest.
 ``exr``
     ``layers/<split>/NNNNNN.exr``: linear R, G, B; A (opacity); Z (depth along the camera's axis [m], 0 = nothing);
     instance and proxy_instance (ids); normal.X/Y/Z (world); light.R/G/B; and the frame's further layers by name.
@@ -15,10 +21,9 @@ The formats, by their names in a scene file's ``output.formats``:
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,55 +31,86 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.label import Labels
+from mitsplat import bop, coco, maps
+from mitsplat.colmap import write_colmap
+from mitsplat.errors import InputError
+from mitsplat.files import SPLITS, Record, link_file, write_file, write_text
+from mitsplat.spec import FORMATS, Output, SceneSpec
+from mitsplat.yolo import TASKS, data_yaml, yolo_lines
 
 if TYPE_CHECKING:
+    import trimesh
+
     from mitsplat.frame import Frame
-    from mitsplat.spec import Output
+    from mitsplat.scene import Scene
 
-Record = dict[str, Any]
-"""The line of one frame in ``manifest.jsonl``."""
-
-FORMATS = ("yolo", "coco", "exr")
-SPLITS = ("train", "val")
+__all__ = ["FORMATS", "Catalogue", "encode_image", "write_collection", "write_frame"]
 
 
-def write_file(path: Path, write: Callable[[Path], object]) -> str:
-    """Make a file by ``write(temporary path)``, then move it to ``path`` at once and for good.
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """What the labels of a scene refer to.
 
-    Returns:
-        The SHA-256 of the content.
+    Attributes:
+        class_names: By class index.
+        keypoint_names: Keypoints of every class.
+        assets: Names, by position among the scene's assets.
+        meshes: Their proxy meshes [m].
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    write(temporary)
-    with temporary.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    return digest
+
+    class_names: Sequence[str]
+    keypoint_names: Sequence[Sequence[str]]
+    assets: Sequence[str]
+    meshes: Sequence[trimesh.Trimesh]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Catalogue:
+        """The catalogue of a scene, checked against the formats that it asks for.
+
+        Raises:
+            InputError: If assets of one class name different keypoints, or a format cannot show what the scene has.
+        """
+        points: dict[str, tuple[str, tuple[str, ...]]] = {}
+        for asset in scene.assets:
+            names = tuple(asset.keypoints)
+            other, known = points.setdefault(asset.class_name, (asset.name, names))
+            if known != names:
+                raise InputError(
+                    f"{scene.path}: assets of class {asset.class_name!r} must name the same keypoints "
+                    f"(got {list(known)} in {other} and {list(names)} in {asset.name})"
+                )
+        keypoint_names = tuple(points[name][1] if name in points else () for name in scene.class_names)
+        formats = scene.spec.output.formats
+        if "yolo-pose" in formats and not any(keypoint_names):
+            raise InputError(f"{scene.path}: output.formats: yolo-pose needs an asset with keypoints (got none)")
+        if "bop" in formats and any(scene.spec.camera.intrinsics.distortion):
+            raise InputError(
+                f"{scene.path}: output.formats: bop must have a camera without lens distortion "
+                f"(got {list(scene.spec.camera.intrinsics.distortion)})"
+            )
+        meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
+        return cls(scene.class_names, keypoint_names, [asset.name for asset in scene.assets], meshes)
+
+    @property
+    def num_keypoints(self) -> int:
+        """Keypoints of the class that has most."""
+        return max(map(len, self.keypoint_names), default=0)
 
 
-def write_text(path: Path, text: str) -> str:
-    """Write UTF-8 text by :func:`write_file`."""
-    return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))
-
-
-def write_frame(frame: Frame, root: Path, output: Output) -> Record:
+def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue) -> Record:
     """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest."""
-    plan = frame.plan
-    name = f"{plan.split}/{frame.index:06d}"
-    files = {f"images/{name}.{output.image}": lambda path: path.write_bytes(encode_image(frame.image, output))}
-    if "yolo" in output.formats:
-        files[f"labels/{name}.txt"] = lambda path: path.write_text(yolo_lines(frame.labels))
-    if "exr" in output.formats:
-        files[f"layers/{name}.exr"] = lambda path: write_exr(path, frame)
-    return {
+    plan, labels, output = frame.plan, frame.labels, spec.output
+    formats = set(output.formats)
+    ids = frame.instance if spec.labels.source == "splats" else frame.proxy_instance
+    environment = coco.environment_segment(labels, ids) if "panoptic" in formats else None
+    scale = maps.depth_scale(frame.depth) if formats & {"bop", "depth"} else None
+    record: Record = {
         "index": frame.index,
         "layout": plan.layout,
         "view": plan.view,
         "split": plan.split,
         "seed": plan.seed,
-        "files": {file: write_file(root / file, write) for file, write in files.items()},
+        "files": {},
         "draws": dict(frame.draws),
         "camera": {
             "width": frame.camera.width,
@@ -83,101 +119,86 @@ def write_frame(frame: Frame, root: Path, output: Output) -> Record:
             "distortion": list(frame.camera.distortion),
             "world_from_camera": frame.camera.world_from_camera.tolist(),
         },
-        "labels": frame.labels.to_json(),
+        "labels": labels.to_json(),
         "rest": frame.layout.to_json()["certificate"],
+        **({"environment": environment} if environment is not None else {}),
+        **({"depth_scale": scale} if scale is not None else {}),
     }
+    name = f"{plan.split}/{frame.index:06d}"
+    image = f"images/{name}.{output.image}"
+
+    def add(file: str, write: Callable[[Path], object]) -> None:
+        record["files"][file] = write_file(root / file, write)
+
+    def add_png(file: str, picture: npt.NDArray[Any]) -> None:
+        add(file, lambda path: path.write_bytes(maps.encode_png(picture)))
+
+    add(image, lambda path: path.write_bytes(encode_image(frame.image, output)))
+    for task in (format for format in output.formats if format in TASKS):
+        folder, text = TASKS[task].folder, yolo_lines(labels, task, catalogue.num_keypoints)
+        if folder:
+            add(folder + image, lambda path: link_file(root / image, path))
+        add(f"{folder}labels/{name}.txt", lambda path, text=text: path.write_text(text))  # type: ignore[misc]
+    if formats & {"instances", "panoptic"}:
+        labelled = maps.instance_picture(labels)
+        if "instances" in formats:
+            add_png(f"instances/{name}.png", labelled)
+        if "panoptic" in formats:
+            add_png(f"panoptic/{name}.png", coco.panoptic_image(labelled, ids, environment))
+    if "semantic" in formats:
+        add_png(f"semantic/{name}.png", maps.semantic_picture(labels, ids, catalogue.class_names))
+    if formats & {"bop", "depth"}:
+        depth = maps.depth_picture(frame.depth)
+        if "depth" in formats:
+            add_png(f"depth/{name}.png", depth)
+        if "bop" in formats:
+            scene = bop.scene_folder(record)
+            add(f"{scene}/rgb/{frame.index:06d}.{output.image}", lambda path: link_file(root / image, path))
+            add_png(f"{scene}/depth/{frame.index:06d}.png", depth)
+            for folder, position, picture in bop.mask_images(labels):
+                add_png(f"{scene}/{folder}/{frame.index:06d}_{position:06d}.png", picture)
+    if "normals" in formats:
+        add_png(f"normals/{name}.png", maps.normal_picture(frame.normal))
+    if "flow" in formats and plan.next_camera is not None:
+        flow = maps.optical_flow(frame.depth, frame.camera, plan.next_camera)
+        add(f"flow/{name}.flo", lambda path: maps.write_flow(path, flow))
+    if "exr" in formats:
+        add(f"layers/{name}.exr", lambda path: maps.write_exr(path, frame))
+    return record
 
 
 def encode_image(image: npt.NDArray[np.uint8], output: Output) -> bytes:
-    """An RGB image (H, W, 3) as PNG or JPEG.
-
-    PNG takes OpenCV's defaults (one filter, run-length strategy): a third of the time of its explicit level 3 for 5 to
-    10 % more bytes on noisy frames.
-    """
-    options = [cv2.IMWRITE_JPEG_QUALITY, output.jpeg_quality] if output.image == "jpg" else []
-    done, data = cv2.imencode(f".{output.image}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    """An RGB image (H, W, 3) as PNG or JPEG."""
+    if output.image == "png":
+        return maps.encode_png(image)
+    options = [cv2.IMWRITE_JPEG_QUALITY, output.jpeg_quality]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
     if not done:
-        raise OSError(f"OpenCV could not encode an image of shape {image.shape} as {output.image}")
+        raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")
     return bytes(data)
 
 
-def yolo_lines(labels: Labels) -> str:
-    """Lines of a YOLO segmentation label: class index, then x and y of the outline's vertices in [0, 1]."""
-    return "".join(
-        f"{label.class_index} {' '.join(f'{value:.6f}' for value in polygon.ravel())}\n"
-        for label in labels.instances
-        for polygon in [label.polygon / (labels.width, labels.height)]
-    )
-
-
-def write_exr(path: Path, frame: Frame) -> None:
-    """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
-    import OpenEXR
-
-    fixed = ("depth", "instance", "proxy_instance", "normal", "light")
-    layers = {**{name: getattr(frame, name) for name in fixed}, **frame.layers}
-    names = {"depth": "Z", "alpha": "A"}
-    axes = {"normal": "XYZ"}
-    channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}
-    for layer, values in layers.items():
-        if values.ndim == 2:
-            channels[names.get(layer, layer)] = values
-        else:
-            channels |= {f"{layer}.{axis}": values[..., i] for i, axis in enumerate(axes.get(layer, "RGB"))}
-    kinds = {"f": np.float32, "u": np.uint32, "i": np.uint32, "b": np.uint32}
-    contiguous = {name: np.ascontiguousarray(c, dtype=kinds[c.dtype.kind]) for name, c in channels.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, contiguous) as file:
-        file.write(str(path))
-
-
-def write_collection(root: Path, records: Iterable[Record], class_names: Sequence[str], formats: Iterable[str]) -> None:
+def write_collection(root: Path, records: Iterable[Record], catalogue: Catalogue, formats: Iterable[str]) -> None:
     """Write what describes a whole dataset, from the ``records`` of its frames, which are iterated several times."""
-    if "yolo" in formats:
-        write_text(root / "data.yaml", data_yaml(class_names, {record["split"] for record in records}))
-    if "coco" in formats:
-        (root / "annotations").mkdir(exist_ok=True)
-        for split in SPLITS:
-            chosen = (record for record in records if record["split"] == split)
-            write_text(root / f"annotations/instances_{split}.json", json.dumps(coco(chosen, class_names)))
-
-
-def data_yaml(class_names: Sequence[str], splits: Iterable[str]) -> str:
-    """Description of a dataset for Ultralytics.
-
-    It has no ``path``: Ultralytics then resolves the splits against the file's own folder, wherever it is run.
-    """
-    present = [split for split in SPLITS if split in splits]
-    lines = ["# Paths are relative to this file."]
-    for split in SPLITS:
-        if split in present or not present:
-            lines.append(f"{split}: images/{split}")
-        else:
-            lines.append(f"{split}: images/{present[0]} # there are no images for {split}; Ultralytics wants some")
-    lines += ["names:", *(f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names))]
-    return "\n".join(lines) + "\n"
-
-
-def coco(records: Iterable[Record], class_names: Sequence[str]) -> dict[str, Any]:
-    """COCO instance annotations of some frames; image ids are frame indices."""
-    images: list[Mapping[str, Any]] = []
-    annotations: list[Mapping[str, Any]] = []
-    for record in records:
-        width, height = record["labels"]["size"]
-        image = next(Path(file).name for file in record["files"] if file.startswith("images/"))
-        images.append({"id": record["index"], "file_name": image, "width": width, "height": height})
-        for label in record["labels"]["instances"]:
-            x0, y0, x1, y1 = label["box"]
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": record["index"],
-                    "category_id": label["class_index"] + 1,
-                    "bbox": [x0, y0, x1 - x0, y1 - y0],
-                    "area": label["area"],
-                    "iscrowd": 0,
-                    "segmentation": {"size": [height, width], "counts": label["rle"]},
-                }
-            )
-    categories = [{"id": i, "name": name, "supercategory": "object"} for i, name in enumerate(class_names, start=1)]
-    return {"images": images, "annotations": annotations, "categories": categories}
+    formats = set(formats)
+    classes, points = catalogue.class_names, catalogue.keypoint_names
+    splits = {record["split"] for record in records}
+    for task in formats & set(TASKS):
+        text = data_yaml(classes, splits, points if task == "yolo-pose" else None)
+        write_text(root / f"{TASKS[task].folder}data.yaml", text)
+    describe: dict[str, tuple[str, Callable[[Iterable[Record]], dict[str, Any]]]] = {
+        "coco": ("instances", lambda chosen: coco.instances_json(chosen, classes, points, amodal=False)),
+        "amodal": ("amodal", lambda chosen: coco.instances_json(chosen, classes, points, amodal=True)),
+        "panoptic": ("panoptic", lambda chosen: coco.panoptic_json(chosen, classes)),
+        "poses": ("poses", lambda chosen: coco.poses_json(chosen, classes, catalogue.assets)),
+    }
+    for format, (name, describe_split) in describe.items():
+        if format in formats:
+            for split in SPLITS:
+                content = describe_split(record for record in records if record["split"] == split)
+                write_text(root / f"annotations/{name}_{split}.json", json.dumps(content))
+    if "bop" in formats:
+        bop.write_scenes(root, records)
+        bop.write_models(root, catalogue.meshes)
+    if "colmap" in formats:
+        write_colmap(root, records)

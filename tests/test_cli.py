@@ -58,7 +58,8 @@ def write_dataset(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
         rendered=3,
         images={"train": 2, "val": 1},
         instances={"nut": 4, "bolt": 5},
-        dropped={},
+        dropped={"small": 2, "hidden": 0},
+        marked={"occluded": 1},
         contact_sheet=tmp_path / "out/contact_sheet.jpg",
     )
     calls = Calls(summary)
@@ -84,6 +85,7 @@ def test_render_passes_every_option_on(
     assert write_dataset.kwargs == {"frames": 3, "workers": 2, "overwrite": True}
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"dataset: {tmp_path / 'out'} (2 train, 1 val; 9 labelled instances)"
+    assert lines[1] == "not labelled: 2 small; marked: 1 occluded"
     assert lines[-1] == f"contact sheet: {tmp_path / 'out/contact_sheet.jpg'}"
 
 
@@ -195,7 +197,7 @@ def test_doctor_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         (["--size", "-1x3"], "--size must be WIDTHxHEIGHT"),
         (["--size", "0x3"], "scene.yaml: output.width: must be >= 1 (got 0)"),
         (["--seed", "-1"], "scene.yaml: seed: must be >= 0 (got -1)"),
-        (["--format", "yolo,zip"], "output.formats[1]: must be 'yolo', 'coco' or 'exr' (got \"zip\")"),
+        (["--format", "yolo,zip"], "output.formats[1]: must be 'yolo', 'yolo-detect', "),
         (["-n", "13"], "(got 13)"),
         (["-n", "0"], "(got 0)"),
         (["--workers", "0"], "(got 0)"),

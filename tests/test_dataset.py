@@ -17,12 +17,13 @@ from mitsplat import dataset
 from mitsplat.dataset import write_dataset
 from mitsplat.engine import FrameError
 from mitsplat.errors import InputError
+from mitsplat.files import SPLITS
 from mitsplat.label import LabelRules, Labels, Silhouette, Truth, label_instances
 from mitsplat.manifest import Manifest
 from mitsplat.scene import load_scene, plan_frame, random_stream
 from mitsplat.settle import Instance, Layout, RestCertificate
 from mitsplat.sheet import class_colour, draw_labels
-from mitsplat.writers import SPLITS, data_yaml
+from mitsplat.yolo import data_yaml
 
 CERTIFICATE = RestCertificate(
     rested=True,
@@ -235,7 +236,7 @@ class TestSameBytes:
     def test_stopped_between_image_and_label(self, scene, tmp_path, undisturbed, monkeypatch):
         out = tmp_path / "out"
 
-        def fail(labels):
+        def fail(*args):
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mitsplat.label import LabelRules, Labels, Silhouette, Truth, label_instances
 from mitsplat.outline import fill_polygon, outline
-from mitsplat.writers import yolo_lines
+from mitsplat.yolo import yolo_lines
 
 
 @dataclass(frozen=True)

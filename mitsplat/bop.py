@@ -1,0 +1,134 @@
+"""BOP datasets (Benchmark for 6D Object Pose estimation), one scene for each layout.
+
+::
+
+    bop/models/obj_000001.ply, models_info.json      proxy meshes [mm]; object ids are positions in ``objects`` + 1
+    bop/<split>/000000/scene_camera.json, scene_gt.json, scene_gt_info.json
+    bop/<split>/000000/rgb/000003.png, depth/000003.png, mask/000003_000000.png, mask_visib/000003_000000.png
+
+Definitions are those of the BOP toolkit (``docs/bop_datasets_format.md``, ``scripts/calc_gt_info.py``): the silhouette
+is counted up to one image beyond each border, boxes are (x, y, x_max - x_min, y_max - y_min), pixel centres are whole
+numbers. The one difference: what is visible is known exactly, where the toolkit compares depths within 15 mm.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
+
+from mitsplat.coco import camera_of
+from mitsplat.files import Record, write_file, write_text
+from mitsplat.label import Labels
+
+MILLIMETRES = 1000.0
+
+
+def scene_folder(record: Record) -> str:
+    """Folder of the frame's scene, relative to the dataset."""
+    return f"bop/{record['split']}/{record['layout']:06d}"
+
+
+def mask_images(labels: Labels) -> Iterable[tuple[str, int, npt.NDArray[np.uint8]]]:
+    """(folder, position of the instance, picture of 0 and 255) of every mask of a frame."""
+    for position, label in enumerate(labels.instances):
+        for folder, box, mask in (("mask", label.amodal.box, label.amodal.mask), ("mask_visib", label.box, label.mask)):
+            x0, y0, x1, y1 = box
+            picture = np.zeros((labels.height, labels.width), dtype=np.uint8)
+            picture[y0:y1, x0:x1] = np.where(mask, np.uint8(255), np.uint8(0))
+            yield folder, position, picture
+
+
+def write_scenes(root: Path, records: Iterable[Record]) -> None:
+    """Write the annotations of all scenes."""
+    scenes: dict[str, dict[str, dict[str, Any]]] = defaultdict(lambda: {"camera": {}, "gt": {}, "gt_info": {}})
+    for record in records:
+        scene, index = scenes[scene_folder(record)], str(record["index"])
+        scene["camera"][index] = camera_entry(record)
+        scene["gt"][index] = pose_entries(record)
+        scene["gt_info"][index] = info_entries(record)
+    for folder, parts in scenes.items():
+        for part, content in parts.items():
+            write_text(root / folder / f"scene_{part}.json", json.dumps(content))
+
+
+def write_models(root: Path, meshes: Sequence[trimesh.Trimesh]) -> None:
+    """Write the objects' meshes, and their bounds and diameters."""
+    info = {}
+    for number, mesh in enumerate(meshes, start=1):
+        scaled = mesh.copy()
+        scaled.apply_scale(MILLIMETRES)
+        data = trimesh.exchange.ply.export_ply(scaled, encoding="ascii", vertex_normal=True)
+        write_file(root / f"bop/models/obj_{number:06d}.ply", lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
+        low, extents = scaled.bounds[0], scaled.extents
+        info[str(number)] = {
+            "diameter": diameter(scaled),
+            **{f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)},
+            **{f"size_{axis}": float(value) for axis, value in zip("xyz", extents, strict=True)},
+        }
+    write_text(root / "bop/models/models_info.json", json.dumps(info, indent=1))
+
+
+def diameter(mesh: trimesh.Trimesh) -> float:
+    """Largest distance of two vertices."""
+    points = mesh.vertices
+    corners = points[ConvexHull(points).vertices]
+    return float(pdist(corners).max())
+
+
+def camera_entry(record: Record) -> dict[str, Any]:
+    """The frame in ``scene_camera.json``."""
+    camera = camera_of(record)
+    intrinsics = camera.intrinsics
+    intrinsics[:2, 2] -= 0.5
+    pose = camera.camera_from_world
+    return {
+        "cam_K": intrinsics.ravel().tolist(),
+        "depth_scale": record["depth_scale"],
+        "cam_R_w2c": pose[:3, :3].ravel().tolist(),
+        "cam_t_w2c": (MILLIMETRES * pose[:3, 3]).tolist(),
+    }
+
+
+def pose_entries(record: Record) -> list[dict[str, Any]]:
+    """The frame in ``scene_gt.json``."""
+    camera_from_world = camera_of(record).camera_from_world
+    entries = []
+    for label in record["labels"]["instances"]:
+        pose = camera_from_world @ np.array(label["world_from_object"])
+        entries.append(
+            {
+                "cam_R_m2c": pose[:3, :3].ravel().tolist(),
+                "cam_t_m2c": (MILLIMETRES * pose[:3, 3]).tolist(),
+                "obj_id": label["asset"] + 1,
+            }
+        )
+    return entries
+
+
+def info_entries(record: Record) -> list[dict[str, Any]]:
+    """The frame in ``scene_gt_info.json``."""
+
+    def box(bounds: Sequence[int]) -> list[int]:
+        x0, y0, x1, y1 = bounds
+        return [x0, y0, x1 - 1 - x0, y1 - 1 - y0]
+
+    return [
+        {
+            "bbox_obj": box(label["silhouette_box"]),
+            "bbox_visib": box(label["box"]),
+            "px_count_all": label["silhouette_area"],
+            "px_count_valid": label["depth_area"],
+            "px_count_visib": label["area"],
+            "visib_fract": label["area"] / label["silhouette_area"],
+        }
+        for label in record["labels"]["instances"]
+    ]

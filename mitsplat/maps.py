@@ -1,0 +1,125 @@
+"""Pictures of per-pixel values: layers as OpenEXR, depth, normals, ids and classes as PNG, optical flow as ``.flo``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.camera import Camera
+from mitsplat.label import Labels
+
+if TYPE_CHECKING:
+    from mitsplat.frame import Frame
+
+DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
+"""Millimetres per unit of a depth picture: the first by which the frame's farthest depth fits 16 bits."""
+
+UNKNOWN_FLOW = 1e10
+"""Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
+
+
+def write_exr(path: Path, frame: Frame) -> None:
+    """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
+    import OpenEXR
+
+    fixed = ("depth", "instance", "proxy_instance", "normal", "light")
+    layers = {**{name: getattr(frame, name) for name in fixed}, **frame.layers}
+    names = {"depth": "Z", "alpha": "A"}
+    axes = {"normal": "XYZ"}
+    channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}
+    for layer, values in layers.items():
+        if values.ndim == 2:
+            channels[names.get(layer, layer)] = values
+        else:
+            channels |= {f"{layer}.{axis}": values[..., i] for i, axis in enumerate(axes.get(layer, "RGB"))}
+    kinds = {"f": np.float32, "u": np.uint32, "i": np.uint32, "b": np.uint32}
+    contiguous = {name: np.ascontiguousarray(c, dtype=kinds[c.dtype.kind]) for name, c in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, contiguous) as file:
+        file.write(str(path))
+
+
+def encode_png(picture: npt.NDArray[Any]) -> bytes:
+    """A grey (H, W) or RGB (H, W, 3) picture of 8 or 16 bits as PNG.
+
+    It takes OpenCV's defaults (one filter, run-length strategy): a third of the time of its explicit level 3 for 5 to
+    10 % more bytes on noisy frames.
+    """
+    stored = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
+    done, data = cv2.imencode(".png", stored)
+    if not done:
+        raise OSError(f"OpenCV could not encode an image of shape {picture.shape} as png")
+    return bytes(data)
+
+
+def depth_scale(depth: npt.NDArray[np.floating[Any]]) -> float:
+    """Millimetres per unit of the frame's depth picture."""
+    farthest = float(depth.max(initial=0.0)) * 1000
+    return next((scale for scale in DEPTH_SCALES if farthest <= 65535 * scale), DEPTH_SCALES[-1])
+
+
+def depth_picture(depth: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint16]:
+    """Depths along the optical axis [m] in units of :func:`depth_scale`; 0 where nothing is, (H, W)."""
+    units = np.rint(depth * (1000 / depth_scale(depth)))
+    return np.where(depth > 0, np.clip(units, 1, 65535), 0).astype(np.uint16)
+
+
+def normal_picture(normal: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint16]:
+    """World-space normals (H, W, 3) as 16-bit RGB, 65535 (n + 1) / 2; black where there is none."""
+    encoded = np.rint(65535 * (np.clip(normal, -1, 1) + 1) / 2)
+    return np.where(normal.any(axis=-1, keepdims=True), encoded, 0).astype(np.uint16)
+
+
+def instance_picture(labels: Labels) -> npt.NDArray[np.uint16]:
+    """Id of the labelled instance of every pixel, 0 for anything else, (H, W)."""
+    picture = np.zeros((labels.height, labels.width), dtype=np.uint16)
+    for label in labels.instances:
+        x0, y0, x1, y1 = label.box
+        picture[y0:y1, x0:x1][label.mask] = label.id
+    return picture
+
+
+def semantic_picture(labels: Labels, ids: npt.NDArray[np.integer[Any]], class_names: Sequence[str]) -> npt.NDArray[Any]:
+    """Class index + 1 of every pixel, 0 for the environment, the largest value for instances without a label, (H, W).
+
+    Args:
+        labels: Labels of the frame.
+        ids: The id map that they come from, (H, W).
+        class_names: All classes; up to 254 fit 8 bits.
+    """
+    kind = np.uint8 if len(class_names) < 255 else np.uint16
+    picture = np.where(ids > 0, np.iinfo(kind).max, 0).astype(kind)
+    for label in labels.instances:
+        x0, y0, x1, y1 = label.box
+        picture[y0:y1, x0:x1][label.mask] = label.class_index + 1
+    return picture
+
+
+def optical_flow(depth: npt.NDArray[np.floating[Any]], camera: Camera, following: Camera) -> npt.NDArray[np.float32]:
+    """Motion of every pixel to the next view of the same, still layout [px], (H, W, 2).
+
+    :data:`UNKNOWN_FLOW` where nothing is seen, or what is seen lies behind the next camera. Points that something hides
+    from the next camera have a flow like any other.
+    """
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    z = np.asarray(depth, dtype=np.float64).reshape(-1, 1)
+    local = np.concatenate([camera.ray_slopes(pixels) * z, z], axis=1)
+    pose = camera.world_from_camera
+    moved, ahead = following.project(local @ pose[:3, :3].T + pose[:3, 3])
+    known = (z[:, 0] > 0) & (ahead > following.near)
+    flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
+    return flow.reshape(height, width, 2).astype(np.float32)
+
+
+def write_flow(path: Path, flow: npt.NDArray[np.float32]) -> None:
+    """Write optical flow (H, W, 2) as Middlebury's ``.flo``: a tag, width, height, then pairs of floats."""
+    height, width = flow.shape[:2]
+    header = b"PIEH" + np.array([width, height], dtype="<i4").tobytes()
+    path.write_bytes(header + np.ascontiguousarray(flow, dtype="<f4").tobytes())

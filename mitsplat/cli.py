@@ -1,12 +1,12 @@
 """The command ``mitsplat``: arguments to calls, and errors in one sentence instead of a traceback.
 
-Exit status: 0 done, 1 the doctor found something missing, 2 bad input, 130 interrupted.
+Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 130 interrupted.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,6 +28,7 @@ app = typer.Typer(
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
 FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, from 0.")]
+DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset folder.")]
 QualityName = Literal["fast", "balanced", "exact"]
 
 
@@ -90,12 +91,26 @@ def render(
         summary = write_dataset(loaded, out, frames=frames, workers=workers, overwrite=overwrite, progress=progress)
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
-    dropped, marked = (
-        ", ".join(f"{count} {reason}" for reason, count in counts.items() if count) or "none"
-        for counts in (summary.dropped, summary.marked)
-    )
-    typer.echo(f"not labelled: {dropped}; marked: {marked}")
+    typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
     typer.echo(f"contact sheet: {summary.contact_sheet}")
+
+
+@app.command()
+def audit(dataset: DatasetFolder) -> None:
+    """Re-check DATASET from its files alone.
+
+    Every violation is one line; with any, the exit status is 1.
+    """
+    from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, audit_dataset
+
+    found = audit_dataset(dataset)
+    for file, text in found.violations:
+        typer.echo(f"{file}: {text}")
+    typer.echo(f"{found.frames} frames, {found.instances} instances, {found.files} files")
+    typer.echo(f"not labelled: {_counts(found.dropped)}; marked: {_counts(found.marked)}")
+    typer.echo(f"polygons below an IoU of {POLYGON_IOU} (masks in parts, over {POLYGON_AREA} px): {found.low_polygons}")
+    typer.echo(f"violations: {len(found.violations)}")
+    raise typer.Exit(1 if found.violations else 0)
 
 
 @app.command()
@@ -217,6 +232,10 @@ def _common(
     ] = False,
 ) -> None:
     pass
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in counts.items() if count) or "none"
 
 
 def _fail(sentence: str, *, status: int = 2) -> None:

@@ -1,0 +1,293 @@
+"""The audit: a clean dataset passes, and each planted fault is found though its hash says that all is well."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools import mask as coco_mask
+from test_cli import run
+from test_dataset import render, settle
+
+from mitsplat.audit import audit_dataset
+from mitsplat.dataset import write_dataset
+from mitsplat.errors import InputError
+from mitsplat.files import Record
+from mitsplat.scene import load_scene
+from mitsplat.spec import FORMATS
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from conftest import box_asset
+    from ruamel.yaml import YAML
+
+    folder = tmp_path_factory.mktemp("audit")
+    for asset in (box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))):
+        asset.save(folder / "assets" / asset.name)
+        manual = folder / "assets" / asset.name / "asset.yaml"
+        manual.write_text(manual.read_text() + "keypoints: {top: [0, 0, 0.005]}\n")
+    data = {
+        "name": "small",
+        "objects": [{"asset": "assets/nut"}, {"asset": "assets/bolt"}],
+        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+        "output": {"width": 64, "height": 48, "layouts": 3, "views": 2, "formats": list(FORMATS)},
+    }
+    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
+    scene = load_scene(folder / "scene.yaml")
+    write_dataset(scene, folder / "out", render=render, settle=settle)
+    return folder / "out"
+
+
+@pytest.fixture
+def dataset(clean: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(clean, tmp_path / "out"))
+
+
+def records_of(root: Path) -> list[Record]:
+    return [json.loads(line) for line in (root / "manifest.jsonl").read_text().splitlines()]
+
+
+def store(root: Path, records: list[Record], *, describe: bool = True) -> None:
+    """Write the manifest with the hashes of the files as they are, and what describes all frames to match it."""
+    for record in records:
+        for file in record["files"]:
+            record["files"][file] = hashlib.sha256((root / file).read_bytes()).hexdigest()
+    (root / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    if describe:
+        from mitsplat.writers import Catalogue, write_collection
+
+        content = json.loads((root / "dataset.json").read_text())
+        kept = {path: path.read_bytes() for path in (root / "bop/models").iterdir()}
+        catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], ())
+        write_collection(root, records, catalogue, content["scene"]["output"]["formats"])
+        for path, data in kept.items():
+            path.write_bytes(data)
+
+
+def first(records: list[Record]) -> Any:
+    return records[0]["labels"]["instances"][0]
+
+
+def decode(records: list[Record], label: Any, key: str = "rle") -> np.ndarray:
+    width, height = records[0]["labels"]["size"]
+    return np.asarray(coco_mask.decode({"size": [height, width], "counts": label[key]}))
+
+
+def encode(mask: np.ndarray) -> str:
+    return str(coco_mask.encode(np.asfortranarray(mask))["counts"].decode())
+
+
+def test_a_clean_dataset_has_no_violations(clean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = audit_dataset(clean)
+    assert found.violations == ()
+    assert found.frames == 6 and found.instances > 10
+    assert run("audit", clean) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "violations: 0"
+
+
+def lose_a_label(root: Path, records: list[Record]) -> None:
+    path = root / "labels/train/000000.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
+
+
+def swap_a_class(root: Path, records: list[Record]) -> None:
+    path = root / "labels/train/000000.txt"
+    path.write_text(str(1 - int(path.read_text()[0])) + path.read_text()[1:])
+
+
+def move_a_polygon(root: Path, records: list[Record]) -> None:
+    path = root / "labels/train/000000.txt"
+    head, *rest = path.read_text().splitlines()
+    kind, *values = head.split()
+    moved = [kind, *(f"{float(value) + (0.04 if i % 2 == 0 else 0):.6f}" for i, value in enumerate(values))]
+    path.write_text("\n".join([" ".join(moved), *rest]) + "\n")
+
+
+def fill_a_hole(root: Path, records: list[Record]) -> None:
+    """The manifest's mask has a hole, the polygon does not."""
+    label = first(records)
+    mask = decode(records, label)
+    x0, y0, x1, y1 = label["box"]
+    mask[(y0 + y1) // 2 - 2 : (y0 + y1) // 2 + 3, (x0 + x1) // 2 - 2 : (x0 + x1) // 2 + 3] = 0
+    label |= {"rle": encode(mask), "area": int(mask.sum())}
+    label["visible_fraction"] = round(label["area"] / label["amodal_area"], 6)
+
+
+def overlap_masks(root: Path, records: list[Record]) -> None:
+    one, other = records[0]["labels"]["instances"][:2]
+    other |= {key: one[key] for key in ("rle", "box", "area", "amodal_rle", "amodal_box", "amodal_area")}
+    other |= {key: one[key] for key in ("silhouette_area", "silhouette_box", "visible_fraction", "truncation")}
+
+
+def claim_visibility(root: Path, records: list[Record]) -> None:
+    first(records)["visible_fraction"] = 0.5
+
+
+def deny_truncation(root: Path, records: list[Record]) -> None:
+    first(records)["silhouette_area"] += 100
+
+
+def scale_a_pose(root: Path, records: list[Record]) -> None:
+    first(records)["world_from_object"][0][0] = 1.5
+
+
+def merge_ids(root: Path, records: list[Record]) -> None:
+    path = root / "instances/train/000000.png"
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture[picture == 2] = 1
+    cv2.imwrite(str(path), picture)
+
+
+def resize_an_image(root: Path, records: list[Record]) -> None:
+    path = root / "images/train/000000.png"
+    cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (32, 24)))
+
+
+def repeat_an_image(root: Path, records: list[Record]) -> None:
+    shutil.copyfile(root / "images/train/000000.png", root / "images/train/000001.png")
+
+
+def leak_a_layout(root: Path, records: list[Record]) -> None:
+    record = next(record for record in records if record["layout"] == records[0]["layout"] and record["view"] == 1)
+    record["split"] = "val"
+
+
+def paint_a_class(root: Path, records: list[Record]) -> None:
+    path = root / "semantic/train/000000.png"
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), np.where(picture == 1, 2, picture).astype(np.uint8))
+
+
+def erase_depth(root: Path, records: list[Record]) -> None:
+    path = root / "depth/train/000000.png"
+    cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+
+def erode_a_bop_mask(root: Path, records: list[Record]) -> None:
+    path = root / "bop/train/000000/mask_visib/000000_000000.png"
+    cv2.imwrite(str(path), cv2.erode(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.ones((3, 3))))
+
+
+def widen_a_box(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-detect/labels/train/000000.txt"
+    values = path.read_text().split()
+    path.write_text(path.read_text().replace(values[3], f"{float(values[3]) * 1.1:.6f}", 1))
+
+
+def turn_a_rotated_box(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-obb/labels/train/000000.txt"
+    kind, *values = path.read_text().splitlines()[0].split()
+    turned = " ".join([kind, *(f"{float(value) + 0.02 * (i in (0, 4)):.6f}" for i, value in enumerate(values))])
+    path.write_text("\n".join([turned, *path.read_text().splitlines()[1:]]) + "\n")
+
+
+def flip_a_keypoint(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-pose/labels/train/000000.txt"
+    head, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([head[:-1] + str((int(head[-1]) + 1) % 3), *rest]) + "\n")
+
+
+def shift_segments(root: Path, records: list[Record]) -> None:
+    path = root / "panoptic/train/000000.png"
+    cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), 3, axis=1))
+
+
+FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
+    lose_a_label: ("labels/train/000000.txt", "lines for"),
+    swap_a_class: ("labels/train/000000.txt", "class is"),
+    move_a_polygon: ("labels/train/000000.txt", "does not give its mask back"),
+    fill_a_hole: ("labels/train/000000.txt", "does not give its mask back"),
+    overlap_masks: ("manifest.jsonl, frame 0", "belong to more than one instance"),
+    claim_visibility: ("manifest.jsonl, frame 0", "its visible fraction is"),
+    deny_truncation: ("manifest.jsonl, frame 0", "its truncation is"),
+    scale_a_pose: ("manifest.jsonl, frame 0", "its pose is not a rotation"),
+    merge_ids: ("instances/train/000000.png", "pixels differ from the masks"),
+    resize_an_image: ("images/train/000000.png", "is 32x24 px"),
+    repeat_an_image: ("images/train/000001.png", "is the same picture as"),
+    leak_a_layout: ("manifest.jsonl", "are in both train and val"),
+    paint_a_class: ("semantic/train/000000.png", "differ from the masks' classes"),
+    erase_depth: ("depth/train/000000.png", "have no depth"),
+    erode_a_bop_mask: ("bop/train/000000/mask_visib/000000_000000.png", "differ from the manifest's mask"),
+    widen_a_box: ("yolo-detect/labels/train/000000.txt", "is not its box"),
+    turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is not the smallest rectangle"),
+    flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints are not"),
+    shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
+}
+
+
+@pytest.mark.parametrize("plant", FAULTS, ids=lambda plant: plant.__name__)
+def test_a_planted_fault_is_found(
+    dataset: Path, plant: Callable[[Path, list[Record]], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = records_of(dataset)
+    plant(dataset, records)
+    store(dataset, records)
+    assert run("audit", dataset) == 1
+    file, text = FAULTS[plant]
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith(f"{file}: ") and text in line for line in lines), lines
+
+
+@pytest.mark.parametrize("file", ["images/train/000000.png", "flow/train/000000.flo", "layers/train/000000.exr"])
+def test_a_file_that_changed_or_is_missing_is_found(dataset: Path, file: str) -> None:
+    path = dataset / file
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    assert (file, "is not what was written: its SHA-256 differs from the manifest's") in audit_dataset(
+        dataset
+    ).violations
+    path.unlink()
+    assert (file, "is missing") in audit_dataset(dataset).violations
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "place"),
+    [
+        ("annotations/instances_train.json", lambda c: c["annotations"][0]["bbox"].__setitem__(0, 1), "bbox[0]"),
+        ("annotations/instances_train.json", lambda c: c["annotations"][0].update(category_id=9), "category_id"),
+        ("annotations/amodal_train.json", lambda c: c["annotations"].pop(), "annotations"),
+        ("annotations/panoptic_train.json", lambda c: c["categories"][0].update(name="x"), "categories[0].name"),
+        ("bop/train/000000/scene_gt.json", lambda c: c["0"][0]["cam_t_m2c"].__setitem__(2, 5.0), "cam_t_m2c[2]"),
+        ("bop/train/000000/scene_gt_info.json", lambda c: c["0"][0].update(visib_fract=0.1), "visib_fract"),
+    ],
+)
+def test_annotations_that_disagree_with_the_manifest_are_found(
+    dataset: Path, file: str, change: Callable[[Any], None], place: str
+) -> None:
+    content = json.loads((dataset / file).read_text())
+    change(content)
+    (dataset / file).write_text(json.dumps(content))
+    (found,) = audit_dataset(dataset).violations
+    assert found[0] == file and place in found[1]
+
+
+def test_permuted_class_names_are_found(dataset: Path) -> None:
+    path = dataset / "data.yaml"
+    path.write_text(path.read_text().replace("bolt", "x").replace("nut", "bolt").replace("x", "nut"))
+    assert [file for file, _ in audit_dataset(dataset).violations] == ["data.yaml"]
+
+
+def test_files_of_no_frame_are_found(dataset: Path) -> None:
+    shutil.copyfile(dataset / "images/train/000000.png", dataset / "images/train/000099.png")
+    (dataset / "labels/train.cache").write_text("")
+    assert audit_dataset(dataset).violations == (("images/train/000099.png", "belongs to no frame of the manifest"),)
+
+
+def test_a_damaged_manifest_is_found(dataset: Path) -> None:
+    with (dataset / "manifest.jsonl").open("a") as file:
+        file.write('{"index": 7}\n')
+    (found,) = [text for file, text in audit_dataset(dataset).violations]
+    assert found.startswith("line 7 is not the record of a frame")
+
+
+def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="must be a dataset of mitsplat"):
+        audit_dataset(tmp_path)

@@ -114,6 +114,23 @@ def audit(dataset: DatasetFolder) -> None:
 
 
 @app.command()
+def report(
+    dataset: DatasetFolder,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Page to write (.html); report.html in DATASET if absent.")
+    ] = None,
+) -> None:
+    """Write a page to look at DATASET by.
+
+    It is one HTML file that needs no network: samples with their labels, statistics, audit, origin.
+    """
+    from mitsplat.report import write_report
+
+    page, found = write_report(dataset, out)
+    typer.echo(f"report: {page} ({len(found.violations)} violations)")
+
+
+@app.command()
 def preview(
     scene: SceneFile,
     frame: FrameIndex = 0,
@@ -121,8 +138,11 @@ def preview(
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 640x360.")] = None,
     seed: Annotated[int | None, typer.Option(help="Decides everything that is random.")] = None,
     quality: Annotated[QualityName | None, typer.Option(help="Rendering preset.")] = None,
+    layers: Annotated[
+        bool, typer.Option("--layers/--no-layers", help="Show ids, depth, light and highlight beside the picture.")
+    ] = True,
 ) -> None:
-    """Render one frame of SCENE to a picture."""
+    """Render one frame of SCENE to a picture, with its layers side by side."""
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(f"--out must end in .png or .jpg (got {out})")
     if not out.parent.is_dir():
@@ -131,9 +151,11 @@ def preview(
 
     from mitsplat.frame import render_frame
     from mitsplat.scene import load_scene
+    from mitsplat.sheet import layer_sheet
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality))
-    Image.fromarray(render_frame(loaded, frame).image).save(out)
+    rendered = render_frame(loaded, frame)
+    Image.fromarray(layer_sheet(rendered) if layers else rendered.image).save(out)
     typer.echo(f"picture: {out}")
 
 

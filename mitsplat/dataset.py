@@ -6,6 +6,7 @@
     annotations/instances_train.json, instances_val.json    data.yaml    contact_sheet.jpg
     manifest.jsonl    one line per frame: files and their SHA-256, camera, draws, labels with masks and poses
     timings.jsonl     seconds per stage; apart, so that equal datasets have equal manifests
+    runs.jsonl        the command of every run that made frames
     dataset.json      what decides the content: effective scene, hashes of its inputs, version
     scene/            the scene file as it was given
     layouts/0000.json where the objects came to rest
@@ -21,8 +22,11 @@ import hashlib
 import importlib.metadata
 import json
 import os
+import platform
 import re
+import shlex
 import shutil
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -56,6 +60,7 @@ Progress = Callable[[int, int, str], None]
 _CONTENT = "dataset.json"
 _MANIFEST = "manifest.jsonl"
 _TIMINGS = "timings.jsonl"
+_RUNS = "runs.jsonl"
 _SHEET = "contact_sheet.jpg"
 _LOCK = ".lock"
 _UNFINISHED = re.compile(r"\.lock|\.dataset\.json\.\d+\.part")
@@ -64,7 +69,7 @@ _ENTRIES = (
     *("images", "labels", "layers", "annotations", "layouts", "scene"),
     *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "bop", "colmap"),
     *("depth", "normals", "instances", "semantic", "flow", "report.html"),
-    *("data.yaml", _SHEET, _MANIFEST, _TIMINGS, _CONTENT, _LOCK),
+    *("data.yaml", _SHEET, _MANIFEST, _TIMINGS, _RUNS, _CONTENT, _LOCK),
 )
 
 
@@ -148,6 +153,9 @@ def write_dataset(
                 progress(len(manifest), max(count, len(manifest)), text)
 
         note("starting")
+        if layouts:
+            command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+            append_line(out / _RUNS, {"command": command, "python": platform.python_version(), "workers": workers})
         make = _FrameMaker(scene, catalogue, out, render or _default_render(), settle or _default_settle())
         with closing(run_frames(make, layouts, workers=workers, note=note)) as results:
             for record, seconds in results:
@@ -286,6 +294,7 @@ def _prepare(out: Path, scene: Scene, content: dict[str, Any]) -> None:
     if not (out / "scene" / scene.path.name).exists():
         write_file(out / "scene" / scene.path.name, lambda temporary: shutil.copyfile(scene.path, temporary))
     cut_torn_line(out / _TIMINGS)
+    cut_torn_line(out / _RUNS)
 
 
 def _remove_dataset(out: Path) -> None:

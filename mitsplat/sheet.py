@@ -1,4 +1,4 @@
-"""Pictures to check labels by: masks, boxes and class names drawn over images, and a contact sheet of a dataset."""
+"""Pictures to check labels by: labels drawn over images, a frame's layers side by side, a dataset's contact sheet."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import colorsys
 import math
 from collections.abc import Collection
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -14,6 +15,9 @@ import numpy.typing as npt
 from mitsplat.coco import image_file
 from mitsplat.files import Record, write_file
 from mitsplat.label import InstanceLabel, Labels
+
+if TYPE_CHECKING:
+    from mitsplat.frame import Frame
 
 Image = npt.NDArray[np.uint8]
 
@@ -47,6 +51,29 @@ def draw_labels(image: Image, labels: Labels, *, opacity: float = 0.45) -> Image
     return drawn
 
 
+def layer_sheet(frame: Frame) -> Image:
+    """A frame's picture, labels, ids, depth, light and highlight side by side, each with a caption, RGB."""
+    known = frame.depth[frame.depth > 0]
+    near, far = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    share = np.clip((frame.depth - near) / max(far - near, 1e-9), 0, 1)
+    depth = cv2.applyColorMap(np.rint(255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    tiles = {
+        "picture": frame.image,
+        f"labels: {len(frame.labels.instances)} instances": draw_labels(frame.image, frame.labels),
+        "ids by splats": _id_colours(frame.instance),
+        f"depth: {near:.3g} to {far:.3g} m": np.where(frame.depth[..., None] > 0, depth, 0).astype(np.uint8),
+        "light: black 0, grey 1 (as captured), white 2": _grey(frame.light / 2),
+        "highlight: white 1, square root": _grey(np.sqrt(np.maximum(frame.layers["highlight"], 0))),
+    }
+    height, width = frame.image.shape[:2]
+    sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)
+    for i, (caption, tile) in enumerate(tiles.items()):
+        top, left = i // 3 * (height + _CAPTION + _GAP), i % 3 * (width + _GAP)
+        sheet[top : top + height, left : left + width] = tile
+        cv2.putText(sheet, caption, (left + 6, top + height + 17), _FONT, 0.5, (230, 230, 230), 1, cv2.LINE_AA)
+    return sheet
+
+
 def contact_sheet(root: Path, records: Collection[Record], path: Path, *, count: int = 16) -> None:
     """Write a JPEG of up to ``count`` frames, evenly spread over the ``records`` below ``root``, labels drawn.
 
@@ -63,6 +90,17 @@ def contact_sheet(root: Path, records: Collection[Record], path: Path, *, count:
         sheet[top : top + tile.shape[0], left : left + _TILE_WIDTH] = tile
     _, data = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
     write_file(path, lambda temporary: temporary.write_bytes(bytes(data)))
+
+
+def _id_colours(ids: npt.NDArray[np.uint16]) -> Image:
+    """Ids as the colours of as many classes, 0 as black, (H, W, 3)."""
+    present, position = np.unique(ids, return_inverse=True)
+    colours = np.array([class_colour(int(i)) if i else (0, 0, 0) for i in present], dtype=np.uint8)
+    return np.asarray(colours[position].reshape(*ids.shape, 3))
+
+
+def _grey(values: npt.NDArray[np.floating[Any]]) -> Image:
+    return np.asarray(np.rint(255 * np.clip(values, 0, 1)), dtype=np.uint8)
 
 
 def _tile(root: Path, record: Record) -> Image:

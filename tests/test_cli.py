@@ -128,7 +128,8 @@ def test_preview_writes_a_picture(scene_path: Path, monkeypatch: pytest.MonkeyPa
     image = np.full((4, 6, 3), (10, 20, 30), dtype=np.uint8)
     calls = Calls(SimpleNamespace(image=image))
     monkeypatch.setattr(frame, "render_frame", calls)
-    assert run("preview", scene_path, "--frame", 5, "-o", tmp_path / "a.png", "--size", "6x4") == 0
+    options = ("--frame", 5, "-o", tmp_path / "a.png", "--size", "6x4", "--no-layers")
+    assert run("preview", scene_path, *options) == 0
     scene, index = calls.args
     assert (scene.spec.output.width, index) == (6, 5)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
@@ -308,7 +309,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 def test_readme_documents_every_command_and_option() -> None:
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     commands = typer.main.get_command(app).commands
-    assert set(commands) >= {"render", "preview", "bake", "export", "schema", "doctor"}
+    assert set(commands) >= {"render", "audit", "report", "preview", "bake", "export", "schema", "doctor"}
     for name, command in commands.items():
         line = next((row for row in readme.splitlines() if row.startswith(f"| `mitsplat {name}")), None)
         assert line is not None, name

@@ -22,7 +22,7 @@ from mitsplat.label import LabelRules, Labels, Silhouette, Truth, label_instance
 from mitsplat.manifest import Manifest
 from mitsplat.scene import load_scene, plan_frame, random_stream
 from mitsplat.settle import Instance, Layout, RestCertificate
-from mitsplat.sheet import class_colour, draw_labels
+from mitsplat.sheet import class_colour, draw_labels, layer_sheet
 from mitsplat.yolo import data_yaml
 
 CERTIFICATE = RestCertificate(
@@ -102,7 +102,7 @@ def write(scene, out, **options):
     return write_dataset(scene, out, **{"render": render, "settle": settle, **options})
 
 
-def contents(root, *, without=("timings.jsonl", ".lock")):
+def contents(root, *, without=("timings.jsonl", "runs.jsonl", ".lock")):
     """SHA-256 of every file that must not depend on how the dataset was made."""
     files = (path for path in sorted(root.rglob("*")) if path.is_file() and path.name not in without)
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
@@ -407,6 +407,18 @@ class TestPictures:
 
     def test_colours_of_many_classes_differ(self):
         assert len({class_colour(i) for i in range(64)}) == 64
+
+    def test_layers_lie_side_by_side(self, scene):
+        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
+        frame.layers["highlight"] = np.zeros((48, 64, 3), dtype=np.float32)
+        sheet = layer_sheet(frame)
+        height, width = 48 + 24 + 6, 64 + 6
+        assert sheet.shape == (2 * height - 6, 3 * width - 6, 3)
+        tiles = [sheet[row : row + 48, left : left + 64] for row in (0, height) for left in (0, width, 2 * width)]
+        np.testing.assert_array_equal(tiles[0], frame.image)
+        np.testing.assert_array_equal(tiles[2].any(axis=-1), frame.instance > 0)
+        np.testing.assert_array_equal(tiles[3].any(axis=-1), frame.depth > 0)
+        assert (tiles[4] == 128).all() and not tiles[5].any()
 
     def test_the_sheet_shows_a_spread_of_frames(self, scene, tmp_path):
         summary = write(scene, tmp_path / "out")

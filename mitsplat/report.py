@@ -1,0 +1,346 @@
+"""One page to look at a dataset by: a single HTML file that needs no network, no server and no other file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import statistics
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
+from mitsplat.charts import bars, columns, heat_map, histogram
+from mitsplat.coco import image_file
+from mitsplat.files import Record, write_text
+from mitsplat.label import Labels, Silhouette
+from mitsplat.sheet import class_colour
+
+SAMPLES = 12
+"""Images that are shown, evenly spread over the dataset."""
+BRIGHTNESS_IMAGES = 200
+"""Images, evenly spread, that the brightness is read from."""
+
+_THUMBNAIL = 640
+_OVERLAYS = {"mask": "Masks", "box": "Boxes", "name": "Names", "alone": "Silhouettes, hidden parts included"}
+_SHOWN_FIRST = ("mask", "name")
+
+
+@dataclass
+class _Statistics:
+    """What is counted while the manifest is read once."""
+
+    images: Counter[str] = field(default_factory=Counter)
+    classes: Counter[str] = field(default_factory=Counter)
+    per_image: list[int] = field(default_factory=list)
+    shares: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    boxes: list[tuple[float, float, float, float]] = field(default_factory=list)
+    size: tuple[int, int] = (1, 1)
+
+    def add(self, record: Record) -> None:
+        labels = record["labels"]
+        width, height = self.size = tuple(labels["size"])
+        self.images[record["split"]] += 1
+        self.per_image.append(len(labels["instances"]))
+        for label in labels["instances"]:
+            self.classes[label["class"]] += 1
+            x0, y0, x1, y1 = label["box"]
+            self.boxes.append(((x0 + x1) / 2 / width, (y0 + y1) / 2 / height, (x1 - x0) / width, (y1 - y0) / height))
+            for key in ("visible_fraction", "truncation", "agreement", "boundary_f1", "polygon_iou"):
+                self.shares[key].append(label[key])
+
+
+def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit]:
+    """Write the page of a dataset, ``report.html`` in it by default.
+
+    Returns:
+        Its path, and the audit that it shows.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat.
+        OSError: If an image cannot be read or the page cannot be written.
+    """
+    root = Path(root)
+    out = root / "report.html" if out is None else Path(out)
+    audit = audit_dataset(root)
+    content = json.loads((root / "dataset.json").read_bytes())
+    records = [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
+    counted = _Statistics()
+    for record in records:
+        counted.add(record)
+    name = str(content["scene"]["name"])
+    parts = [
+        f"<h1>{html.escape(name)}</h1>",
+        _summary(content, counted, audit, root),
+        _audit(audit),
+        _samples(root, _spread(records, SAMPLES)),
+        _charts(counted, _brightness(root, _spread(records, BRIGHTNESS_IMAGES)), _seconds(root)),
+        _details(content),
+    ]
+    page = _PAGE.replace("{{title}}", html.escape(name)).replace("{{body}}", "\n".join(parts))
+    write_text(out, page)
+    return out, audit
+
+
+def _spread(records: list[Record], count: int) -> list[Record]:
+    chosen = np.unique(np.linspace(0, len(records) - 1, min(count, len(records))).round().astype(int))
+    return [records[i] for i in chosen]
+
+
+def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: Path) -> str:
+    runs = _lines(root / "runs.jsonl")
+    rows = {
+        "Images": ", ".join(f"{count} {split}" for split, count in sorted(counted.images.items())),
+        "Size": f"{counted.size[0]} x {counted.size[1]} px",
+        "Instances": str(sum(counted.classes.values())),
+        "Not labelled": _counts(audit.dropped),
+        "Marked": _counts(audit.marked),
+        "Labels from": content["scene"]["labels"]["source"],
+        "Formats": ", ".join(content["scene"]["output"]["formats"]),
+        "Seed": str(content["scene"]["seed"]),
+        "Command": " ; ".join(run["command"] for run in runs) or "unknown",
+        "mitsplat": content["mitsplat"],
+    }
+    lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
+    return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2><table>{lines}</table></section>'
+
+
+def _audit(audit: Audit) -> str:
+    verdict = "No violations" if not audit.violations else f"{len(audit.violations)} violations"
+    found = "".join(
+        f"<li><code>{html.escape(file)}</code>: {html.escape(text)}</li>" for file, text in audit.violations[:100]
+    )
+    more = f"<p>and {len(audit.violations) - 100} more</p>" if len(audit.violations) > 100 else ""
+    return (
+        f'<section aria-labelledby="audit"><h2 id="audit">Audit</h2>'
+        f'<p class="{"good" if not audit.violations else "bad"}">{verdict} in {audit.files} files, '
+        f"{audit.instances} instances.</p>"
+        f"<p>Masks of more than {POLYGON_AREA} px in several parts whose YOLO polygon has an IoU below {POLYGON_IOU}, "
+        f"because bridges join the parts: {audit.low_polygons}.</p>"
+        f"{f'<ul>{found}</ul>' if found else ''}{more}</section>"
+    )
+
+
+def _samples(root: Path, records: list[Record]) -> str:
+    boxes = "".join(
+        f'<label><input type="checkbox" data-overlay="{key}"{" checked" if key in _SHOWN_FIRST else ""}> {text}</label>'
+        for key, text in _OVERLAYS.items()
+    )
+    figures = "".join(_sample(root, record) for record in records)
+    return (
+        f'<section aria-labelledby="samples"><h2 id="samples">Samples</h2>'
+        f"<fieldset><legend>Show</legend>{boxes}</fieldset>"
+        f'<div class="samples {" ".join(f"show-{key}" for key in _SHOWN_FIRST)}" id="sheet">{figures}</div></section>'
+    )
+
+
+def _sample(root: Path, record: Record) -> str:
+    file = root / image_file(record)
+    image = cv2.imread(str(file))
+    if image is None:
+        raise OSError(f"{file} cannot be read as an image")
+    labels = Labels.from_json(record["labels"])
+    height, width = image.shape[:2]
+    scale = min(1.0, _THUMBNAIL / width)
+    small = cv2.resize(
+        image, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
+    )
+    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    source = base64.b64encode(bytes(data)).decode("ascii")
+    unit = width / 640
+    marks = []
+    for label in labels.instances:
+        colour = "rgb({},{},{})".format(*class_colour(label.class_index))
+        x0, y0, x1, y1 = label.box
+        title = (
+            f"{label.class_name} {label.id}: {label.visible_fraction:.0%} visible, {label.truncation:.0%} cut off"
+            f"{''.join(f', {mark}' for mark in label.marks)}"
+        )
+        marks.append(
+            f"<g><title>{html.escape(title)}</title>"
+            f'<path class="alone" d="{_path(label.amodal)}" stroke="{colour}"/>'
+            f'<path class="mask" d="{_path(Silhouette(label.box, label.mask))}" fill="{colour}" stroke="{colour}"/>'
+            f'<rect class="box" x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}" stroke="{colour}"/>'
+            f'<text class="name" x="{x0}" y="{max(y0 - 3 * unit, 11 * unit):.0f}" font-size="{12 * unit:.1f}">'
+            f"{html.escape(label.class_name)}</text></g>"
+        )
+    classes = _counts(Counter(label.class_name for label in labels.instances))
+    caption = f"Frame {record['index']}, {record['split']}: {classes}"
+    text = html.escape(caption, quote=True)
+    return (
+        f'<figure><div class="picture"><img alt="{text}" src="data:image/jpeg;base64,{source}">'
+        f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks)}</svg></div>'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
+
+
+def _path(shape: Silhouette) -> str:
+    """Outlines of a mask along its pixels' centres as an SVG path, holes cut out by the even-odd rule."""
+    x, y = shape.box[:2]
+    rings, _ = cv2.findContours(shape.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
+    return "".join(
+        "M" + "L".join(f"{px + x + 0.5:g} {py + y + 0.5:g}" for px, py in ring.reshape(-1, 2)) + "Z" for ring in rings
+    )
+
+
+def _brightness(root: Path, records: list[Record]) -> tuple[np.ndarray, list[float]]:
+    """Counts of pixels by luma in 32 bins, and each image's mean luma."""
+    counts, means = np.zeros(32, dtype=np.int64), []
+    for record in records:
+        grey = cv2.imread(str(root / image_file(record)), cv2.IMREAD_GRAYSCALE)
+        if grey is not None:
+            counts += np.histogram(grey, bins=32, range=(0, 256))[0]
+            means.append(float(grey.mean()))
+    return counts, means
+
+
+def _seconds(root: Path) -> dict[str, float]:
+    """Median seconds of every stage over the frames."""
+    stages = defaultdict[str, list[float]](list)
+    for line in _lines(root / "timings.jsonl"):
+        for stage, seconds in line.items():
+            if stage != "index":
+                stages[stage].append(seconds)
+    return {stage: round(statistics.median(values), 4) for stage, values in stages.items()}
+
+
+def _charts(counted: _Statistics, brightness: tuple[np.ndarray, list[float]], seconds: dict[str, float]) -> str:
+    boxes = np.array(counted.boxes, dtype=np.float64).reshape(-1, 4)
+    most = max([1, *counted.per_image])
+    ratio = counted.size[1] / counted.size[0]
+    cells = 24, max(2, round(24 * ratio))
+    share = counted.shares
+    size = float(counted.size[0]), float(counted.size[1])
+    charts = [
+        bars("Instances by class", dict(sorted(counted.classes.items()))),
+        columns(
+            "Instances per image",
+            np.bincount(counted.per_image, minlength=most + 1),
+            [str(number) for number in range(most + 1)],
+            "instances",
+        ),
+        heat_map(
+            "Where boxes lie",
+            boxes[:, 0] * size[0],
+            boxes[:, 1] * size[1],
+            size=size,
+            cells=cells,
+            axes="middle of the box [px]",
+        ),
+        heat_map(
+            "How large boxes are",
+            boxes[:, 2] * size[0],
+            boxes[:, 3] * size[1],
+            size=size,
+            cells=cells,
+            axes="width to the right, height down [px]",
+        ),
+        histogram("Visible fraction of instances", share["visible_fraction"], bounds=(0, 1), axis="visible fraction"),
+        histogram("Truncation of instances", share["truncation"], bounds=(0, 1), axis="share beyond the border"),
+        histogram("Agreement of splats and proxies", share["agreement"], bounds=(0, 1), axis="IoU"),
+        histogram("Agreement of their boundaries", share["boundary_f1"], bounds=(0, 1), axis="boundary F1"),
+        columns(
+            "Brightness of pixels",
+            brightness[0],
+            [f"{8 * i} to {8 * i + 7}" for i in range(len(brightness[0]))],
+            "luma",
+        ),
+        histogram("Brightness of images", brightness[1], bounds=(0, 255), axis="mean luma"),
+        bars("Seconds per frame by stage, median", seconds, unit=" s"),
+    ]
+    return (
+        f'<section aria-labelledby="charts"><h2 id="charts">Statistics</h2>'
+        f'<div class="charts">{"".join(charts)}</div></section>'
+    )
+
+
+def _details(content: dict[str, Any]) -> str:
+    libraries = "".join(
+        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(version)}</td></tr>'
+        for name, version in content["libraries"].items()
+    )
+    scene = html.escape(json.dumps(content["scene"], indent=1))
+    return (
+        f'<section aria-labelledby="origin"><h2 id="origin">Origin</h2>'
+        f"<details><summary>Libraries</summary><table>{libraries}</table></details>"
+        f'<details><summary>Scene in effect</summary><pre tabindex="0">{scene}</pre></details></section>'
+    )
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_bytes().splitlines()] if path.is_file() else []
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()) if count) or "none"
+
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{title}}: dataset report</title>
+<style>
+:root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --line: #c8ced6; --bar: #2f6db5; --soft: #f3f5f8; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e8ebef; --paper: #15181c; --line: #454c55; --bar: #6ea8ea; --soft: #1f242a; }
+}
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 1400px; padding: 1rem 1.5rem 4rem; color: var(--ink); background: var(--paper);
+  font: 16px/1.5 system-ui, sans-serif; }
+h1, h2 { line-height: 1.2; }
+h2 { margin: 2.5rem 0 .75rem; border-bottom: 1px solid var(--line); padding-bottom: .3rem; }
+table { border-collapse: collapse; }
+th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0; overflow-wrap: anywhere; }
+th { font-weight: 600; white-space: nowrap; }
+.good::before { content: "\\2713  "; color: #1a7f37; font-weight: 700; }
+.bad::before { content: "\\2717  "; color: #cf222e; font-weight: 700; }
+fieldset { border: 1px solid var(--line); border-radius: 6px; margin: 0 0 1rem; padding: .4rem 1rem .6rem; }
+fieldset label { display: inline-block; margin-right: 1.5rem; padding: .2rem 0; cursor: pointer; }
+figure { margin: 0; }
+figcaption { font-size: .9rem; padding: .35rem 0; }
+.samples, .charts { display: grid; gap: 1.2rem;
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
+.picture { position: relative; line-height: 0; background: var(--soft); }
+.picture img { width: 100%; height: auto; }
+.picture svg { position: absolute; inset: 0; width: 100%; height: 100%; }
+.picture svg * { vector-effect: non-scaling-stroke; }
+.picture .mask { fill-rule: evenodd; fill-opacity: .45; stroke-width: 1; }
+.picture .alone { fill: none; stroke-width: 2; stroke-dasharray: 4 3; }
+.picture .box { fill: none; stroke-width: 1.5; }
+.picture .name { fill: #fff; stroke: #000; stroke-width: 3px; paint-order: stroke; font-family: system-ui, sans-serif; }
+.picture .mask, .picture .alone, .picture .box, .picture .name { display: none; }
+.show-mask .mask, .show-alone .alone, .show-box .box, .show-name .name { display: inline; }
+.charts figure { background: var(--soft); border-radius: 6px; padding: .5rem .9rem .7rem; }
+.charts figcaption { font-weight: 600; }
+.charts svg { width: 100%; height: auto; font-size: 12px; fill: var(--ink); }
+.bar { fill: var(--bar); }
+.axis { stroke: var(--line); }
+.frame { fill: none; stroke: var(--line); }
+summary { cursor: pointer; }
+pre { overflow: auto; max-height: 30rem; background: var(--soft); padding: .8rem; font-size: .85rem; }
+:focus-visible { outline: 3px solid var(--bar); outline-offset: 2px; }
+</style>
+</head>
+<body>
+<main>
+{{body}}
+</main>
+<script>
+"use strict";
+const sheet = document.getElementById("sheet");
+for (const box of document.querySelectorAll("input[data-overlay]")) {
+  const show = () => sheet.classList.toggle("show-" + box.dataset.overlay, box.checked);
+  box.addEventListener("change", show);
+  show();
+}
+</script>
+</body>
+</html>
+"""

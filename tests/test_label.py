@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pycocotools import mask as coco_mask
 
-from mitsplat.label import LabelRules, Labels, Silhouette, Truth, label_instances
+from mitsplat.label import LabelRules, Labels, Silhouette, Truth, encode_mask, label_instances
 from mitsplat.outline import fill_polygon, outline
 from mitsplat.yolo import yolo_lines
 
@@ -314,6 +315,16 @@ def test_masks_are_exclusive_and_cover_the_map():
     labels = label(ids, min_pixels=1, min_fragment=1)
     total = sum(whole(entry, ids.shape).astype(int) for entry in labels.instances)
     np.testing.assert_array_equal(total, ids > 0)
+
+
+@pytest.mark.parametrize("box", [(0, 0, 40, 30), (5, 3, 20, 17), (30, 20, 40, 30), (0, 29, 40, 30), (39, 0, 40, 30)])
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_run_lengths_are_those_of_pycocotools(box, share):
+    x0, y0, x1, y1 = box
+    mask = np.random.default_rng(x0 + y1).random((y1 - y0, x1 - x0)) <= share
+    canvas = np.zeros((30, 40), dtype=np.uint8, order="F")
+    canvas[y0:y1, x0:x1] = mask
+    assert encode_mask(mask, box, (40, 30)) == coco_mask.encode(canvas)["counts"].decode()
 
 
 def test_json_gives_the_labels_back():

@@ -75,21 +75,12 @@ def audit_dataset(root: str | Path) -> Audit:
         InputError: If the folder is no dataset of mitsplat.
     """
     root = Path(root)
-    content = _read_content(root)
-    violations: list[tuple[str, str]] = []
-    records = []
+    content = read_content(root)
+    records, violations = read_records(root)
     marked, dropped = Counter[str](), Counter[str]()
     instances = low = files = 0
-    for number, line in enumerate((root / "manifest.jsonl").read_bytes().splitlines(), start=1):
-        try:
-            record = json.loads(line)
-            labels = Labels.from_json(record["labels"])
-            camera_of(record)
-            file = image_file(record)
-        except (ValueError, KeyError, TypeError, StopIteration) as error:
-            violations.append(("manifest.jsonl", f"line {number} is not the record of a frame ({error!r})"))
-            continue
-        records.append(record)
+    for record in records:
+        labels, file = Labels.from_json(record["labels"]), image_file(record)
         where = f"manifest.jsonl, frame {record['index']}"
         found = list(_check_files(root, record))
         missing = {name for name, _ in found}
@@ -126,14 +117,38 @@ class _Frame:
         return canvas
 
 
-def _read_content(root: Path) -> dict[str, Any]:
+def read_content(root: Path) -> dict[str, Any]:
+    """What decides a dataset's bytes, ``dataset.json``.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat, or one of a version before labels were audited.
+    """
     try:
         content: dict[str, Any] = json.loads((root / "dataset.json").read_bytes())
-        if "mitsplat" not in content or not (root / "manifest.jsonl").is_file():
-            raise KeyError("mitsplat")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{root} must be a dataset of mitsplat: dataset.json or manifest.jsonl is missing") from error
+        present = {"mitsplat", "scene", "classes", "keypoints", "assets"} <= set(content) and "labels" in content[
+            "scene"
+        ]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
+    if not present or not (root / "manifest.jsonl").is_file():
+        raise InputError(f"{root} must be a dataset of this version of mitsplat, with dataset.json and manifest.jsonl")
     return content
+
+
+def read_records(root: Path) -> tuple[list[Record], list[tuple[str, str]]]:
+    """The frames' records that can be read, and what is wrong with the manifest's other lines."""
+    records, violations = [], []
+    for number, line in enumerate((root / "manifest.jsonl").read_bytes().splitlines(), start=1):
+        try:
+            record = json.loads(line)
+            Labels.from_json(record["labels"])
+            camera_of(record)
+            image_file(record)
+        except (ValueError, KeyError, TypeError, StopIteration) as error:
+            violations.append(("manifest.jsonl", f"line {number} is not the record of a frame ({error!r})"))
+            continue
+        records.append(record)
+    return records, violations
 
 
 def _check_files(root: Path, record: Record) -> Violations:

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
+from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset, read_content, read_records
 from mitsplat.charts import bars, columns, heat_map, histogram
 from mitsplat.coco import image_file
 from mitsplat.files import Record, write_text
@@ -63,13 +63,13 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
-        OSError: If an image cannot be read or the page cannot be written.
+        OSError: If the page cannot be written.
     """
     root = Path(root)
     out = root / "report.html" if out is None else Path(out)
     audit = audit_dataset(root)
-    content = json.loads((root / "dataset.json").read_bytes())
-    records = [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
+    content = read_content(root)
+    records, _ = read_records(root)
     counted = _Statistics()
     for record in records:
         counted.add(record)
@@ -140,10 +140,9 @@ def _samples(root: Path, records: list[Record]) -> str:
 
 
 def _sample(root: Path, record: Record) -> str:
-    file = root / image_file(record)
-    image = cv2.imread(str(file))
+    image = cv2.imread(str(root / image_file(record)))
     if image is None:
-        raise OSError(f"{file} cannot be read as an image")
+        return f"<figure><figcaption>Frame {record['index']}: its image cannot be read</figcaption></figure>"
     labels = Labels.from_json(record["labels"])
     height, width = image.shape[:2]
     scale = min(1.0, _THUMBNAIL / width)

@@ -291,3 +291,6 @@ def test_a_damaged_manifest_is_found(dataset: Path) -> None:
 def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must be a dataset of mitsplat"):
         audit_dataset(tmp_path)
+    (tmp_path / "dataset.json").write_text('{"mitsplat": "0.0.1", "scene": {}}')
+    with pytest.raises(InputError, match="must be a dataset of this version of mitsplat"):
+        audit_dataset(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,29 @@ def test_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any])
     again = ms.render_frame(ms.load_scene(scene.path), 2, layout=layout)
     assert first.image.tobytes() == again.image.tobytes()
     assert first.instance.tobytes() == again.instance.tobytes()
+
+
+@pytest.mark.parametrize("source", ["splats", "proxies"])
+def test_silhouettes_are_labels_of_the_instances_alone(
+    write_scene: WriteScene, scene_data: dict[str, Any], settled: dict[str, Any], scene: ms.Scene, source: str
+) -> None:
+    """Each instance placed alone in the scene is labelled with exactly what it covers among the others."""
+    layout = layout_of_small_scene(scene, settled)
+    table = {**scene_data["shapes"][0], "visible": False}  # surroundings may hide an instance; alone it has none
+    data = {**scene_data, "shapes": [table], "labels": {"source": source}}
+    chosen = ms.load_scene(write_scene(data, f"{source}.yaml"))
+    frame = ms.render_frame(chosen, 1, layout=layout)
+    ids = frame.instance if source == "splats" else frame.proxy_instance
+    assert len(frame.labels.instances) >= 2
+    for label in frame.labels.instances:
+        x0, y0, x1, y1 = label.box
+        assert not (label.mask & (ids[y0:y1, x0:x1] != label.id)).any()
+        assert 0 < label.agreement <= 1 and 0 < label.boundary_f1 <= 1
+        alone = replace(layout, instances=tuple(i for i in layout.instances if i.id == label.id))
+        (only,) = ms.render_frame(chosen, 1, layout=alone).labels.instances
+        np.testing.assert_array_equal(only.mask, label.amodal.mask)
+        assert (only.box, only.visible_fraction) == (label.amodal.box, 1)
+        assert label.visible_fraction == label.area / only.area
 
 
 @pytest.mark.parametrize("shadow", ["none", "image"])

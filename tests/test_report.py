@@ -120,6 +120,16 @@ def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureF
     assert "<b>.png" not in text
 
 
+def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:  # noqa: F811
+    (dataset / "images/train/000000.png").unlink()
+    with (dataset / "manifest.jsonl").open("a") as file:
+        file.write("{\n")
+    page, audit = write_report(dataset)
+    assert len(audit.violations) >= 2
+    text = page.read_text()
+    assert "Frame 0: its image cannot be read" in text and "line 7 is not the record" in text
+
+
 class TestCharts:
     def test_a_histogram_counts_every_value_once(self) -> None:
         text = histogram("shares", [0.0, 0.05, 0.5, 1.0, 1.0], bins=10, bounds=(0, 1))

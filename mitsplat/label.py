@@ -22,25 +22,27 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
 from scipy import ndimage
 
+from mitsplat.masks import (
+    BOUNDARY_TOLERANCE,
+    BoolArray,
+    Box,
+    Silhouette,
+    boundary_f1,
+    encode_mask,
+    without_fragments,
+)
 from mitsplat.outline import fill_polygon, outline
 
 if TYPE_CHECKING:
     from mitsplat.camera import Camera
     from mitsplat.settle import Instance
 
-BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
-Box = tuple[int, int, int, int]
-"""Bounds (x0, y0, x1, y1) [px], half-open."""
-
-BOUNDARY_TOLERANCE = 2
-"""Distance within which two boundaries count as the same [px]."""
 
 KEYPOINT_TOLERANCE = 0.005
 """How far behind the surface that is seen a keypoint may lie and still count as visible, as a share of its depth."""
@@ -66,48 +68,6 @@ class LabelRules:
     min_visible: float = 0.0
     min_agreement: float = 0.0
     below_threshold: Literal["drop", "mark"] = "mark"
-
-
-@dataclass(frozen=True, eq=False)
-class Silhouette:
-    """The pixels that an instance covers when it is alone; they may lie outside the image.
-
-    Attributes:
-        box: Bounds of the mask.
-        mask: Covered pixels inside the box, shape (y1 - y0, x1 - x0).
-    """
-
-    box: Box
-    mask: BoolArray
-
-    @classmethod
-    def cropped(cls, mask: BoolArray, x: int, y: int) -> Silhouette:
-        """The silhouette of a mask with at least one pixel whose first pixel is at (x, y)."""
-        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
-        return cls((x + x0, y + y0, x + x1, y + y1), np.ascontiguousarray(mask[y0:y1, x0:x1]))
-
-    @cached_property
-    def area(self) -> int:
-        """Pixels."""
-        return int(np.count_nonzero(self.mask))
-
-    def inside(self, width: int, height: int) -> Silhouette | None:
-        """The part in an image, or None."""
-        x0, y0, x1, y1 = self.box
-        left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
-        if left >= right or top >= bottom:
-            return None
-        part = self.mask[top - y0 : bottom - y0, left - x0 : right - x0]
-        return Silhouette.cropped(part, left, top) if part.any() else None
-
-    def whole(self, width: int, height: int) -> BoolArray:
-        """The mask in an image, shape (height, width)."""
-        canvas = np.zeros((height, width), dtype=bool)
-        if part := self.inside(width, height):
-            x0, y0, x1, y1 = part.box
-            canvas[y0:y1, x0:x1] = part.mask
-        return canvas
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +103,7 @@ class InstanceLabel:
         silhouette_area: Its pixels.
         depth_area: Pixels of ``amodal`` at which the image has a depth.
         agreement: IoU of the instance's masks by splats and by proxies.
-        boundary_f1: F1 score of their boundaries, see :func:`boundary_f1`.
+        boundary_f1: F1 score of their boundaries, see :func:`mitsplat.masks.boundary_f1`.
         world_from_object: Rigid transform of the asset's coordinates to the world's [m], shape (4, 4).
         keypoints: Position [px] and visibility of the asset's named points, shape (K, 3): :data:`VISIBLE`,
             :data:`HIDDEN`, or :data:`UNLABELLED` at (0, 0).
@@ -279,23 +239,6 @@ class Labels:
         return cls(width, height, tuple(instances), dict(record["dropped"]))
 
 
-def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
-    """COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height).
-
-    Runs go down the columns. Only the box's columns are looked at, in a tenth of pycocotools' time for whole images.
-    """
-    x0, y0, x1, y1 = box
-    width, height = size
-    columns = np.zeros((x1 - x0) * height + 2, dtype=np.int8)
-    columns[1:-1].reshape(x1 - x0, height)[:, y0:y1] = mask.T
-    turns = np.flatnonzero(np.diff(columns)) + x0 * height
-    counts = np.diff(turns, prepend=0, append=width * height)
-    if counts[-1] == 0:
-        counts = counts[:-1]
-    code = coco_mask.frPyObjects({"size": [height, width], "counts": counts.tolist()}, height, width)
-    return str(code["counts"].decode("ascii"))
-
-
 def label_instances(
     truth: Truth,
     instances: Sequence[Instance],
@@ -339,7 +282,7 @@ def label_instances(
             dropped["outside" if alone is None or alone.inside(width, height) is None else "hidden"] += 1
             continue
         rows, columns = found[instance.id]
-        mask, fragments = _without_fragments(ids[rows, columns] == instance.id, rules.min_fragment)
+        mask, fragments = without_fragments(ids[rows, columns] == instance.id, rules.min_fragment)
         dropped["fragments"] += fragments
         if np.count_nonzero(mask) < rules.min_pixels:
             dropped["small"] += 1
@@ -383,25 +326,6 @@ def label_instances(
     return Labels(width, height, tuple(labels), dropped)
 
 
-def boundary_f1(one: BoolArray, other: BoolArray) -> float:
-    """F1 score of two masks' boundaries: pixels within :data:`BOUNDARY_TOLERANCE` of the other's count as found.
-
-    After Csurka et al. 2013, "What is a good evaluation measure for semantic segmentation?". A mask's boundary is its
-    pixels with a neighbour outside it; the arrays' border is none.
-    """
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BOUNDARY_TOLERANCE + 1,) * 2)
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    edges = [mask & (cv2.erode(mask.astype(np.uint8), cross) == 0) for mask in (one, other)]
-    counts = [int(np.count_nonzero(edge)) for edge in edges]
-    if not all(counts):
-        return float(counts[0] == counts[1])
-    shares = [
-        np.count_nonzero(edge & (cv2.dilate(near.astype(np.uint8), disc) > 0)) / count
-        for edge, near, count in zip(edges, reversed(edges), counts, strict=True)
-    ]
-    return float(2 * shares[0] * shares[1] / sum(shares)) if sum(shares) else 0.0
-
-
 def _amodal(
     alone: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
 ) -> tuple[Silhouette, Box, int]:
@@ -418,9 +342,9 @@ def _amodal(
         left, top, right, bottom = part.box
         canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
     # Fragments are judged in the image, as those of the visible mask are, and again beyond it.
-    whole = Silhouette.cropped(_without_fragments(canvas, min_fragment)[0], x0, y0)
+    whole = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
     inside = whole.inside(*size)
-    kept = None if inside is None else _without_fragments(inside.mask, min_fragment)[0]
+    kept = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
     if inside is None or kept is None or not kept.any():
         raise AssertionError("what is seen of an instance is part of its silhouette")
     return Silhouette.cropped(kept, *inside.box[:2]), whole.box, whole.area
@@ -462,11 +386,3 @@ def _see_keypoints(points: FloatArray, instance: Instance, camera: Camera, truth
 def _with_depth(amodal: Silhouette, truth: Truth) -> int:
     x0, y0, x1, y1 = amodal.box
     return int(np.count_nonzero(amodal.mask & (truth.depth[y0:y1, x0:x1] > 0)))
-
-
-def _without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:
-    """The mask without connected parts of fewer than ``min_fragment`` pixels, and how many those were."""
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    keep = stats[:, cv2.CC_STAT_AREA] >= min_fragment
-    keep[0] = False
-    return keep[parts], int(count - 1 - np.count_nonzero(keep))

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
-from mitsplat.label import Silhouette
 from mitsplat.llvm import check_llvm
+from mitsplat.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.splats import Splats
 

@@ -18,7 +18,8 @@ from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset, read
 from mitsplat.charts import bars, columns, heat_map, histogram
 from mitsplat.coco import image_file
 from mitsplat.files import Record, write_text
-from mitsplat.label import Labels, Silhouette
+from mitsplat.label import Labels
+from mitsplat.masks import Silhouette
 from mitsplat.sheet import class_colour
 
 SAMPLES = 12
@@ -152,7 +153,7 @@ def _sample(root: Path, record: Record) -> str:
     _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])
     source = base64.b64encode(bytes(data)).decode("ascii")
     unit = width / 640
-    marks = []
+    marks, names = [], []
     for label in labels.instances:
         colour = "rgb({},{},{})".format(*class_colour(label.class_index))
         x0, y0, x1, y1 = label.box
@@ -164,16 +165,18 @@ def _sample(root: Path, record: Record) -> str:
             f"<g><title>{html.escape(title)}</title>"
             f'<path class="alone" d="{_path(label.amodal)}" stroke="{colour}"/>'
             f'<path class="mask" d="{_path(Silhouette(label.box, label.mask))}" fill="{colour}" stroke="{colour}"/>'
-            f'<rect class="box" x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}" stroke="{colour}"/>'
+            f'<rect class="box" x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}" stroke="{colour}"/></g>'
+        )
+        names.append(
             f'<text class="name" x="{x0}" y="{max(y0 - 3 * unit, 11 * unit):.0f}" font-size="{12 * unit:.1f}">'
-            f"{html.escape(label.class_name)}</text></g>"
+            f"{html.escape(label.class_name)}</text>"
         )
     classes = _counts(Counter(label.class_name for label in labels.instances))
     caption = f"Frame {record['index']}, {record['split']}: {classes}"
     text = html.escape(caption, quote=True)
     return (
         f'<figure><div class="picture"><img alt="{text}" src="data:image/jpeg;base64,{source}">'
-        f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks)}</svg></div>'
+        f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks + names)}</svg></div>'
         f"<figcaption>{text}</figcaption></figure>"
     )
 
@@ -286,9 +289,11 @@ _PAGE = """<!doctype html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{{title}}: dataset report</title>
 <style>
-:root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --line: #c8ced6; --bar: #2f6db5; --soft: #f3f5f8; }
+:root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --line: #c8ced6; --bar: #2f6db5; --soft: #f3f5f8;
+  --good: #1a7f37; --bad: #cf222e; }
 @media (prefers-color-scheme: dark) {
-  :root { --ink: #e8ebef; --paper: #15181c; --line: #454c55; --bar: #6ea8ea; --soft: #1f242a; }
+  :root { --ink: #e8ebef; --paper: #15181c; --line: #454c55; --bar: #6ea8ea; --soft: #1f242a;
+    --good: #56d364; --bad: #ff7b72; }
 }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 1400px; padding: 1rem 1.5rem 4rem; color: var(--ink); background: var(--paper);
@@ -298,8 +303,8 @@ h2 { margin: 2.5rem 0 .75rem; border-bottom: 1px solid var(--line); padding-bott
 table { border-collapse: collapse; }
 th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0; overflow-wrap: anywhere; }
 th { font-weight: 600; white-space: nowrap; }
-.good::before { content: "\\2713  "; color: #1a7f37; font-weight: 700; }
-.bad::before { content: "\\2717  "; color: #cf222e; font-weight: 700; }
+.good::before { content: "\\2713  "; color: var(--good); font-weight: 700; }
+.bad::before { content: "\\2717  "; color: var(--bad); font-weight: 700; }
 fieldset { border: 1px solid var(--line); border-radius: 6px; margin: 0 0 1rem; padding: .4rem 1rem .6rem; }
 fieldset label { display: inline-block; margin-right: 1.5rem; padding: .2rem 0; cursor: pointer; }
 figure { margin: 0; }

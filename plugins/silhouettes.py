@@ -19,7 +19,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.camera import Camera
-from mitsplat.label import Silhouette
+from mitsplat.masks import Silhouette
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.march import PIXELS_PER_LANE, _respond
 from mitsplat.plugins.rays import TILE, View

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.label import Silhouette
+from mitsplat.masks import Silhouette
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Hit, Occluder, Proxies, Surface, light_factor, reference_irradiance
 from mitsplat.plugins.march import Image, march

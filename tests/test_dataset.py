@@ -18,8 +18,9 @@ from mitsplat.dataset import write_dataset
 from mitsplat.engine import FrameError
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS
-from mitsplat.label import LabelRules, Labels, Silhouette, Truth, label_instances
+from mitsplat.label import LabelRules, Labels, Truth, label_instances
 from mitsplat.manifest import Manifest
+from mitsplat.masks import Silhouette
 from mitsplat.scene import load_scene, plan_frame, random_stream
 from mitsplat.settle import Instance, Layout, RestCertificate
 from mitsplat.sheet import class_colour, draw_labels, layer_sheet

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pycocotools import mask as coco_mask
 
-from mitsplat.label import LabelRules, Labels, Silhouette, Truth, encode_mask, label_instances
+from mitsplat.label import LabelRules, Labels, Truth, label_instances
+from mitsplat.masks import Silhouette, encode_mask
 from mitsplat.outline import fill_polygon, outline
 from mitsplat.yolo import yolo_lines
 

@@ -23,7 +23,8 @@ from mitsplat import maps
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.label import HIDDEN, VISIBLE, LabelRules, Silhouette, Truth, label_instances
+from mitsplat.label import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
+from mitsplat.masks import Silhouette
 from mitsplat.outline import fill_polygon
 from mitsplat.scene import load_scene
 from mitsplat.spec import FORMATS

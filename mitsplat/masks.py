@@ -1,0 +1,104 @@
+"""Masks: silhouettes that may reach beyond the image, their fragments, boundaries and run-length codes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from pycocotools import mask as coco_mask
+
+BoolArray = npt.NDArray[np.bool_]
+Box = tuple[int, int, int, int]
+"""Bounds (x0, y0, x1, y1) [px], half-open."""
+
+BOUNDARY_TOLERANCE = 2
+"""Distance within which two boundaries count as the same [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """The pixels that an instance covers when it is alone; they may lie outside the image.
+
+    Attributes:
+        box: Bounds of the mask.
+        mask: Covered pixels inside the box, shape (y1 - y0, x1 - x0).
+    """
+
+    box: Box
+    mask: BoolArray
+
+    @classmethod
+    def cropped(cls, mask: BoolArray, x: int, y: int) -> Silhouette:
+        """The silhouette of a mask with at least one pixel whose first pixel is at (x, y)."""
+        ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
+        return cls((x + x0, y + y0, x + x1, y + y1), np.ascontiguousarray(mask[y0:y1, x0:x1]))
+
+    @cached_property
+    def area(self) -> int:
+        """Pixels."""
+        return int(np.count_nonzero(self.mask))
+
+    def inside(self, width: int, height: int) -> Silhouette | None:
+        """The part in an image, or None."""
+        x0, y0, x1, y1 = self.box
+        left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
+        if left >= right or top >= bottom:
+            return None
+        part = self.mask[top - y0 : bottom - y0, left - x0 : right - x0]
+        return Silhouette.cropped(part, left, top) if part.any() else None
+
+    def whole(self, width: int, height: int) -> BoolArray:
+        """The mask in an image, shape (height, width)."""
+        canvas = np.zeros((height, width), dtype=bool)
+        if part := self.inside(width, height):
+            x0, y0, x1, y1 = part.box
+            canvas[y0:y1, x0:x1] = part.mask
+        return canvas
+
+
+def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
+    """COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height).
+
+    Runs go down the columns. Only the box's columns are looked at, in a tenth of pycocotools' time for whole images.
+    """
+    x0, y0, x1, y1 = box
+    width, height = size
+    columns = np.zeros((x1 - x0) * height + 2, dtype=np.int8)
+    columns[1:-1].reshape(x1 - x0, height)[:, y0:y1] = mask.T
+    turns = np.flatnonzero(np.diff(columns)) + x0 * height
+    counts = np.diff(turns, prepend=0, append=width * height)
+    if counts[-1] == 0:
+        counts = counts[:-1]
+    code = coco_mask.frPyObjects({"size": [height, width], "counts": counts.tolist()}, height, width)
+    return str(code["counts"].decode("ascii"))
+
+
+def boundary_f1(one: BoolArray, other: BoolArray) -> float:
+    """F1 score of two masks' boundaries: pixels within :data:`BOUNDARY_TOLERANCE` of the other's count as found.
+
+    After Csurka et al. 2013, "What is a good evaluation measure for semantic segmentation?". A mask's boundary is its
+    pixels with a neighbour outside it; the arrays' border is none.
+    """
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BOUNDARY_TOLERANCE + 1,) * 2)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    edges = [mask & (cv2.erode(mask.astype(np.uint8), cross) == 0) for mask in (one, other)]
+    counts = [int(np.count_nonzero(edge)) for edge in edges]
+    if not all(counts):
+        return float(counts[0] == counts[1])
+    shares = [
+        np.count_nonzero(edge & (cv2.dilate(near.astype(np.uint8), disc) > 0)) / count
+        for edge, near, count in zip(edges, reversed(edges), counts, strict=True)
+    ]
+    return float(2 * shares[0] * shares[1] / sum(shares)) if sum(shares) else 0.0
+
+
+def without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:
+    """The mask without connected parts of fewer than ``min_fragment`` pixels, and how many those were."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    keep = stats[:, cv2.CC_STAT_AREA] >= min_fragment
+    keep[0] = False
+    return keep[parts], int(count - 1 - np.count_nonzero(keep))

@@ -156,7 +156,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"randomise": {"exposure": [1, 0]}}, "randomise.exposure: must be [low, high] with low <= high"),
         (
             {"output__formats": ["yolo", "zip"]},
-            "output.formats[1]: must be 'yolo', 'coco' or 'exr' (got \"zip\")",
+            "output.formats[1]: must be 'yolo', 'yolo-detect', 'yolo-obb', ",
         ),
         ({"output__validation": 1.5}, "output.validation: must be <= 1 (got 1.5)"),
         ({"enclosure": {"floor": 0.2}}, "enclosure.floor: must be below the region's top at 0.2 m (got 0.2)"),

@@ -21,12 +21,15 @@ import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
 
-from mitsplat.coco import camera_of, image_file
+from mitsplat import bop
+from mitsplat.assets import read_mesh
+from mitsplat.coco import image_file
 from mitsplat.errors import InputError
 from mitsplat.files import Record
 from mitsplat.label import Labels
 from mitsplat.readback import CHECKS, Violations, WrittenFrame, check_bop, check_image
-from mitsplat.writers import Catalogue, write_collection
+from mitsplat.stored import read_content, read_records
+from mitsplat.writers import FOLDERS, Catalogue, write_collection
 from mitsplat.yolo import TASKS
 
 POLYGON_IOU = 0.99
@@ -35,6 +38,8 @@ POLYGON_AREA = 200
 
 _SHARE = 1e-5
 """Difference of shares that are stored with six decimals."""
+_MODEL_ROUNDED = 0.01
+"""Difference that the decimals of a model's file make [mm]."""
 
 
 @dataclass(frozen=True)
@@ -67,23 +72,24 @@ def audit_dataset(root: str | Path) -> Audit:
     """
     root = Path(root)
     content = read_content(root)
-    records, violations = read_records(root)
+    records, violations = read_records(root, content)
     marked, dropped = Counter[str](), Counter[str]()
     instances = low = files = 0
     for record in records:
         labels, file = Labels.from_json(record["labels"]), image_file(record)
         where = f"manifest.jsonl, frame {record['index']}"
         found = list(_check_files(root, record))
-        missing = {name for name, _ in found}
+        damaged = {name for name, _ in found}
         violations += found
+        violations += ((where, text) for text in _check_formats(record, content))
         violations += ((where, text) for text in _check_labels(record, labels, content))
         frame = WrittenFrame(root, record, labels, content)
         for prefix, check in CHECKS.items():
-            for name in sorted(name for name in record["files"] if name.startswith(prefix) and name not in missing):
+            for name in sorted(name for name in record["files"] if name.startswith(prefix) and name not in damaged):
                 violations += ((name, text) for text in check(frame, root / name))
-        if file not in missing:
+        if file not in damaged:
             violations += ((file, text) for text in check_image(frame, root / file))
-        violations += check_bop(frame)
+        violations += check_bop(frame, damaged)
         instances += len(labels.instances)
         files += len(record["files"])
         low += sum(label.area > POLYGON_AREA and label.polygon_iou < POLYGON_IOU for label in labels.instances)
@@ -91,41 +97,9 @@ def audit_dataset(root: str | Path) -> Audit:
         dropped.update(labels.dropped)
     violations += _check_whole(root, records)
     violations += _check_collection(root, records, content)
+    if "bop" in content["scene"]["output"]["formats"]:
+        violations += _check_models(root, content)
     return Audit(len(records), instances, files, tuple(violations), low, dict(marked), dict(dropped))
-
-
-def read_content(root: Path) -> dict[str, Any]:
-    """What decides a dataset's bytes, ``dataset.json``.
-
-    Raises:
-        InputError: If the folder is no dataset of mitsplat, or one of a version before labels were audited.
-    """
-    try:
-        content: dict[str, Any] = json.loads((root / "dataset.json").read_bytes())
-        present = {"mitsplat", "scene", "classes", "keypoints", "assets"} <= set(content) and "labels" in content[
-            "scene"
-        ]
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
-    if not present or not (root / "manifest.jsonl").is_file():
-        raise InputError(f"{root} must be a dataset of this version of mitsplat, with dataset.json and manifest.jsonl")
-    return content
-
-
-def read_records(root: Path) -> tuple[list[Record], list[tuple[str, str]]]:
-    """The frames' records that can be read, and what is wrong with the manifest's other lines."""
-    records, violations = [], []
-    for number, line in enumerate((root / "manifest.jsonl").read_bytes().splitlines(), start=1):
-        try:
-            record = json.loads(line)
-            Labels.from_json(record["labels"])
-            camera_of(record)
-            image_file(record)
-        except (ValueError, KeyError, TypeError, StopIteration) as error:
-            violations.append(("manifest.jsonl", f"line {number} is not the record of a frame ({error!r})"))
-            continue
-        records.append(record)
-    return records, violations
 
 
 def _check_files(root: Path, record: Record) -> Violations:
@@ -134,6 +108,12 @@ def _check_files(root: Path, record: Record) -> Violations:
             yield file, "is missing"
         elif hashlib.sha256((root / file).read_bytes()).hexdigest() != digest:
             yield file, "is not what was written: its SHA-256 differs from the manifest's"
+
+
+def _check_formats(record: Record, content: Mapping[str, Any]) -> Iterator[str]:
+    for name in content["scene"]["output"]["formats"]:
+        if name in FOLDERS and not any(file.startswith(FOLDERS[name]) for file in record["files"]):
+            yield f"lists no file of the format {name}"
 
 
 def _check_labels(record: Record, labels: Labels, content: Mapping[str, Any]) -> Iterator[str]:
@@ -165,6 +145,8 @@ def _check_labels(record: Record, labels: Labels, content: Mapping[str, Any]) ->
         truncation = 1 - np.count_nonzero(amodal) / label.silhouette_area
         if abs(truncation - entry["truncation"]) > _SHARE:
             yield f"{name}: its truncation is {truncation:.6f}, not {entry['truncation']}"
+        if abs(label.polygon_iou - entry["polygon_iou"]) > _SHARE:
+            yield f"{name}: the IoU of its polygon is {label.polygon_iou:.6f}, not {entry['polygon_iou']}"
         below = {"occluded": fraction < rules["min_visible"] - _SHARE}
         below["disagreeing"] = label.agreement < rules["min_agreement"] - _SHARE
         if set(label.marks) != {mark for mark, is_below in below.items() if is_below}:
@@ -218,6 +200,29 @@ def _check_collection(root: Path, records: list[Record], content: Mapping[str, A
                 yield file, "is missing"
             elif (root / file).read_bytes() != path.read_bytes():
                 yield file, _difference(root / file, path)
+
+
+def _check_models(root: Path, content: Mapping[str, Any]) -> Violations:
+    """Whether BOP's models are there and measure what is said of them."""
+    file = "bop/models/models_info.json"
+    try:
+        info = json.loads((root / file).read_bytes())
+    except (OSError, ValueError) as error:
+        yield file, f"cannot be read ({error})"
+        return
+    for number in range(1, len(content["assets"]) + 1):
+        model = f"bop/models/obj_{number:06d}.ply"
+        try:
+            measured = bop.model_info(read_mesh(root / model))
+        except InputError as error:
+            yield model, f"cannot be read ({error})"
+            continue
+        stated = info.get(str(number)) if isinstance(info, dict) else None
+        if not isinstance(stated, dict) or any(
+            not isinstance(stated.get(key), float) or abs(stated[key] - value) > _MODEL_ROUNDED
+            for key, value in measured.items()
+        ):
+            yield file, f"does not give the measures of {model}"
 
 
 def _difference(found: Path, expected: Path) -> str:

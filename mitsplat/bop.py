@@ -66,15 +66,19 @@ def write_models(root: Path, meshes: Sequence[trimesh.Trimesh]) -> None:
     for number, mesh in enumerate(meshes, start=1):
         scaled = mesh.copy()
         scaled.apply_scale(MILLIMETRES)
+        info[str(number)] = model_info(scaled)
         data = trimesh.exchange.ply.export_ply(scaled, encoding="ascii", vertex_normal=True)
         write_file(root / f"bop/models/obj_{number:06d}.ply", lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
-        low, extents = scaled.bounds[0], scaled.extents
-        info[str(number)] = {
-            "diameter": diameter(scaled),
-            **{f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)},
-            **{f"size_{axis}": float(value) for axis, value in zip("xyz", extents, strict=True)},
-        }
     write_text(root / "bop/models/models_info.json", json.dumps(info, indent=1))
+
+
+def model_info(mesh: trimesh.Trimesh) -> dict[str, float]:
+    """Diameter, lower corner and extents of a mesh, in its units."""
+    return {
+        "diameter": diameter(mesh),
+        **{f"min_{axis}": float(value) for axis, value in zip("xyz", mesh.bounds[0], strict=True)},
+        **{f"size_{axis}": float(value) for axis, value in zip("xyz", mesh.extents, strict=True)},
+    }
 
 
 def diameter(mesh: trimesh.Trimesh) -> float:

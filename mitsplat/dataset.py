@@ -142,7 +142,7 @@ def write_dataset(
     if unknown := set(formats) - set(FORMATS):
         raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
     catalogue = Catalogue.of(scene)
-    with _open_folder(scene, out, resume=resume, overwrite=overwrite) as manifest:
+    with _open_folder(scene, catalogue, out, resume=resume, overwrite=overwrite) as manifest:
         layouts: dict[int, list[int]] = {}
         for index in range(count):
             if index not in manifest:
@@ -225,9 +225,9 @@ class _FrameMaker:
 
 
 @contextmanager
-def _open_folder(scene: Scene, out: Path, *, resume: bool, overwrite: bool) -> Iterator[Manifest]:
+def _open_folder(scene: Scene, catalogue: Catalogue, out: Path, *, resume: bool, overwrite: bool) -> Iterator[Manifest]:
     """Lock and prepare the folder; its manifest, without the frames that miss a file."""
-    content = _content(scene, Catalogue.of(scene))
+    content = _content(scene, catalogue)
     _check_own(out)
     try:
         out.mkdir(parents=True, exist_ok=True)

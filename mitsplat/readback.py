@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat import bop
+from mitsplat.coco import image_file
 from mitsplat.files import Record
 from mitsplat.label import InstanceLabel, Labels
 from mitsplat.maps import instance_picture
@@ -116,7 +118,7 @@ def _check_rotated(frame: WrittenFrame, path: Path) -> Iterator[str]:
 
 def _check_pose(frame: WrittenFrame, path: Path) -> Iterator[str]:
     size = np.array([frame.labels.width, frame.labels.height])
-    count = max(map(len, frame.content["keypoints"]))
+    count = max(map(len, frame.content["keypoints"]), default=0)
     for row in _rows(frame, path):
         if isinstance(row, str):
             yield row
@@ -178,20 +180,34 @@ def _check_depth(frame: WrittenFrame, path: Path) -> Iterator[str]:
             yield f"{missing} pixels of instances have no depth"
 
 
-def check_bop(frame: WrittenFrame) -> Violations:
-    """What is wrong with the frame's BOP masks."""
-    scene = bop.scene_folder(frame.record)
-    if not any(file.startswith(scene) for file in frame.record["files"]):
+def check_bop(frame: WrittenFrame, damaged: Collection[str]) -> Violations:
+    """What is wrong with the frame's BOP pictures, but for those of which it is known already."""
+    if "bop" not in frame.content["scene"]["output"]["formats"]:
         return
+    scene, listed = bop.scene_folder(frame.record), frame.record["files"]
+    name = f"{frame.record['index']:06d}"
+    image = Path(image_file(frame.record))
+    checks: dict[str, Callable[[Path], Iterator[str]]] = {
+        f"{scene}/rgb/{name}{image.suffix}": lambda path: check_image(frame, path),
+        f"{scene}/depth/{name}.png": lambda path: _check_depth(frame, path),
+    }
     for position, label in enumerate(frame.labels.instances):
         for folder in ("mask", "mask_visib"):
-            file = f"{scene}/{folder}/{frame.record['index']:06d}_{position:06d}.png"
-            picture = cv2.imread(str(frame.root / file), cv2.IMREAD_UNCHANGED)
             expected = frame.whole(label, amodal=folder == "mask")
-            if picture is None or picture.shape != expected.shape:
-                yield file, "cannot be read as a grey image of the frame's size"
-            elif ((picture > 0) != expected).any():
-                yield file, f"{np.count_nonzero((picture > 0) != expected)} pixels differ from the manifest's mask"
+            checks[f"{scene}/{folder}/{name}_{position:06d}.png"] = partial(_check_mask, expected)
+    for file, check in checks.items():
+        if file not in listed:
+            yield file, "is not listed in the manifest"
+        elif file not in damaged:
+            yield from ((file, text) for text in check(frame.root / file))
+
+
+def _check_mask(expected: npt.NDArray[np.bool_], path: Path) -> Iterator[str]:
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.shape != expected.shape:
+        yield "cannot be read as a grey image of the frame's size"
+    elif ((picture > 0) != expected).any():
+        yield f"{np.count_nonzero((picture > 0) != expected)} pixels differ from the manifest's mask"
 
 
 CHECKS: dict[str, Callable[[WrittenFrame, Path], Iterator[str]]] = {

@@ -14,13 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset, read_content, read_records
+from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
 from mitsplat.charts import bars, columns, heat_map, histogram
 from mitsplat.coco import image_file
 from mitsplat.files import Record, write_text
 from mitsplat.label import Labels
 from mitsplat.masks import Silhouette
 from mitsplat.sheet import class_colour
+from mitsplat.stored import read_content, read_records
 
 SAMPLES = 12
 """Images that are shown, evenly spread over the dataset."""
@@ -70,7 +71,7 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
     out = root / "report.html" if out is None else Path(out)
     audit = audit_dataset(root)
     content = read_content(root)
-    records, _ = read_records(root)
+    records, _ = read_records(root, content)
     counted = _Statistics()
     for record in records:
         counted.add(record)

@@ -44,7 +44,15 @@ if TYPE_CHECKING:
     from mitsplat.frame import Frame
     from mitsplat.scene import Scene
 
-__all__ = ["FORMATS", "Catalogue", "encode_image", "write_collection", "write_frame"]
+__all__ = ["FOLDERS", "FORMATS", "Catalogue", "encode_image", "write_collection", "write_frame"]
+
+
+FOLDERS = {
+    **{task: f"{entry.folder}labels/" for task, entry in TASKS.items()},
+    **{name: f"{name}/" for name in ("bop", "depth", "instances", "normals", "panoptic", "semantic")},
+    "exr": "layers/",
+}
+"""Where every frame has a file, by format."""
 
 
 @dataclass(frozen=True, eq=False)

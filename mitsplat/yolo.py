@@ -74,7 +74,7 @@ def data_yaml(
             lines.append(f"{split}: images/{present[0]} # there are no images for {split}; Ultralytics wants some")
     lines += ["names:", *(f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names))]
     if keypoint_names is not None:
-        count = max(map(len, keypoint_names))
+        count = max(map(len, keypoint_names), default=0)
         lines += [f"kpt_shape: [{count}, 3]", "kpt_names:"]
         for i, names in enumerate(keypoint_names):
             padded = [*names, *(f"unused_{k}" for k in range(len(names), count))]

@@ -54,13 +54,13 @@ def splat_silhouettes(
 
 def proxy_silhouettes(
     proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: View
-) -> dict[int, Any]:
-    """The same by proxy meshes: (mesh, world_from_mesh) of every instance above 0."""
+) -> dict[int, Silhouette]:
+    """The same by proxy meshes: (mesh, world_from_mesh) of every part of an instance, by the instance's id."""
     canvas, left, top = _canvas(view)
     found = {}
     for instance, parts in proxies.items():
         window = _window(canvas, parts)
-        if instance == 0 or window is None:
+        if window is None:
             continue
         x0, y0, x1, y1 = window
         shape = y1 - y0, x1 - x0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,9 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.assets import Asset
+from mitsplat.dataset import write_dataset
+from mitsplat.scene import load_scene
+from mitsplat.spec import FORMATS
 from mitsplat.splats import Splats
 
 WriteScene = Callable[..., Path]
@@ -58,3 +63,28 @@ def write_scene(tmp_path: Path) -> WriteScene:
         return tmp_path / name
 
     return write
+
+
+@pytest.fixture(scope="session")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small dataset of drawn frames in every format, to be left as it is."""
+    from test_dataset import render, settle
+
+    folder = tmp_path_factory.mktemp("clean")
+    for asset in (box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))):
+        replace(asset, keypoints={"top": (0, 0, 0.005)}).save(folder / "assets" / asset.name)
+    data = {
+        "name": "small",
+        "objects": [{"asset": "assets/nut"}, {"asset": "assets/bolt"}],
+        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+        "output": {"width": 64, "height": 48, "layouts": 3, "views": 2, "formats": list(FORMATS)},
+    }
+    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
+    return write_dataset(load_scene(folder / "scene.yaml"), folder / "out", render=render, settle=settle).path
+
+
+@pytest.fixture
+def dataset(clean: Path, tmp_path: Path) -> Path:
+    """A copy of the clean dataset, to be damaged."""
+    return Path(shutil.copytree(clean, tmp_path / "out"))

@@ -12,44 +12,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from pycocotools import mask as coco_mask
 from test_cli import run
-from test_dataset import render, settle
 
 from mitsplat.audit import audit_dataset
-from mitsplat.dataset import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.scene import load_scene
-from mitsplat.spec import FORMATS
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from conftest import box_asset
-    from ruamel.yaml import YAML
-
-    folder = tmp_path_factory.mktemp("audit")
-    for asset in (box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))):
-        asset.save(folder / "assets" / asset.name)
-        manual = folder / "assets" / asset.name / "asset.yaml"
-        manual.write_text(manual.read_text() + "keypoints: {top: [0, 0, 0.005]}\n")
-    data = {
-        "name": "small",
-        "objects": [{"asset": "assets/nut"}, {"asset": "assets/bolt"}],
-        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
-        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
-        "output": {"width": 64, "height": 48, "layouts": 3, "views": 2, "formats": list(FORMATS)},
-    }
-    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
-    scene = load_scene(folder / "scene.yaml")
-    write_dataset(scene, folder / "out", render=render, settle=settle)
-    return folder / "out"
-
-
-@pytest.fixture
-def dataset(clean: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(clean, tmp_path / "out"))
 
 
 def records_of(root: Path) -> list[Record]:
@@ -201,6 +170,25 @@ def shift_segments(root: Path, records: list[Record]) -> None:
     cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), 3, axis=1))
 
 
+def forget_a_depth(root: Path, records: list[Record]) -> None:
+    del records[0]["files"]["depth/train/000000.png"]
+
+
+def forget_a_bop_mask(root: Path, records: list[Record]) -> None:
+    del records[0]["files"]["bop/train/000000/mask/000000_000000.png"]
+
+
+def claim_a_polygon(root: Path, records: list[Record]) -> None:
+    first(records)["polygon_iou"] = 0.5
+
+
+def model_in_metres(root: Path, records: list[Record]) -> None:
+    path = root / "bop/models/obj_000001.ply"
+    mesh = trimesh.load_mesh(path)
+    mesh.apply_scale(0.001)
+    mesh.export(path)
+
+
 FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     lose_a_label: ("labels/train/000000.txt", "lines for"),
     swap_a_class: ("labels/train/000000.txt", "class is"),
@@ -221,6 +209,10 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is not the smallest rectangle"),
     flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints are not"),
     shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
+    forget_a_depth: ("manifest.jsonl, frame 0", "lists no file of the format depth"),
+    forget_a_bop_mask: ("bop/train/000000/mask/000000_000000.png", "is not listed in the manifest"),
+    claim_a_polygon: ("manifest.jsonl, frame 0", "the IoU of its polygon is"),
+    model_in_metres: ("bop/models/models_info.json", "does not give the measures of bop/models/obj_000001.ply"),
 }
 
 
@@ -286,6 +278,37 @@ def test_a_damaged_manifest_is_found(dataset: Path) -> None:
         file.write('{"index": 7}\n')
     (found,) = [text for file, text in audit_dataset(dataset).violations]
     assert found.startswith("line 7 is not the record of a frame")
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "text"),
+    [
+        (("labels", "instances", 0, "box"), [0, 0, 0, 0], "instance 1: rle: its box must lie in the image"),
+        (("labels", "instances", 0, "amodal_box"), [0, 0, 1000, 9], "amodal_rle: its box must lie in the image"),
+        (("labels", "instances", 0, "rle"), "", "must have a pixel in its box"),
+        (("labels", "instances", 0, "silhouette_area"), 0, "silhouette_area: Input should be greater"),
+        (("labels", "instances", 0, "class_index"), 2, "class_index must be below 2 (got 2)"),
+        (("labels", "instances", 0, "asset"), 9, "asset must be below 2 (got 9)"),
+        (("labels", "instances", 0, "keypoints"), [[1.0, 1.0, 2.0]] * 3, "keypoints must be those of its class"),
+        (("labels", "size"), [32, 24], "labels.size must be the camera's"),
+        (("camera", "intrinsics"), [[1.0]], "camera.intrinsics"),
+        (("environment",), None, "environment must be a segment"),
+        (("depth_scale",), None, "depth_scale must be stated"),
+        (("files",), {}, "files must list the frame's image"),
+        (("split",), "test", "split: Input should be 'train' or 'val'"),
+    ],
+)
+def test_a_record_that_nothing_can_rely_on_is_one_violation(
+    dataset: Path, keys: tuple[Any, ...], value: Any, text: str
+) -> None:
+    records = records_of(dataset)
+    place: Any = records[0]
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = value
+    (dataset / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    found = [said for file, said in audit_dataset(dataset).violations if file == "manifest.jsonl"]
+    assert len(found) == 1 and found[0].startswith("line 1 is not the record of a frame (") and text in found[0]
 
 
 def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_audit import clean, dataset, records_of, store, swap_a_class  # noqa: F401 - fixtures
+from test_audit import records_of, store, swap_a_class
 from test_cli import run
 
 from mitsplat.charts import bars, columns, heat_map, histogram
@@ -46,7 +46,7 @@ class Page(HTMLParser):
 
 
 @pytest.fixture
-def page(clean: Path, tmp_path: Path) -> Page:  # noqa: F811
+def page(clean: Path, tmp_path: Path) -> Page:
     path, _ = write_report(clean, tmp_path / "report.html")
     return Page(path.read_text())
 
@@ -89,7 +89,7 @@ def test_the_page_is_well_formed_and_named_for_screen_readers(page: Page) -> Non
     assert not any("tabindex" in attributes and attributes["tabindex"] != "0" for _, attributes in page.elements)
 
 
-def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium on this machine")
@@ -108,7 +108,7 @@ def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
     assert body is not None and 'data-shown="true"' in body[0] and 'data-hidden="true"' in body[0]
 
 
-def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     records = records_of(dataset)
     swap_a_class(dataset, records)
     (dataset / "images/train/<b>.png").write_bytes(b"")
@@ -120,7 +120,7 @@ def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureF
     assert "<b>.png" not in text
 
 
-def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:  # noqa: F811
+def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:
     (dataset / "images/train/000000.png").unlink()
     with (dataset / "manifest.jsonl").open("a") as file:
         file.write("{\n")

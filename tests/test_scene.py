@@ -199,6 +199,19 @@ def test_environment_cannot_be_dropped(scene_data: SceneData, write_scene: Write
 # Frames
 
 
+def test_the_next_camera_is_that_of_the_layouts_next_view(scene_data: SceneData, write_scene: WriteScene) -> None:
+    scene = load_scene(write_scene(scene_data))
+    for index in range(scene.num_frames):
+        following = plan_frame(scene, index).next_camera
+        if index % 4 == 3:
+            assert following is None
+        else:
+            assert following is not None
+            np.testing.assert_array_equal(
+                following.world_from_camera, plan_frame(scene, index + 1).camera.world_from_camera
+            )
+
+
 def test_frames_belong_to_layouts(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene = load_scene(write_scene(scene_data))
     assert [layout_of(scene, index) for index in range(12)] == [0] * 4 + [1] * 4 + [2] * 4

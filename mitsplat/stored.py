@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mitsplat.coco import camera_of
 from mitsplat.errors import InputError
 from mitsplat.files import Record
+from mitsplat.masks import encode_mask
 from mitsplat.spec import Labelling, Output
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
@@ -178,9 +179,10 @@ def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
     x0, y0, x1, y1 = box
     if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
         raise ValueError(f"its box must lie in the image (got {box})")
-    mask = coco_mask.decode({"size": [height, width], "counts": code})
-    if not mask[y0:y1, x0:x1].any():
-        raise ValueError(f"must have a pixel in its box (got none in {box})")
+    mask = coco_mask.decode({"size": [height, width], "counts": code}).astype(bool)[y0:y1, x0:x1]
+    # Decoding leaves what no run covers as the memory was; only a whole code is what its mask encodes to.
+    if not mask.any() or encode_mask(mask, (x0, y0, x1, y1), (width, height)) != code:
+        raise ValueError(f"must be the code of a mask in its box (got {code[:20]!r} for {box})")
 
 
 def _first(error: ValidationError) -> str:

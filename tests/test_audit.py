@@ -285,7 +285,8 @@ def test_a_damaged_manifest_is_found(dataset: Path) -> None:
     [
         (("labels", "instances", 0, "box"), [0, 0, 0, 0], "instance 1: rle: its box must lie in the image"),
         (("labels", "instances", 0, "amodal_box"), [0, 0, 1000, 9], "amodal_rle: its box must lie in the image"),
-        (("labels", "instances", 0, "rle"), "", "must have a pixel in its box"),
+        (("labels", "instances", 0, "rle"), "", "must be the code of a mask in its box (got '' for"),
+        (("labels", "instances", 0, "rle"), "1", "must be the code of a mask in its box"),
         (("labels", "instances", 0, "silhouette_area"), 0, "silhouette_area: Input should be greater"),
         (("labels", "instances", 0, "class_index"), 2, "class_index must be below 2 (got 2)"),
         (("labels", "instances", 0, "asset"), 9, "asset must be below 2 (got 9)"),

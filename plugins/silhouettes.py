@@ -21,7 +21,7 @@ import trimesh
 from mitsplat.camera import Camera
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.gaussian import RECORD
-from mitsplat.plugins.march import PIXELS_PER_LANE, _respond
+from mitsplat.plugins.march import _respond
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
 from mitsplat.quality import Quality
@@ -43,7 +43,7 @@ def splat_silhouettes(
         return {}
     canvas, left, top = _canvas(view)
     fine = canvas.sampled(quality.samples)
-    lists = bin_gaussians(clouds, objects, fine, alpha_min=quality.alpha_min, sh_degree=0)
+    lists = bin_gaussians(clouds, objects, fine, replace(quality, order="tile", sh_degree=0))
     if lists.pairs == 0:
         return {}
     ids = np.unique([placement.instance for placement in objects])
@@ -131,17 +131,16 @@ def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any]:
 
 def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance: Any) -> Any:
     """For every pair and each column of its tile, the pixels that the instance covers, as bits from the top."""
-    lanes_per_tile = TILE * TILE // PIXELS_PER_LANE
-    lane = dr.arange(mi.UInt32, dr.width(tile) * lanes_per_tile)
-    pair, within = lane // lanes_per_tile, lane % lanes_per_tile
+    lane = dr.arange(mi.UInt32, dr.width(tile) * TILE)
+    pair, column = lane // TILE, lane % TILE
     tile, instance = dr.gather(mi.UInt32, tile, pair), dr.gather(mi.Float, instance, pair)
     row = tile // view.tiles_x
-    x = mi.Float((tile - row * view.tiles_x) * TILE + within % TILE)
-    y = mi.Float(row * TILE + within // TILE * PIXELS_PER_LANE)
+    x = mi.Float((tile - row * view.tiles_x) * TILE + column)
+    y = mi.Float(row * TILE)
     n = quality.samples
     middle = n * n // 2  # the sample that the instance image shows
     dx, dy = dr.opaque(mi.Float, (middle % n + 0.5) / n), dr.opaque(mi.Float, (middle // n + 0.5) / n)
-    slopes = [view.slopes(x + dx, y + k + dy) for k in range(PIXELS_PER_LANE)]
+    slopes = [view.slopes(x + dx, y + k + dy) for k in range(TILE)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
     start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
@@ -164,7 +163,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance
             most = dr.maximum(most, t)
         return (i < stop) & (most >= 0.5)
 
-    ones = [mi.Float(1.0) for _ in range(PIXELS_PER_LANE)]
+    ones = [mi.Float(1.0) for _ in range(TILE)]
     _, through = dr.while_loop((mi.UInt32(start), ones), undecided, body, label="silhouettes")
     bits = mi.UInt32(0)
     for k, t in enumerate(through):
@@ -178,7 +177,9 @@ def _assemble(
 ) -> dict[int, Silhouette]:
     """Masks of whole instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE)
-    blocks = np.unpackbits(columns[..., None], axis=2, bitorder="little").swapaxes(1, 2)  # pair, row, column
+    blocks = np.unpackbits(columns[..., None], axis=2, count=TILE, bitorder="little").swapaxes(
+        1, 2
+    )  # pair, row, column
     rows, cols = tile // canvas.tiles_x, tile % canvas.tiles_x
     found = {}
     for number, instance in enumerate(ids):

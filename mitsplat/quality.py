@@ -9,10 +9,38 @@ from mitsplat.errors import InputError
 
 
 @dataclass(frozen=True)
+class Kernel:
+    """How a Gaussian's footprint on the image differs from the Gaussian itself.
+
+    Attributes:
+        variance: What is added to the footprint's covariance [px^2].
+        keeps_light: Whether opacity falls as the footprint grows, so that the light of small Gaussians stays the same.
+        alpha_max: Highest opacity of one Gaussian along a ray.
+    """
+
+    variance: float
+    keeps_light: bool
+    alpha_max: float
+
+
+KERNELS: dict[str, Kernel] = {
+    "exact": Kernel(0.0, True, 1.0),
+    "mip": Kernel(1.0 / 12.0, True, 1.0),
+    "3dgs": Kernel(0.3, False, 0.99),
+    "gsplat": Kernel(0.3, False, 0.999),
+}
+
+
+@dataclass(frozen=True)
 class Quality:
     """What the renderer computes for one ray; every field that is cheaper is also less exact.
 
     Attributes:
+        response: Gaussians along every perspective ray (``perspective``), or along rays that are parallel within one
+            Gaussian's footprint, as trainers linearise the projection (``ewa``; Zwicker et al. 2002).
+        kernel: ``exact`` evaluates the Gaussian itself at the pixel's centre. ``mip`` widens footprints by the variance
+            of a pixel, so that small Gaussians do not sparkle (2-D Mip filter, Yu et al. 2024). ``3dgs`` and ``gsplat``
+            dilate and limit opacity as those trainers do.
         order: Gaussians are blended in the order of their peaks along one ray of every 4 x 4 tile of pixels (``tile``),
             or along the pixel's own ray (``ray``).
         alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
@@ -21,6 +49,8 @@ class Quality:
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered).
     """
 
+    response: Literal["perspective", "ewa"] = "perspective"
+    kernel: Literal["exact", "mip", "3dgs", "gsplat"] = "exact"
     order: Literal["tile", "ray"] = "tile"
     alpha_min: float = 1.0 / 255.0
     transmittance_min: float = 1e-3
@@ -28,6 +58,10 @@ class Quality:
     samples: int = 1
 
     def __post_init__(self) -> None:
+        if self.response not in ("perspective", "ewa"):
+            raise InputError(f"quality: response must be 'perspective' or 'ewa' (got {self.response!r})")
+        if self.kernel not in KERNELS:
+            raise InputError(f"quality: kernel must be one of {', '.join(KERNELS)} (got {self.kernel!r})")
         if self.order not in ("tile", "ray"):
             raise InputError(f"quality: order must be 'tile' or 'ray' (got {self.order!r})")
         if not 0.0 < self.alpha_min < 1.0:

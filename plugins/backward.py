@@ -22,7 +22,7 @@ from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.plugins.march import Lanes, march
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
-from mitsplat.quality import Quality
+from mitsplat.quality import KERNELS, Quality
 
 LN_2 = 0.6931471805599453
 
@@ -38,10 +38,12 @@ def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[l
     Gaussians that reach the camera's plane are rendered but get no gradient.
 
     Raises:
-        ValueError: If the quality asks for another order or several samples.
+        ValueError: If the quality asks for another order, several samples or a kernel that limits opacity.
     """
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
         raise ValueError("gradients need quality.order 'tile' and one sample per pixel")
+    if KERNELS[quality.kernel].alpha_max < 1:
+        raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
     clouds = CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
     eye = Placement(0, _IDENTITY, 1)
     lists = bin_gaussians(clouds, [eye], view, quality)

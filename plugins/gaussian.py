@@ -14,13 +14,20 @@ and the depth of that point is ``z = m_z (1 + (E du + F dv) / 2) / (the same den
 for every perspective ray, and no two large numbers are subtracted, so float32 holds for small and far Gaussians, where
 the textbook form loses all its digits.
 
+A low-pass filter of covariance K on the image makes the footprint's covariance M^-1 + K, where M = ((A, B), (B, C)):
+
+    M' = (M + det(M) adj(K)) / D,   D = det(I + M K) = 1 + tr(M K) + det(M) det(K),   opacity' = opacity / sqrt(D)
+
+As for any joint Gaussian, what its depth and its denominator have of the slopes shrinks by P = (I + M K)^-1: the filter
+spreads a Gaussian over rays that pass beside it, and says nothing about where it would be there.
+
 The rays on which a Gaussian reaches the cut-off ``q <= k^2`` fill the conic ``numerator - k^2 denominator <= 0``. It is
 an ellipse, with a closed-form bounding box, unless the cut-off ellipsoid touches the camera's plane z = 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -140,7 +147,7 @@ Conic6 = tuple[Any, Any, Any, Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A Gaussian seen from the camera: centre and coefficients of the response (module docstring), and its depth."""
+    """A Gaussian seen from the camera: centre, coefficients of the response (module docstring), depth and det(M)."""
 
     u0: Any
     v0: Any
@@ -153,6 +160,36 @@ class Response:
     h: Any
     i: Any
     depth: Any
+    det: Any
+
+    def filtered(self, k11: Any, k12: Any, k22: Any) -> tuple[Response, Any]:
+        """The response under a low-pass filter of covariance K in slopes, and det(I + M K) (module docstring)."""
+        b = 0.5 * self.b2
+        p, q = self.a * k11 + b * k12, self.a * k12 + b * k22
+        r, s = b * k11 + self.c * k12, b * k12 + self.c * k22
+        det = 1 + p + s + self.det * (k11 * k22 - k12 * k12)
+        inverse = dr.rcp(det)
+        p11, p12, p21, p22 = (1 + s) * inverse, -q * inverse, -r * inverse, (1 + p) * inverse
+        g, h, i = self.g, 0.5 * self.h, self.i
+        response = Response(
+            self.u0,
+            self.v0,
+            (self.a + self.det * k22) * inverse,
+            2 * (b - self.det * k12) * inverse,
+            (self.c + self.det * k11) * inverse,
+            p11 * self.e + p12 * self.f,
+            p21 * self.e + p22 * self.f,
+            p11 * (p11 * g + p12 * h) + p12 * (p11 * h + p12 * i),
+            2 * (p11 * (p21 * g + p22 * h) + p12 * (p21 * h + p22 * i)),
+            p21 * (p21 * g + p22 * h) + p22 * (p21 * h + p22 * i),
+            self.depth,
+            self.det * inverse,
+        )
+        return response, det
+
+    def parallel(self) -> Response:
+        """The response along rays parallel to the one through the centre: no perspective within the footprint."""
+        return replace(self, e=mi.Float(0), f=mi.Float(0), g=mi.Float(0), h=mi.Float(0), i=mi.Float(0))
 
     def cutoff(self, k2: Any) -> Conic6:
         """Coefficients of du^2, du dv, dv^2, du, dv and 1 of the conic that is <= 0 where q <= k^2."""
@@ -204,6 +241,7 @@ def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
         2 * n0 * dr.dot(w1, w2),
         n0 * dr.squared_norm(w2),
         depth * scale,
+        dr.square(gain * dr.dot(w0, dr.cross(w1, w2))) * dr.squared_norm(w0),
     )
 
 

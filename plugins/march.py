@@ -6,7 +6,9 @@ for a packet of rays: the more pixels share a fetch, the better, until registers
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -15,7 +17,7 @@ import mitsuba as mi
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists
-from mitsplat.quality import Quality
+from mitsplat.quality import KERNELS, Quality
 
 SORT_SLOTS = 8
 """Gaussians that the per-ray order collects in one walk over a part of a list."""
@@ -85,7 +87,9 @@ def _blend(pixel: Pixel, weight: Any, transmittance: Any, colour: list[Any], z: 
     ]
 
 
-def _respond(record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool) -> list[tuple[Any, Any]]:
+def _respond(
+    record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
+) -> list[tuple[Any, Any]]:
     """(log2 of opacity along the ray, depth of the peak) of one Gaussian on several rays, as in module `gaussian`."""
     u0, v0, a, b2, c, opacity, _, _, _, depth, e, f, g, h, i, _ = record
     result: list[Any] = []
@@ -113,7 +117,8 @@ def _respond(record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared
         result, _ = dr.if_stmt(
             (result, u0), a < 0, at_the_camera, lambda result, row: (result, row), label="gaussian at the camera"
         )
-    return list(zip(result[0::2], result[1::2], strict=True))
+    log_alphas = result[0::2] if cap is None else [dr.minimum(log_alpha, cap) for log_alpha in result[0::2]]
+    return list(zip(log_alphas, result[1::2], strict=True))
 
 
 class Lanes:
@@ -161,11 +166,14 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
     walk = _walk_in_tile_order if quality.order == "tile" else _walk_in_ray_order
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end = dr.opaque(mi.Float, quality.transmittance_min)
+    alpha_max = KERNELS[quality.kernel].alpha_max
+    cap = dr.log2(dr.opaque(mi.Float, alpha_max)) if alpha_max < 1 else None
     passes = []
     for i in range(n * n):
         dx, dy = dr.opaque(mi.Float, (i % n + 0.5) / n), dr.opaque(mi.Float, (i // n + 0.5) / n)
         us, vs = lanes.slopes(dx, dy)
-        pixels = walk(lists, lanes.start, lanes.stop, us, vs, far, view, cut, end)
+        respond = partial(_respond, lists=lists, us=us, vs=vs, shared_column=not view.distortion, cap=cap)
+        pixels = walk(lists, lanes.start, lanes.stop, respond, far, view.near_plane, cut, end)
         passes.append(_collect(pixels, lanes.pixel, lanes.inside, view.width * view.height))
         if n > 1:
             dr.eval(passes[-1])
@@ -196,16 +204,13 @@ def _walk_in_tile_order(
     lists: TileLists,
     start: Any,
     stop: Any,
-    us: list[Any],
-    vs: list[Any],
+    respond: Callable[[Any], list[tuple[Any, Any]]],
     far: list[Any],
-    view: View,
+    near: Any,
     cut: Any,
     end: Any,
 ) -> list[Pixel]:
     """Blend in the order of the tile's list: that of the peaks along one of its rays."""
-    near = view.near_plane
-    shared_column = not view.distortion
 
     def alive(pixels: list[Pixel]) -> Any:
         brightest = pixels[0][T]
@@ -218,7 +223,7 @@ def _walk_in_tile_order(
             mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
         )
         blended = []
-        responses = _respond(record, lists, us, vs, shared_column)
+        responses = respond(record)
         for pixel, (log_alpha, z), z_far in zip(pixels, responses, far, strict=True):
             hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[T] > end)
             weight = dr.select(hit, pixel[T] * dr.exp2(log_alpha), 0.0)
@@ -226,7 +231,7 @@ def _walk_in_tile_order(
         return i + 1, blended
 
     _, pixels = dr.while_loop(
-        (start, [_new_pixel() for _ in us]), lambda i, pixels: (i < stop) & alive(pixels), body, label="march"
+        (start, [_new_pixel() for _ in far]), lambda i, pixels: (i < stop) & alive(pixels), body, label="march"
     )
     return pixels
 
@@ -235,10 +240,9 @@ def _walk_in_ray_order(
     lists: TileLists,
     start: Any,
     stop: Any,
-    us: list[Any],
-    vs: list[Any],
+    respond: Callable[[Any], list[tuple[Any, Any]]],
     far: list[Any],
-    view: View,
+    near: Any,
     cut: Any,
     end: Any,
 ) -> list[Pixel]:
@@ -248,7 +252,6 @@ def _walk_in_ray_order(
     have a peak in front of those, and the next one begins at the first entry that found no slot: a walk sees a short
     part of the list, and any number of Gaussians in any order comes out right. Equal depths keep the list's order.
     """
-    near, shared_column = view.near_plane, not view.distortion
     width = dr.width(start)
     none = 0xFFFFFFFF
 
@@ -274,7 +277,7 @@ def _walk_in_ray_order(
         def body(i: Any, slots: list[_Slots], left: list[Any]) -> tuple[Any, list[_Slots], list[Any]]:
             record = dr.gather(mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, width))
             new_slots, new_left = [], []
-            responses = _respond(record, lists, us, vs, shared_column)
+            responses = respond(record)
             for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
                 responses, slots, left, far, last, strict=True
             ):
@@ -295,7 +298,7 @@ def _walk_in_ray_order(
         def empty() -> _Slots:
             return [(mi.Float(dr.inf), mi.Float(0), mi.UInt32(0)) for _ in range(SORT_SLOTS)]
 
-        state = mi.UInt32(begin), [empty() for _ in us], [mi.UInt32(none) for _ in us]
+        state = mi.UInt32(begin), [empty() for _ in far], [mi.UInt32(none) for _ in far]
         i, slots, left = dr.while_loop(state, unfilled, body, label="collect")
         return i, slots, left
 
@@ -322,8 +325,8 @@ def _walk_in_ray_order(
         return blended, new_last, next_begin, dr.maximum(seen, reached), active & unfinished
 
     state = (
-        [_new_pixel() for _ in us],
-        [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in us],
+        [_new_pixel() for _ in far],
+        [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in far],
         mi.UInt32(start),
         mi.UInt32(start),
         start < stop,

@@ -126,6 +126,19 @@ class View:
             ),
         )
 
+    def pixel_covariance(self, u: Any, v: Any, variance: float) -> tuple[Any, Any, Any]:
+        """Covariance (uu, uv, vv) in slopes, at (u, v), of an isotropic ``variance`` [px^2] on the image."""
+        o = self._opaque
+        variance = dr.opaque(mi.Float, variance)
+        if not self.distortion:
+            return variance / dr.square(o["fx"]), mi.Float(0), variance / dr.square(o["fy"])
+        lo_u, hi_u, lo_v, hi_v = self._extent
+        _, _, (a, b, c, d) = self.distort(dr.clip(u, lo_u, hi_u), dr.clip(v, lo_v, hi_v))
+        # Inverse of the map from slopes to pixels, diag(f) J.
+        det = (a * d - b * c) * o["fx"] * o["fy"]
+        a, b, c, d = d * o["fy"] / det, -b * o["fx"] / det, -c * o["fy"] / det, a * o["fx"] / det
+        return variance * (a * a + b * b), variance * (a * c + b * d), variance * (c * c + d * d)
+
     def tile_box(self, u0: Any, u1: Any, v0: Any, v1: Any) -> tuple[Any, Any, Any, Any]:
         """Half-open ranges of tiles (x0, x1, y0, y1) that a box of slopes may meet, clipped to the image."""
         o = self._opaque

@@ -151,7 +151,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance
             mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
         )
         mine = record[RECORD - 1] == instance
-        responses = _respond(record, lists, us, vs, shared_column)
+        responses = _respond(record, lists, us, vs, shared_column, cap=None)
         return i + 1, [
             dr.select(mine & (log_alpha > cut) & (z > near), t * (1 - dr.exp2(log_alpha)), t)
             for t, (log_alpha, z) in zip(through, responses, strict=True)

@@ -30,7 +30,7 @@ from mitsplat.plugins.gaussian import (
     rotation_axes,
 )
 from mitsplat.plugins.rays import View
-from mitsplat.quality import Quality
+from mitsplat.quality import KERNELS, Quality
 
 PLACEMENT = 32
 """Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
@@ -121,10 +121,9 @@ def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View,
     total = dr.width(local)
     if total == 0:
         return _empty(tiles)
-    source = _Source(clouds, table)
-    cut = dr.opaque(mi.Float, quality.alpha_min)
+    source = _Source(clouds, table, view, quality)
 
-    depth, visible = source.cull(owner, local, view, cut)
+    depth, visible = source.cull(owner, local)
     index = dr.compress(visible)
     count = dr.width(index)
     if count == 0:
@@ -133,7 +132,7 @@ def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View,
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     dr.eval(owner, local)
 
-    records, near, bounds, box, candidates = source.records(owner, local, view, cut, quality.sh_degree)
+    records, near, bounds, box, candidates = source.records(owner, local)
     entries, nearest, start, stop = _pair(dr.detach(records), bounds, box, candidates, view, tiles, quality.order)
     return TileLists(records, near, entries, nearest, start, stop, count, dr.width(entries))
 
@@ -186,8 +185,9 @@ def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vi
 class _Source:
     """Gaussians of placements as the projection kernels read them."""
 
-    def __init__(self, clouds: CloudSet, table: Any) -> None:
-        self.clouds, self.table = clouds, table
+    def __init__(self, clouds: CloudSet, table: Any, view: View, quality: Quality) -> None:
+        self.clouds, self.table, self.view, self.quality = clouds, table, view, quality
+        self.cut = dr.opaque(mi.Float, quality.alpha_min)
 
     def load(self, owner: Any, local: Any) -> dict[str, Any]:
         row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PLACEMENT, dr.width(owner)))
@@ -204,11 +204,14 @@ class _Source:
             "scale": row[9],
         } | {"opacity": packet[3], "instance": row[10]}
 
-    def bounds(self, g: dict[str, Any], view: View, cut: Any) -> tuple[Any, ...]:
-        """Response, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth."""
+    def bounds(self, g: dict[str, Any]) -> tuple[Any, ...]:
+        """Response, opacity, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth.
+
+        Gaussians near the plane keep the exact response: a pixel is small against them, and no line of sight central.
+        """
+        view, kernel = self.view, KERNELS[self.quality.kernel]
         shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
-        k2 = 2 * dr.log(g["opacity"] / cut)
-        k = dr.safe_sqrt(k2)
+        k = dr.safe_sqrt(2 * dr.log(g["opacity"] / self.cut))
         reach = [
             g["scale"]
             * k
@@ -216,9 +219,18 @@ class _Source:
             for v in (g["right"], g["down"], g["forward"])
         ]
         centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
-        response = project_gaussian(**shape)
+        response, opacity = project_gaussian(**shape), g["opacity"]
+        if kernel.variance > 0:
+            covariance = view.pixel_covariance(response.u0, response.v0, kernel.variance)
+            response, det = response.filtered(*covariance)
+            if kernel.keeps_light:
+                opacity = opacity * dr.rsqrt(det)
+        if self.quality.response == "ewa":
+            response = response.parallel()
+        k2 = 2 * dr.log(opacity / self.cut)
         du0, du1, dv0, dv1, ellipse = ellipse_bounds(response.cutoff(k2))
         near = ~ellipse | (centre[2] - reach[2] < view.near_plane)
+        opacity, k2 = dr.select(near, g["opacity"], opacity), dr.select(near, k * k, k2)
         farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
 
         # Slopes of the part of the ellipsoid's box beyond the near plane: loose, but only few Gaussians need it.
@@ -237,12 +249,12 @@ class _Source:
             dr.select(near, near_v1, response.v0 + dv1),
         )
         visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
-        return response, k2, near, visible, box, centre[2] - reach[2]
+        return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
-    def cull(self, owner: Any, local: Any, view: View, cut: Any) -> tuple[Any, Any]:
+    def cull(self, owner: Any, local: Any) -> tuple[Any, Any]:
         g = self.load(owner, local)
-        response, _, _, visible, box, _ = self.bounds(g, view, cut)
-        x0, x1, y0, y1 = view.tile_box(*box)
+        response, _, _, _, visible, box, _ = self.bounds(g)
+        x0, x1, y0, y1 = self.view.tile_box(*box)
         visible &= (x1 > x0) & (y1 > y0)
         depth, visible = dr.detach(response.depth), dr.detach(visible)
         # Depth first as the sort key; Gaussians behind the camera that still reach in front of it come first.
@@ -250,11 +262,11 @@ class _Source:
         dr.eval(depth, visible)
         return depth, visible
 
-    def records(self, owner: Any, local: Any, view: View, cut: Any, sh_degree: int) -> tuple[Any, ...]:
+    def records(self, owner: Any, local: Any) -> tuple[Any, ...]:
         count = dr.width(local)
         g = self.load(owner, local)
-        response, k2, near, _, box, least = self.bounds(g, view, cut)
-        colour = self.colour(g["mean"], local, sh_degree)
+        response, opacity, k2, near, _, box, least = self.bounds(g)
+        colour = self.colour(g["mean"], local)
         order = dr.arange(mi.UInt32, count)
         near_rows = None
         near_index = dr.compress(near)
@@ -262,7 +274,7 @@ class _Source:
         conic = response.cutoff(k2)
         u0, v0 = response.u0, response.v0
         if dr.width(near_index) > 0:
-            near_rows, near_cut = self.near_rows(near_index, owner, local, cut)
+            near_rows, near_cut = self.near_rows(near_index, owner, local)
             dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
             u0, v0 = dr.select(near, 0.0, u0), dr.select(near, 0.0, v0)
             row = dr.gather(mi.ArrayXf, near_cut, near_number, near, shape=(8, count))
@@ -274,7 +286,7 @@ class _Source:
             dr.select(near, -1.0, response.a * scaled),
             response.b2 * scaled,
             response.c * scaled,
-            dr.log2(g["opacity"]),
+            dr.log2(opacity),
             *colour,
             response.depth,
             response.e,
@@ -287,18 +299,18 @@ class _Source:
         records, bounds = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, BOUNDS * count)
         dr.scatter(records, mi.ArrayXf(record), order)
         dr.scatter(bounds, mi.ArrayXf([dr.detach(v) for v in (u0, v0, *conic, least, *[mi.Float(0)] * 3)]), order)
-        x0, x1, y0, y1 = view.tile_box(*(dr.detach(side) for side in box))
+        x0, x1, y0, y1 = self.view.tile_box(*(dr.detach(side) for side in box))
         candidates = (x1 - x0) * (y1 - y0)
         tile_box = dr.empty(mi.UInt32, 4 * count)
         dr.scatter(tile_box, mi.ArrayXu([x0, y0, x1 - x0, y1 - y0]), order)
         dr.eval(records, bounds, tile_box, candidates)
         return records, near_rows, bounds, tile_box, candidates
 
-    def near_rows(self, index: Any, owner: Any, local: Any, cut: Any) -> tuple[Any, Any]:
+    def near_rows(self, index: Any, owner: Any, local: Any) -> tuple[Any, Any]:
         """General responses of Gaussians at the camera's plane, and their cut-off conics padded to 8 floats."""
         count = dr.width(index)
         g = self.load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
-        k2 = 2 * dr.log(g.pop("opacity") / cut)
+        k2 = 2 * dr.log(g.pop("opacity") / self.cut)
         g.pop("instance")
         c = [dr.detach(v) for v in general_response(**g)]
         k2 = dr.detach(k2)
@@ -310,9 +322,9 @@ class _Source:
         dr.eval(rows, cuts)
         return rows, cuts
 
-    def colour(self, mean: Any, local: Any, sh_degree: int) -> list[Any]:
+    def colour(self, mean: Any, local: Any) -> list[Any]:
         clouds = self.clouds
-        bands = min(clouds.sh_count, (sh_degree + 1) ** 2)
+        bands = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
         floats = -(-3 * bands // 4) * 4
         base = local * (clouds.sh_stride // 4)
         packets = [dr.gather(mi.Array4f, clouds.sh, base + j) for j in range(floats // 4)]

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
+from mitsplat.quality import KERNELS, PRESETS, Quality
 from mitsplat.splats import Splats, evaluate_sh
 
 Array = npt.NDArray[np.float64]
@@ -23,14 +24,18 @@ class Reference:
     depth: Array
 
 
-def render_reference(splats: Splats, camera: Camera) -> Reference:
+def render_reference(splats: Splats, camera: Camera, quality: Quality = PRESETS["exact"]) -> Reference:
     """Blend the peak response of every Gaussian along each ray, sorted by the depth of the peaks."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     slopes = camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
     rgb, alpha, depth = [], [], []
     colours = reference_colours(splats, camera)
+    plain = (quality.response, quality.kernel) == ("perspective", "exact")
     for u, v in slopes:
-        opacity, z = responses(splats, camera, u, v)
+        if plain:
+            opacity, z = responses(splats, camera, u, v)
+        else:
+            opacity, z = widened_responses(splats, camera, u, v, quality)
         order = np.argsort(z, kind="stable")
         opacity, z = opacity[order], z[order]
         transmittance = np.concatenate([[1.0], np.cumprod(1.0 - opacity)])
@@ -58,6 +63,37 @@ def responses(splats: Splats, camera: Camera, u: float, v: float) -> tuple[Array
     distance2 = (np.cross(whitened_mean, whitened_ray) ** 2).sum(axis=1) / length2
     opacity = splats.opacities * np.exp(-0.5 * distance2)
     return np.where(z > camera.near, opacity, 0.0), z
+
+
+def widened_responses(splats: Splats, camera: Camera, u: float, v: float, quality: Quality) -> tuple[Array, Array]:
+    """The same under a kernel or along parallel rays, from the covariance that EWA projects (Zwicker et al. 2002).
+
+    Depth and length of the ray are those of a joint Gaussian whose position on the image is known less well by K.
+    """
+    kernel = KERNELS[quality.kernel]
+    pose = camera.camera_from_world
+    added = kernel.variance * np.diag([1 / camera.fx**2, 1 / camera.fy**2])
+    opacities, depths = [], []
+    for mean, quat, scales, opacity in zip(splats.means, splats.quats, splats.scales, splats.opacities, strict=True):
+        x, y, depth = pose[:3, :3] @ mean.astype(np.float64) + pose[:3, 3]
+        rotation = pose[:3, :3] @ Rotation.from_quat(quat.astype(np.float64)).as_matrix()
+        scales = scales.astype(np.float64)
+        jacobian = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) / depth
+        footprint = jacobian @ rotation @ np.diag(scales**2) @ rotation.T @ jacobian.T
+        widened = footprint + added
+        if kernel.keeps_light:
+            opacity = opacity * np.sqrt(np.linalg.det(footprint) / np.linalg.det(widened))
+        offset = np.array([u, v]) - np.array([x, y]) / depth
+        whiten = np.diag(1 / scales) @ rotation.T
+        centre, step = whiten @ np.array([x / depth, y / depth, 1.0]), np.zeros(3)
+        if quality.response == "perspective":
+            step = whiten[:, :2] @ np.linalg.solve(widened, footprint).T @ offset
+        length2 = np.sum((centre + step) ** 2) / np.sum(centre**2)
+        exponent = offset @ np.linalg.solve(widened, offset) / length2
+        opacities.append(min(opacity * np.exp(-0.5 * exponent), kernel.alpha_max))
+        depths.append(depth * (1 + centre @ step / np.sum(centre**2)) / length2)
+    z = np.array(depths)
+    return np.where(z > camera.near, opacities, 0.0), z
 
 
 def reference_colours(splats: Splats, camera: Camera) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from mitsplat.camera import Camera
 from mitsplat.composite import tone_curve
 from mitsplat.errors import InputError
-from mitsplat.quality import PRESETS, Quality
-from mitsplat.render import Layers, render_splats
+from mitsplat.quality import KERNELS, PRESETS, Quality
+from mitsplat.render import Layers, make_sensor, render_splats
 from mitsplat.splats import SH_C0, Splats
 from mitsplat.trace import encode_srgb
 
@@ -52,9 +53,9 @@ def one(
     return Splats(tile(mean), tile(quat), tile(scales), np.full(count, opacity), tile(colour)[:, None, :])
 
 
-def error(layers: Layers, splats: Splats, camera: Camera) -> float:
+def error(layers: Layers, splats: Splats, camera: Camera, quality: Quality = PRESETS["exact"]) -> float:
     """Largest difference of colour and alpha from the twin, colour compared linear."""
-    twin = render_reference(splats, camera)
+    twin = render_reference(splats, camera, quality)
     alpha = np.maximum(twin.alpha, 1e-6)[..., None]
     linear = decode(twin.rgb / alpha) * twin.alpha[..., None]
     return float(max(np.abs(layers.rgb - linear).max(), np.abs(layers.alpha - twin.alpha).max()))
@@ -95,6 +96,47 @@ def test_needle_follows_the_twin(angle: float) -> None:
     quat = Rotation.from_euler("zy", [angle, 20.0], degrees=True).as_quat()
     splats = one((0.5, 0.001, 0.001), quat=quat, opacity=0.9)
     assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+@pytest.mark.parametrize("response", ["perspective", "ewa"])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_kernels_and_responses_follow_the_twin(response: str, kernel: str) -> None:
+    splats = make_splats(40, 5, scales=(0.005, 0.2))
+    quality = replace(PRESETS["exact"], response=response, kernel=kernel)
+    assert error(render_splats(splats, CAMERA, quality=quality), splats, CAMERA, quality) < 1e-4
+
+
+def test_small_gaussians_keep_their_light_wherever_they_fall_in_a_pixel() -> None:
+    """Under ``mip`` the opacities of all pixels add up to about 2 pi sigma^2 o. Point samples sparkle.
+
+    Poisson's summation formula bounds the sum of a Gaussian's samples: 1 +- 2 exp(-2 pi^2 v) along each axis, with the
+    widened variance v.
+    """
+    sigma, totals = 0.1, {"mip": [], "exact": []}  # px
+    metres = 2.0 / CAMERA.fx
+    for kernel, found in totals.items():
+        quality = replace(PRESETS["exact"], kernel=kernel)
+        for x, y in [(0.0, 0.0), (0.5, 0.5), (0.2, 0.4), (0.35, 0.1)]:
+            splats = one((sigma * metres,) * 3, mean=(x * metres, y * metres, 0.0), opacity=0.9)
+            found.append(float(render_splats(splats, CAMERA, quality=quality).alpha.sum()))
+    truth = 2 * np.pi * sigma**2 * 0.9
+    ripple = 2 * np.exp(-2 * np.pi**2 * (sigma**2 + KERNELS["mip"].variance))
+    assert (1 - ripple) ** 2 * 0.99 < min(totals["mip"]) / truth < max(totals["mip"]) / truth < (1 + ripple) ** 2 * 1.01
+    assert max(totals["exact"]) > 10 * truth and min(totals["exact"]) < 0.1 * truth
+
+
+def test_kernel_of_a_distorted_lens_has_the_size_of_its_pixels() -> None:
+    camera = replace(CAMERA, distortion=(-0.2, 0.05, 0.01, -0.02, 0.01))
+    from mitsplat.plugins.splat_proxy import view_of
+
+    view = view_of(make_sensor(camera))
+    pixel = np.array([3.0, 20.0])
+    u, v = camera.ray_slopes(pixel)[0]
+    step = 1e-3
+    right, left, down, up = camera.ray_slopes(pixel + step * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]))
+    jacobian = np.stack([right - left, down - up], axis=1) / (2 * step)
+    found = [c[0] for c in view.pixel_covariance(mi.Float(u), mi.Float(v), 0.25)]
+    np.testing.assert_allclose(found, (0.25 * jacobian @ jacobian.T)[[0, 0, 1], [0, 1, 1]], rtol=1e-3)
 
 
 @pytest.mark.parametrize("count", [20, 200])

@@ -36,8 +36,10 @@ _GRAVITY = (0.0, 0.0, -9.81)
 _MEAN_TIME = 0.05  # [s]
 _QUIET_TIME = 0.25  # how long every body must have been quiet [s]
 _MOTION, _MOTION_TIME = 5e-4, 0.5  # how far a surface may have moved [m] in how long [s]
-# Critically damped contact: MuJoCo's stiffness 1/t^2 and damping 2/t.
-_CONTACT_TIME = 0.005
+_WATCH_TIME = 1.0  # how long bodies at rest are watched for having moved on [s]
+# Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
+# 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
+_CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.75
 # Spin and roll friction [m], at most these shares of the size: round parts stop, thin ones do not stand on their rim.
 _TORSIONAL, _ROLLING = (5e-3, 0.1), (5e-4, 0.01)
 _LEAST_FRICTION = 2e-5  # below it MuJoCo divides by almost nothing
@@ -102,10 +104,10 @@ class Outcome:
 
     Attributes:
         refused: Why it cannot be used, or empty.
-        time: Simulated time [s].
-        max_speed, max_spin: Of the fastest body at the end [m/s, rad/s].
-        surface_motion: Farthest that a point of any body moved during the last half second [m].
-        poses: World-from-body transforms, shape (N, 4, 4).
+        time: Simulated time until the bodies were at rest [s].
+        max_speed, max_spin: Of the fastest body then [m/s, rad/s].
+        surface_motion: Farthest that a point of any body moved in the second after that [m]; infinite if refused.
+        poses: World-from-body transforms at the end, shape (N, 4, 4).
     """
 
     refused: str
@@ -130,14 +132,22 @@ class World(ABC):
         self.interval = _STEPS * timestep
         self.time = 0.0
 
-    def reset(self, poses: FloatArray) -> None:
-        """Put the bodies at rest at world-from-body transforms, shape (N, 4, 4); nothing is left of the past."""
+    def reset(self, poses: FloatArray, velocities: FloatArray | None = None) -> None:
+        """Put the bodies somewhere; nothing is left of the past.
+
+        Args:
+            poses: World-from-body transforms, shape (N, 4, 4).
+            velocities: As :attr:`velocities`, shape (N, 2, 3); at rest if None.
+        """
         self.time = 0.0
         coordinates = _parking(self.bodies)
         coordinates[: len(poses)] = np.concatenate(
             [poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1
         )
-        self._reset(coordinates)
+        motion = np.zeros((len(coordinates), 2, 3))
+        if velocities is not None:
+            motion[: len(velocities)] = velocities
+        self._reset(coordinates, motion)
 
     def advance(self) -> None:
         """Step a few times.
@@ -163,7 +173,7 @@ class World(ABC):
         """Linear velocity of the centre of mass [m/s] and angular velocity [rad/s] in world axes, shape (N, 2, 3)."""
 
     @abstractmethod
-    def _reset(self, coordinates: FloatArray) -> None: ...
+    def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None: ...
 
     @abstractmethod
     def _advance(self) -> None: ...
@@ -215,14 +225,13 @@ class WarpWorld(World):
             self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
             here, there = there, here
 
-    def _reset(self, coordinates: FloatArray) -> None:
+    def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None:
         state = self._states[0]
         self._solver.reset(state)
-        still = np.zeros((len(coordinates), 6))
         _assign(state.joint_q, coordinates.ravel())
         _assign(state.body_q, coordinates)
-        _assign(state.joint_qd, still.ravel())
-        _assign(state.body_qd, still)
+        _assign(state.joint_qd, motion.ravel())
+        _assign(state.body_qd, motion.reshape(-1, 6))
 
     def _advance(self) -> None:
         wp.capture_launch(self._graph)
@@ -254,9 +263,14 @@ class MujocoWorld(World):
         arms = np.einsum("nij,nj->ni", rotations, self._centres)
         return np.stack([of_origin[:, 0] + np.cross(spin, arms), spin], axis=1)
 
-    def _reset(self, coordinates: FloatArray) -> None:
+    def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None:
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = coordinates[:, [0, 1, 2, 6, 3, 4, 5]].ravel()
+        rotations = self.poses[:, :3, :3]
+        of_centre, spin = motion[: len(self.bodies), 0], motion[: len(self.bodies), 1]
+        arms = np.einsum("nij,nj->ni", rotations, self._centres)
+        of_origin = np.stack([of_centre - np.cross(spin, arms), np.einsum("nji,nj->ni", rotations, spin)], axis=1)
+        self._data.qvel[: of_origin.size] = of_origin.ravel()
 
     def _advance(self) -> None:
         mujoco.mj_step(self._model, self._data, nstep=_STEPS)
@@ -269,60 +283,79 @@ class MujocoWorld(World):
 
 
 def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> Outcome:
-    """Advance a world until its bodies rest, or until it is clear that they will not.
+    """Advance a world until its bodies rest, and watch them for a second more, or until it is clear that they will not.
 
     At rest every body has been slow for a quarter of a second, and no surface moved by half a millimetre in half a
-    second.
+    second; nor may one while it is watched.
 
     Args:
         world: Changed in place.
-        max_time: When to give up [s].
+        max_time: When they must have come to rest [s].
         bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
     """
-    centres = np.array([body.mass.centre for body in world.bodies])
+    try:
+        time, (speed, spin) = _fall(world, max_time, bounds)
+        rest, motion = world.poses, 0.0
+        while world.time < time + _WATCH_TIME:
+            motion = max(motion, _surface_motion(world.bodies, rest, _advance_within(world, bounds)))
+        if motion > _MOTION:
+            raise _Refused(f"moved on by {motion * 1e3:.1f} mm after it seemed at rest")
+    except ContactOverflow:
+        return Outcome(OVERFLOW, world.time, np.inf, np.inf, np.inf, world.poses)
+    except _Refused as refused:
+        return Outcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses)
+    return Outcome("", time, speed, spin, motion, world.poses)
+
+
+class _Refused(Exception):
+    """Why a drop cannot be used."""
+
+
+def _fall(
+    world: World, max_time: float, bounds: tuple[FloatArray, FloatArray]
+) -> tuple[float, tuple[float, float]]:
+    """Advance until nothing has moved to speak of for a while; the time [s] and the fastest speeds [m/s, rad/s] then."""
     frames = max(2, round(_MOTION_TIME / world.interval) + 1)
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
-    past: deque[FloatArray] = deque(maxlen=frames)
+    past: deque[FloatArray] = deque([world.poses], maxlen=frames)
     moved_at = 0.0
-
-    def end(refused: str) -> Outcome:
-        motion = _surface_motion(world.bodies, past[0], past[-1])
-        return Outcome(refused, world.time, speed, spin, motion, past[-1])
-
     while True:
-        try:
-            world.advance()
-        except ContactOverflow:
-            return Outcome(OVERFLOW, world.time, np.inf, np.inf, np.inf, world.poses)
-        poses = world.poses
-        if not np.isfinite(poses).all() or not np.isfinite(world.velocities).all():
-            return Outcome("the simulation diverged", world.time, np.inf, np.inf, np.inf, poses)
-        past.append(poses)
+        past.append(_advance_within(world, bounds))
         before = min(mean_frames, len(past) - 1)
-        if before:
-            speed, spin = _mean_speeds(past[-1 - before], poses, centres, before * world.interval)
-        else:
-            speed = spin = np.inf
-        if speed >= QUIET_SPEED or spin >= QUIET_SPIN:
+        speeds = _mean_speeds(world.bodies, past[-1 - before], past[-1], before * world.interval)
+        if speeds[0] >= QUIET_SPEED or speeds[1] >= QUIET_SPIN:
             moved_at = world.time
-        positions = _positions(poses, centres)
-        outside = ((positions < bounds[0]) | (positions > bounds[1])).any(axis=1)
-        if outside.any():
-            return end(f"{int(outside.sum())} left the enclosure")
         quiet = world.time - moved_at >= _QUIET_TIME and len(past) == frames
-        if quiet and _surface_motion(world.bodies, past[0], poses) < _MOTION:
-            return end("")
+        if quiet and _surface_motion(world.bodies, past[0], past[-1]) < _MOTION:
+            return world.time, speeds
         if world.time >= max_time:
-            return end(f"not at rest within {max_time:g} s")
+            raise _Refused(f"not at rest within {max_time:g} s")
 
 
-def _positions(poses: FloatArray, points: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3])
+def _advance_within(world: World, bounds: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Advance, and return the poses."""
+    world.advance()
+    poses = world.poses
+    if not np.isfinite(poses).all() or not np.isfinite(world.velocities).all():
+        raise _Refused("the simulation diverged")
+    centres = _centres(world.bodies, poses)
+    outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
+    if outside.any():
+        raise _Refused(f"{int(outside.sum())} left the enclosure")
+    return poses
 
 
-def _mean_speeds(before: FloatArray, after: FloatArray, centres: FloatArray, seconds: float) -> tuple[float, float]:
+def _centres(bodies: Sequence[Body], poses: FloatArray) -> FloatArray:
+    """Centres of mass [m], shape (N, 3)."""
+    local = np.array([body.mass.centre for body in bodies])
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3])
+
+
+def _mean_speeds(
+    bodies: Sequence[Body], before: FloatArray, after: FloatArray, seconds: float
+) -> tuple[float, float]:
     """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
-    way = np.linalg.norm(_positions(after, centres) - _positions(before, centres), axis=1)
+    way = np.linalg.norm(_centres(bodies, after) - _centres(bodies, before), axis=1)
     turn = Rotation.from_matrix(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)).magnitude()
     return float(way.max()) / seconds, float(turn.max()) / seconds
 
@@ -400,7 +433,7 @@ def _add_hulls(
 def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeConfig:
     return newton.ModelBuilder.ShapeConfig(
         density=0.0,
-        ke=1 / _CONTACT_TIME**2,
+        ke=1 / (_CONTACT_TIME * _DAMPING_RATIO) ** 2,
         kd=2 / _CONTACT_TIME,
         mu=max(friction, _LEAST_FRICTION),
         mu_torsional=max(_LEAST_FRICTION, min(_TORSIONAL[0], _TORSIONAL[1] * size)),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,20 +13,46 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.assets import Asset
-from mitsplat.clearance import Clearance, PlacedSurface, Surface, all_clearances, clearance
+from mitsplat.clearance import Clearance, PlacedSurface, Surface, all_clearances, standoff
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, run_to_rest
-from mitsplat.scene import Scene
+from mitsplat.place import Item, draw_poses, fixed_pose
+from mitsplat.scene import Scene, bin_walls
 from mitsplat.settle import FloatArray, Instance, Layout, Progress, RestCertificate
-from mitsplat.spec import Region
+from mitsplat.spec import PILE_HEIGHT, Region
 
-_PLACES = 200  # positions tried for an object before all are drawn anew
-_DRAWS = 20
-_SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
 _REACH = 5e-3  # gaps beyond this are not measured [m]
-# What may be wrong with a layout at rest [m], or as a share of an object's size where that is more.
+# What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
 _DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _WIDEST_GAP, _SHARE = 3e-4, 5e-4, 1e-3, 0.005
+_NEAREST = 5e-4  # what is scattered is farther apart than this [m]
+_FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
+_THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
+
+
+_EMPTY = RestCertificate(
+    rested=True,
+    inside=True,
+    overflow=False,
+    time_to_rest=0.0,
+    max_speed=0.0,
+    max_spin=0.0,
+    surface_motion=0.0,
+    collider_penetration=0.0,
+    pair_penetration=0.0,
+    support_gap=0.0,
+    standoff=0.0,
+    attempts=0,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What physics needs of an asset; ``standoff`` as in :func:`mitsplat.clearance.standoff`."""
+
+    body: Body
+    surface: Surface
+    standoff: float
 
 
 @dataclass(frozen=True)
@@ -57,13 +83,15 @@ class Drop:
 
     def __init__(self, scene: Scene, progress: Progress) -> None:
         self.scene = scene
-        self._parts: dict[int, tuple[Body, Surface]] = {}
-        self._worlds: dict[tuple[tuple[int, ...], float], World] = {}
+        self._parts: dict[int, _Part] = {}
+        self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float], World] = {}
         self._objects = [self._part(asset, progress) for asset in scene.assets]
         self._colliders: list[Collider] = []
         self._obstacles: list[PlacedSurface] = []
         walls = self._add_colliders(progress)
         self._bounds = _enclosure(scene.spec.region, [item.bounds for item in self._obstacles], walls)
+        if scene.spec.settle.arrangement == "pile":
+            self._bounds[1][2] += PILE_HEIGHT
 
     def settle(self, index: int) -> Layout:
         """Draw poses until a layout holds.
@@ -72,18 +100,14 @@ class Drop:
             InputError: If objects find no room, or no draw holds.
         """
         spec, refused, capacity = self.scene.spec, [], 1.0
-        counts = _random(spec.seed, "object counts", index)
-        assets = tuple(
-            position
-            for position, entry in enumerate(spec.objects)
-            for _ in range(int(counts.integers(*_range(entry.count), endpoint=True)))
-        )
+        assets, given = self._draw_objects(index)
         if not assets:
-            return Layout(index, (), RestCertificate(True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, attempts=0))
+            return Layout(index, (), _EMPTY)
+        frictions = self._draw_frictions(index)
         for attempt in range(spec.settle.attempts):
-            poses = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt))
-            world = self._world(assets, capacity)
-            world.reset(poses)
+            start = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt), given)
+            world = self._world(assets, frictions, capacity)
+            world.reset(start)
             outcome = run_to_rest(world, max_time=spec.settle.max_time, bounds=self._bounds)
             reason = outcome.refused
             if reason == OVERFLOW:
@@ -92,18 +116,24 @@ class Drop:
                 resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
                 clearances = all_clearances(resting, self._obstacles, reach=_REACH)
                 gaps = _support_gaps(resting, clearances)
-                reason = _fault(clearances, gaps, self._obstacles)
+                reason = _fault(clearances, gaps, self._obstacles) or self._disarray(
+                    resting, clearances, start, outcome.poses, given
+                )
             if reason:
                 refused.append(reason)
                 continue
             certificate = RestCertificate(
                 rested=True,
+                inside=True,
+                overflow=False,
                 time_to_rest=outcome.time,
                 max_speed=outcome.max_speed,
                 max_spin=outcome.max_spin,
                 surface_motion=outcome.surface_motion,
-                deepest_penetration=max(0.0, -min(pair.distance for pair in clearances)),
+                collider_penetration=_deepest(pair for pair in clearances if pair.second in self._obstacles),
+                pair_penetration=_deepest(pair for pair in clearances if pair.second not in self._obstacles),
                 support_gap=max(gaps.values()),
+                standoff=max(self._objects[asset].standoff for asset in assets),
                 attempts=attempt + 1,
                 refused=tuple(refused),
             )
@@ -114,27 +144,57 @@ class Drop:
             f"draws (got {reasons})"
         )
 
-    def _world(self, assets: tuple[int, ...], capacity: float) -> World:
+    def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[FloatArray | None, ...]]:
+        """Which entry each object of a layout is of, and the pose that the file gives it, if any."""
+        counts = _random(self.scene.spec.seed, "object counts", index)
+        assets: list[int] = []
+        given: list[FloatArray | None] = []
+        for position, entry in enumerate(self.scene.spec.objects):
+            count = int(counts.integers(*entry.count, endpoint=True))
+            poses: list[FloatArray | None] = [fixed_pose(pose) for pose in entry.poses]
+            poses = poses or [None] * count
+            assets += [position] * len(poses)
+            given += poses
+        return tuple(assets), tuple(given)
+
+    def _draw_frictions(self, index: int) -> tuple[float, ...]:
+        """Friction coefficient of each entry in a layout."""
+        spec = self.scene.spec
+        rng = _random(spec.seed, "friction", index)
+        return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
+
+    def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float) -> World:
         """The simulation of these assets; the last one is kept."""
-        if (assets, capacity) not in self._worlds:
-            settle, bodies = self.scene.spec.settle, [self._objects[asset][0] for asset in assets]
+        if (assets, frictions, capacity) not in self._worlds:
+            settle = self.scene.spec.settle
+            bodies = [replace(self._objects[asset].body, friction=frictions[asset]) for asset in assets]
             self._worlds.clear()
-            self._worlds[assets, capacity] = (
+            self._worlds[assets, frictions, capacity] = (
                 MujocoWorld(bodies, self._colliders, timestep=settle.timestep)
                 if settle.stepper == "mujoco"
                 else WarpWorld(bodies, self._colliders, timestep=settle.timestep, capacity=capacity)
             )
-        return self._worlds[assets, capacity]
+        return self._worlds[assets, frictions, capacity]
 
-    def _part(self, asset: Asset, progress: Progress) -> tuple[Body, Surface]:
-        """Body and surface of an asset, made once for all entries that share its mesh."""
+    def _part(self, asset: Asset, progress: Progress) -> _Part:
+        """What physics needs of an asset, made once for all entries that share its mesh."""
         if asset.mesh is None:
             raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
         if id(asset.mesh) not in self._parts:
             mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
-            pieces = asset.pieces or _pieces(mesh, asset.name, progress)
+            surface = Surface(mesh)
+            pieces, stands_off = asset.pieces, 0.0
+            if pieces:
+                stands_off = standoff(surface, pieces)
+            else:
+                limit = max(_WIDEST_GAP, _SHARE * float(mesh.extents.max()))
+                for threshold in _THRESHOLDS:
+                    pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
+                    stands_off = standoff(surface, pieces)
+                    if stands_off <= limit:
+                        break
             mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
-            self._parts[id(asset.mesh)] = Body(pieces, mass, asset.friction), Surface(mesh)
+            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, asset.friction), surface, stands_off)
         return self._parts[id(asset.mesh)]
 
     def _add_colliders(self, progress: Progress) -> list[int]:
@@ -146,7 +206,9 @@ class Drop:
             if not (shape.visible or shape.proxy):
                 walls.append(len(self._colliders))
             mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
-            if shape.box is None:
+            if shape.bin is not None:
+                collider = Collider(shape.friction, pieces=bin_walls(shape.bin))
+            elif shape.box is None:
                 collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
             else:
                 pose = np.eye(4)
@@ -165,45 +227,53 @@ class Drop:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
         return walls
 
-    def draw_poses(self, assets: Sequence[int], rng: np.random.Generator) -> FloatArray:
-        """Poses (N, 4, 4) in the region, orientations uniform in SO(3), bounding boxes apart, colliders not touched."""
-        for _ in range(_DRAWS):
-            poses = self._place_all(assets, rng)
-            if poses is not None:
-                return poses
-        size = np.subtract(self.scene.spec.region.max, self.scene.spec.region.min)
+    def draw_poses(
+        self, assets: Sequence[int], rng: np.random.Generator, given: Sequence[FloatArray | None] = ()
+    ) -> FloatArray:
+        """Poses (N, 4, 4) to start from, see :func:`mitsplat.place.draw_poses`.
+
+        Raises:
+            InputError: If objects find no room.
+        """
+        items = [
+            Item(asset, self._objects[asset].surface, self._objects[asset].body.outline, given[i] if given else None)
+            for i, asset in enumerate(assets)
+        ]
+        region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
+        poses = draw_poses(items, self._obstacles, region, arrangement, rng)
+        if poses is not None:
+            return poses
+        size = np.subtract(region.max, region.min)
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
-            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m)"
+            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m, "
+            f"settle.arrangement {arrangement})"
         )
 
-    def _place_all(self, assets: Sequence[int], rng: np.random.Generator) -> FloatArray | None:
-        region = self.scene.spec.region
-        poses = np.tile(np.eye(4), (len(assets), 1, 1))
-        taken: list[FloatArray] = []
-        # Large ones first, for which room is scarce.
-        for i in sorted(range(len(assets)), key=lambda i: -self._objects[assets[i]][0].size):
-            poses[i, :3, :3] = Rotation.random(rng=rng).as_matrix()
-            turned = self._objects[assets[i]][0].outline @ poses[i, :3, :3].T
-            bounds = np.stack([turned.min(axis=0), turned.max(axis=0)])
-            low, high = np.array(region.min) - bounds[0], np.array(region.max) - bounds[1]
-            if (low > high).any():
-                return None
-            for _ in range(_PLACES):
-                poses[i, :3, 3] = rng.uniform(low, high)
-                box = bounds + poses[i, :3, 3]
-                if any(_boxes_meet(box, other) for other in taken):
-                    continue
-                placed = self._placed(assets[i], poses[i])
-                if all(clearance(placed, item, reach=_SPACING).distance > 0 for item in self._obstacles):
-                    taken.append(box)
-                    break
-            else:
-                return None
-        return poses
+    def _disarray(
+        self,
+        resting: Sequence[PlacedSurface],
+        clearances: Sequence[Clearance],
+        start: FloatArray,
+        end: FloatArray,
+        given: Sequence[FloatArray | None],
+    ) -> str:
+        """How a layout at rest is not arranged as asked for, or empty."""
+        arrangement = self.scene.spec.settle.arrangement
+        if arrangement == "scatter":
+            for pair in clearances:
+                if pair.second not in self._obstacles and pair.distance < _NEAREST:
+                    return f"{pair.first.name} and {pair.second.name} touch"
+        if arrangement in ("stack", "upright"):
+            # Angle between the world's vertical, carried along by the object, and the vertical.
+            tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
+            for item, tilt, pose in zip(resting, tilts, given, strict=True):
+                if pose is None and tilt > _FALLEN:
+                    return f"{item.name} fell over"
+        return ""
 
     def _placed(self, asset: int, pose: FloatArray) -> PlacedSurface:
-        return PlacedSurface(self.scene.assets[asset].name, self._objects[asset][1], pose)
+        return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
 
     def _instances(self, assets: Sequence[int], poses: FloatArray) -> tuple[Instance, ...]:
         classes = [self.scene.class_names.index(self.scene.assets[asset].class_name) for asset in assets]
@@ -226,11 +296,7 @@ def _fault(
 ) -> str:
     """Why objects at rest are not where they could be, or empty."""
     for pair in sorted(clearances, key=lambda pair: pair.distance):
-        if pair.second in obstacles:
-            limit = max(_DEEPEST_IN_COLLIDER, _SHARE * pair.first.size)
-        else:
-            limit = max(_DEEPEST_IN_OBJECT, _SHARE * min(pair.first.size, pair.second.size))
-        if -pair.distance > limit:
+        if -pair.distance > (_DEEPEST_IN_COLLIDER if pair.second in obstacles else _DEEPEST_IN_OBJECT):
             return f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
     for item, gap in gaps.items():
         if gap > max(_WIDEST_GAP, _SHARE * item.size):
@@ -238,21 +304,19 @@ def _fault(
     return ""
 
 
+def _deepest(pairs: Iterable[Clearance]) -> float:
+    return max([0.0, *(-pair.distance for pair in pairs)])
+
+
 def _random(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), *numbers]))
 
 
-def _range(count: int | tuple[int, int]) -> tuple[int, int]:
-    return (count, count) if isinstance(count, int) else count
-
-
-def _pieces(mesh: trimesh.Trimesh, name: str, progress: Progress) -> tuple[trimesh.Trimesh, ...]:
+def _pieces(
+    mesh: trimesh.Trimesh, name: str, progress: Progress, *, threshold: float = _THRESHOLDS[0]
+) -> tuple[trimesh.Trimesh, ...]:
     progress(f"convex pieces of {name}")
-    return convex_pieces(mesh)
-
-
-def _boxes_meet(first: FloatArray, second: FloatArray) -> bool:
-    return bool((first[0] < second[1] + _SPACING).all() and (second[0] < first[1] + _SPACING).all())
+    return convex_pieces(mesh, threshold=threshold)
 
 
 def _enclosure(region: Region, bounds: Sequence[FloatArray], walls: Sequence[int]) -> tuple[FloatArray, FloatArray]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from mitsplat.cache import cache_folder, keep_file
 from mitsplat.errors import InputError
 
 _logger = logging.getLogger(__name__)
@@ -29,6 +28,8 @@ _SMALLEST, _LARGEST = 5e-4, 20.0
 _CONVEX = 0.9995
 # More parts than this are a scan's debris, which is decomposed as a whole.
 _MOST_PARTS = 64
+# More triangles than this say nothing about how an object lies, and take CoACD hours.
+_MOST_FACES = 200_000
 # Faces that meet at a larger angle form an edge that can poke into something [rad].
 _SHARP = 0.17
 
@@ -49,7 +50,9 @@ class MassProperties:
 
 
 def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> trimesh.Trimesh:
-    """Return a welded copy for physics, wound so that it encloses a positive volume.
+    """Return a welded copy for physics, wound so that it encloses a positive volume, of 200,000 triangles at most.
+
+    What is repaired is logged in one sentence.
 
     Args:
         mesh: Surface [m]; may be wound inside out or have holes.
@@ -76,9 +79,15 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     # Divergence theorem: tetrahedra from the origin to each triangle.
     volume = float(np.linalg.det(welded.triangles).sum()) / 6
     if volume < 0:
+        _logger.warning("%s: the mesh is wound inside out; physics turns its faces", name)
         welded.invert()
     if solid and abs(volume) < 1e-6 * size**3:
         raise InputError(f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across)")
+    if solid and not welded.is_watertight:
+        _logger.warning("%s: the mesh is not closed; mass and inertia are those of its convex pieces", name)
+    if len(welded.faces) > _MOST_FACES:
+        _logger.warning("%s: physics simplifies the mesh of %d to %d triangles", name, len(welded.faces), _MOST_FACES)
+        welded = welded.simplify_quadric_decimation(face_count=_MOST_FACES)
     return welded
 
 
@@ -149,7 +158,7 @@ def _cached_pieces(vertices: bytes, faces: bytes, threshold: float) -> tuple[tri
     digest.update(f"{version('coacd')} {threshold!r}".encode())
     digest.update(vertices)
     digest.update(faces)
-    path = _cache_folder() / f"{digest.hexdigest()}.npz"
+    path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
         mesh = trimesh.Trimesh(
@@ -179,11 +188,6 @@ def _split(part: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:
     return [piece for piece in pieces if piece.volume > 1e-6 * hull.volume]
 
 
-def _cache_folder() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "mitsplat" / "pieces"
-
-
 def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...] | None:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
@@ -201,10 +205,4 @@ def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...] | None:
 def _write_pieces(path: Path, pieces: Sequence[trimesh.Trimesh]) -> None:
     arrays: dict[str, Any] = {f"vertices_{i}": piece.vertices for i, piece in enumerate(pieces)}
     arrays |= {f"faces_{i}": piece.faces for i, piece in enumerate(pieces)}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            np.savez(file, **arrays)
-        Path(file.name).replace(path)
-    except OSError as error:  # a cache that cannot be written costs time only
-        _logger.warning("%s: convex pieces are not kept (%s)", path, error)
+    keep_file(path, lambda file: np.savez(file, **arrays))

@@ -39,13 +39,13 @@ _MOTION, _MOTION_TIME = 5e-4, 0.5  # how far a surface may have moved [m] in how
 _WATCH_TIME = 1.0  # how long bodies at rest are watched for having moved on [s]
 # Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
 # 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
-_CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.75
+_CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
 # Spin and roll friction [m], at most these shares of the size: round parts stop, thin ones do not stand on their rim.
 _TORSIONAL, _ROLLING = (5e-3, 0.1), (5e-4, 0.01)
 _LEAST_FRICTION = 2e-5  # below it MuJoCo divides by almost nothing
 # Impedance of contacts at their surface and 1 mm deep: at MuJoCo's default of 0.9, a nut that carries a plate of a
 # hundred times its mass sinks by 1 mm. MuJoCo's own contacts, which flicker, come to rest less often when stiffer.
-_IMPEDANCE_WARP, _IMPEDANCE_MUJOCO = (0.995, 0.9999), (0.99, 0.999)
+_IMPEDANCE_WARP, _IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
 _STEPS = 4  # per captured graph; even, so that the two states end as they began
 _SOLVER_OPTIONS: dict[str, Any] = {
     "integrator": "implicitfast",
@@ -311,10 +311,8 @@ class _Refused(Exception):
     """Why a drop cannot be used."""
 
 
-def _fall(
-    world: World, max_time: float, bounds: tuple[FloatArray, FloatArray]
-) -> tuple[float, tuple[float, float]]:
-    """Advance until nothing has moved to speak of for a while; the time [s] and the fastest speeds [m/s, rad/s] then."""
+def _fall(world: World, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> tuple[float, tuple[float, float]]:
+    """Advance until all has been quiet for a while; the time [s] and the fastest speeds [m/s, rad/s] then."""
     frames = max(2, round(_MOTION_TIME / world.interval) + 1)
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
     past: deque[FloatArray] = deque([world.poses], maxlen=frames)
@@ -351,9 +349,7 @@ def _centres(bodies: Sequence[Body], poses: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3])
 
 
-def _mean_speeds(
-    bodies: Sequence[Body], before: FloatArray, after: FloatArray, seconds: float
-) -> tuple[float, float]:
+def _mean_speeds(bodies: Sequence[Body], before: FloatArray, after: FloatArray, seconds: float) -> tuple[float, float]:
     """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
     way = np.linalg.norm(_centres(bodies, after) - _centres(bodies, before), axis=1)
     turn = Rotation.from_matrix(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)).magnitude()

@@ -23,7 +23,9 @@ from mitsplat.assets import Asset, read_mesh
 from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.spec import (
+    PILE_HEIGHT,
     AreaLight,
+    Bin,
     Box,
     CameraHemisphere,
     CameraOrbit,
@@ -35,6 +37,7 @@ from mitsplat.spec import (
     Intrinsics,
     LightKey,
     LightSpec,
+    ObjectPose,
     ObjectSpec,
     Output,
     PointLight,
@@ -50,6 +53,7 @@ from mitsplat.yaml_input import key_place, load_yaml
 
 __all__ = [
     "AreaLight",
+    "Bin",
     "Box",
     "CameraHemisphere",
     "CameraOrbit",
@@ -62,6 +66,7 @@ __all__ = [
     "Intrinsics",
     "LightKey",
     "LightSpec",
+    "ObjectPose",
     "ObjectSpec",
     "Output",
     "PointLight",
@@ -73,6 +78,7 @@ __all__ = [
     "Settle",
     "Shape",
     "SpotLight",
+    "bin_walls",
     "layout_of",
     "load_scene",
     "plan_frame",
@@ -148,7 +154,8 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
     path = Path(path)
     spec = load_yaml(path, SceneSpec, overrides=overrides)
     if spec.enclosure is not None:
-        walls = _enclosure_walls(spec.enclosure, spec.region)
+        rise = PILE_HEIGHT if spec.settle.arrangement == "pile" else 0.0
+        walls = _enclosure_walls(spec.enclosure, spec.region, rise)
         spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
     folder = path.parent
     for position, light in enumerate(spec.lights):
@@ -213,10 +220,10 @@ def scene_json_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
 
 
-def _enclosure_walls(enclosure: Enclosure, region: Region) -> list[Shape]:
-    """The enclosure as five invisible boxes: walls from its floor up to the region's top, and a lid."""
+def _enclosure_walls(enclosure: Enclosure, region: Region, rise: float) -> list[Shape]:
+    """The enclosure as five invisible boxes: walls from its floor up to ``rise`` above the region, and a lid."""
     low, high = np.array(region.min) - enclosure.margin, np.array(region.max) + enclosure.margin
-    low[2], high[2] = enclosure.floor, region.max[2]
+    low[2], high[2] = enclosure.floor, region.max[2] + rise
     middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
     walls = []
     for name, axis, side in (("-x", 0, -1), ("+x", 0, 1), ("-y", 1, -1), ("+y", 1, 1), ("lid", 2, 1)):
@@ -269,6 +276,9 @@ def _check_fit(asset: Asset, region: Region) -> None:
 
 def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
     """The shape in world space."""
+    if shape.bin is not None:
+        walls: trimesh.Trimesh = trimesh.boolean.union(list(bin_walls(shape.bin)))
+        return walls
     if shape.box is None:
         return read_mesh(folder / str(shape.mesh))
     transform = np.eye(4)
@@ -276,6 +286,23 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
     transform[:3, 3] = shape.box.position
     box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
     return box
+
+
+def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
+    """The five boxes that a bin consists of, in world space."""
+    width, depth, height = shape.size
+    edge = shape.thickness
+    # Walls along x are as long as the floor; those along y stand between them, so that no faces coincide.
+    walls = [((width + 2 * edge, depth + 2 * edge, edge), (0.0, 0.0, -edge / 2))]
+    walls += [((width + 2 * edge, edge, height), (0.0, side * (depth + edge) / 2, height / 2)) for side in (-1, 1)]
+    walls += [((edge, depth, height), (side * (width + edge) / 2, 0.0, height / 2)) for side in (-1, 1)]
+    turn = Rotation.from_euler("z", shape.rotate_z, degrees=True).as_matrix()
+    boxes = []
+    for size, middle in walls:
+        transform = np.eye(4)
+        transform[:3, :3], transform[:3, 3] = turn, turn @ middle + shape.position
+        boxes.append(trimesh.creation.box(extents=size, transform=transform))
+    return tuple(boxes)
 
 
 def _split(layout: int, validation: float) -> Literal["train", "val"]:

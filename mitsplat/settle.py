@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsplat.cache import cache_folder, keep_file
+
 if TYPE_CHECKING:
+    import trimesh
+
     from mitsplat.scene import Scene
 
 FloatArray = NDArray[np.float64]
@@ -41,22 +50,30 @@ class RestCertificate:
 
     Attributes:
         rested: Whether everything was within its limit.
+        inside: Whether no object left the scene's enclosure, or what else there is to lie on.
+        overflow: Whether any contact was dropped for want of room.
         time_to_rest: Simulated time [s].
         max_speed, max_spin: Residual motion of the fastest object [m/s, rad/s].
-        surface_motion: Farthest that a point of any surface moved in the last half second [m].
-        deepest_penetration: Of any pair of objects, or object and collider [m].
+        surface_motion: Farthest that a point of any surface moved in the second after that [m].
+        collider_penetration: Depth of the deepest object in a collider [m].
+        pair_penetration: Depth of the deepest object in another [m].
         support_gap: Distance of the most isolated object from what is nearest to it [m]; 0 if all touch.
+        standoff: How far the convex pieces of any object stand off its true mesh [m], which bounds the gaps.
         attempts: Draws of poses that it took.
         refused: Why each earlier draw was refused.
     """
 
     rested: bool
+    inside: bool
+    overflow: bool
     time_to_rest: float
     max_speed: float
     max_spin: float
     surface_motion: float
-    deepest_penetration: float
+    collider_penetration: float
+    pair_penetration: float
     support_gap: float
+    standoff: float
     attempts: int
     refused: tuple[str, ...] = ()
 
@@ -95,21 +112,88 @@ class Layout:
         )
 
 
-def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None) -> Layout:
+def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None, cached: bool = True) -> Layout:
     """Drop the objects of one layout until they rest. The scene's seed and ``index`` decide the result.
+
+    It is kept in ``$XDG_CACHE_HOME/mitsplat/layouts`` (``~/.cache`` by default) by the hash of all that decides it:
+    what is dropped, from where, on what and with which code, but not how it is shown.
 
     Args:
         scene: What to drop, from where, and on what.
         index: Index of the layout.
         progress: Told in a few words what takes long: making convex pieces, compiling.
+        cached: Whether a layout that was settled before is taken from the cache, and this one kept there.
 
     Raises:
         InputError: If the region is too small for the objects, or no draw of poses comes to rest within the limits.
     """
+    path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
+    if cached:
+        with suppress(OSError, ValueError, KeyError, TypeError):  # damaged or missing: settled anew
+            return Layout.from_json(json.loads(path.read_bytes()))
     with warp_settings(progress):
         from mitsplat.drop import drop_of
 
-        return drop_of(scene, progress or (lambda text: None)).settle(index)
+        layout = drop_of(scene, progress or (lambda text: None)).settle(index)
+    if cached:
+        keep_file(path, lambda file: file.write(json.dumps(layout.to_json()).encode()))
+    return layout
+
+
+@dataclass(frozen=True)
+class _SettleOne:
+    """Settles a layout in a worker process."""
+
+    scene: Scene
+    cached: bool
+
+    def __call__(self, index: int, note: Callable[[str], None], /) -> Layout:
+        return settle_layout(self.scene, index, progress=note, cached=self.cached)
+
+
+def settle_layouts(
+    scene: Scene, indices: Iterable[int], *, workers: int = 1, progress: Progress | None = None, cached: bool = True
+) -> Iterator[Layout]:
+    """Settle many layouts over processes, in the order in which they are finished; see :func:`settle_layout`.
+
+    Several layouts in one simulation (Newton's worlds) cost as much each as one alone on a CPU, and would wait for the
+    slowest (``python -m benchmarks.settle --worlds``).
+    """
+    from mitsplat.engine import run_frames
+
+    layouts = {index: [index] for index in indices}
+    return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
+
+
+@lru_cache(maxsize=4)
+def _scene_hash(scene: Scene) -> str:
+    """Hash of what decides where the objects of a scene come to rest."""
+    spec = scene.spec
+    digest = hashlib.sha256()
+
+    def add(*values: object) -> None:
+        digest.update(repr(values).encode())
+
+    def add_mesh(mesh: trimesh.Trimesh | None) -> None:
+        if mesh is not None:
+            for array in (mesh.vertices, mesh.faces):
+                add(array.shape)
+                digest.update(np.ascontiguousarray(array).tobytes())
+
+    for name in ("coacd", "mujoco", "mujoco-warp", "newton", "numpy", "scipy", "trimesh", "warp-lang"):
+        add(name, version(name))
+    for module in ("clearance", "drop", "mesh", "physics", "place"):
+        digest.update((Path(__file__).parent / f"{module}.py").read_bytes())
+    add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
+    add(scene.class_names, spec.environment_collides)
+    for mesh in scene.shape_meshes:
+        add_mesh(mesh)
+    surroundings = [scene.environment] if spec.environment_collides and scene.environment is not None else []
+    for asset in (*scene.assets, *surroundings):
+        add(asset.name, asset.class_name, asset.density, asset.mass, asset.friction)
+        for mesh in (asset.mesh, *asset.pieces):
+            add_mesh(mesh)
+    return digest.hexdigest()
 
 
 @contextmanager

@@ -59,6 +59,12 @@ EmittedColour = Annotated[
 ]
 
 
+PILE_HEIGHT = 1.0
+"""How far above the drop region the objects of a pile may start [m]."""
+
+Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
+
+
 class Box(StrictModel):
     """A box, its axes along the world's before ``rotate``."""
 
@@ -67,11 +73,21 @@ class Box(StrictModel):
     rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
 
 
+class Bin(StrictModel):
+    """A box without lid, open upwards, that objects fall into."""
+
+    size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of its inside [m].")
+    position: Vec3 = Field((0, 0, 0), description="Middle of its inner floor [m].")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+    thickness: Positive = Field(0.004, description="Thickness of floor and walls [m].")
+
+
 class Shape(StrictModel):
-    """A box or a mesh that is rendered, collides or shades."""
+    """A box, a bin or a mesh that is rendered, collides or shades."""
 
     name: str = Field(min_length=1, description="Name, unique among the shapes.")
     box: Box | None = Field(None, description="The shape as a box.")
+    bin: Bin | None = Field(None, description="Or as a bin.")
     mesh: str | None = Field(None, description="Or as a mesh file, relative to the scene file, in world space [m].")
     visible: bool = Field(False, description="Whether it is rendered.")
     collider: bool = Field(True, description="Whether objects rest on it and bounce off it.")
@@ -84,8 +100,8 @@ class Shape(StrictModel):
 
     @model_validator(mode="after")
     def _check(self) -> Shape:
-        if (self.box is None) == (self.mesh is None):
-            raise FieldError("name", f"shape {self.name!r} must have either a box or a mesh")
+        if sum(form is not None for form in (self.box, self.bin, self.mesh)) != 1:
+            raise FieldError("name", f"shape {self.name!r} must have either a box, a bin or a mesh")
         if not (self.visible or self.collider or self.proxy):
             raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
         return self
@@ -113,6 +129,13 @@ class Enclosure(StrictModel):
     thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")
 
 
+class ObjectPose(StrictModel):
+    """Where an object starts."""
+
+    position: Vec3 = Field(description="Origin of the asset [m].")
+    rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
+
+
 class ObjectSpec(StrictModel):
     """Objects of one asset."""
 
@@ -120,11 +143,26 @@ class ObjectSpec(StrictModel):
     count: CountRange = Field((1, 1), description="How many in each layout: a number or an inclusive range.")
     scale: Positive = Field(1.0, description="Uniform scale applied to the asset.")
     class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
+    poses: tuple[ObjectPose, ...] = Field(
+        (), description="Where each starts, instead of count; from there it settles like the others."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> ObjectSpec:
+        if self.poses and "count" in self.model_fields_set:
+            raise FieldError("count", "must not be given together with poses")
+        return self
 
 
 class Settle(StrictModel):
-    """How objects are dropped."""
+    """How objects are laid out and come to rest.
 
+    ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes. ``scatter``:
+    apart, so that none touches another. ``stack``: all of one entry above one another on their largest face.
+    ``upright``: put down as the asset stands, turned about the vertical.
+    """
+
+    arrangement: Arrangement = Field("drop", description="Random drop, pile, sparse scatter, stacks or upright.")
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(5, ge=1, description="Redraws before a layout is given up.")
     timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
@@ -302,6 +340,9 @@ class Randomise(StrictModel):
         (6504.0, 6504.0), description="Correlated colour temperature that is shown as white [K]."
     )
     noise: NonNegativeRange = Field((0.0, 0.0), description="Read noise, 1 sigma of the encoded range [0, 1].")
+    friction: PositiveRange = Field(
+        (1.0, 1.0), description="Factor on the friction of each entry of objects, drawn once for a layout."
+    )
     light_intensity: PositiveRange = Field((1.0, 1.0), description="Factor on each light, drawn once for a layout.")
 
 

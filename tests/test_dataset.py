@@ -28,12 +28,16 @@ from mitsplat.yolo import data_yaml
 
 CERTIFICATE = RestCertificate(
     rested=True,
+    inside=True,
+    overflow=False,
     time_to_rest=1.5,
     max_speed=0.0,
     max_spin=0.0,
     surface_motion=0.0,
-    deepest_penetration=1e-5,
+    collider_penetration=1e-5,
+    pair_penetration=0.0,
     support_gap=0.0,
+    standoff=0.0,
     attempts=2,
     refused=("too deep",),
 )

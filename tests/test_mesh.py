@@ -99,6 +99,28 @@ def test_a_mesh_inside_out_is_turned():
     assert prepare_mesh(box, "box").volume == pytest.approx(1e-3)
 
 
+def test_repairs_are_told_in_a_sentence_each(caplog):
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.invert()
+    box.update_faces(np.arange(len(box.faces)) != 3)
+    prepare_mesh(box, "box")
+    assert [record.message for record in caplog.records] == [
+        "box: the mesh is wound inside out; physics turns its faces",
+        "box: the mesh is not closed; mass and inertia are those of its convex pieces",
+    ]
+
+
+@pytest.mark.slow
+def test_a_million_triangles_are_simplified(caplog):
+    """The volume of a ball of 1.3 M triangles stays within 0.1 %."""
+    ball = trimesh.creation.icosphere(8, 0.05)
+    assert len(ball.faces) > 1e6
+    simple = prepare_mesh(ball, "ball")
+    assert len(simple.faces) <= 200_000
+    assert simple.volume == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=1e-3)
+    assert caplog.records[-1].message == "ball: physics simplifies the mesh of 1310720 to 200000 triangles"
+
+
 def test_unwelded_triangles_are_welded():
     soup = trimesh.creation.box((0.1, 0.1, 0.1))
     soup = trimesh.Trimesh(soup.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)

@@ -130,7 +130,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0__scale": 0}, "objects[0].scale: must be > 0 (got 0)"),
         ({"region__max": [0.2, -0.3, 1]}, "region.max: must be above min along y (got -0.3, min is -0.2)"),
         ({"shapes__0__visible": False, "shapes__0__collider": False}, "must be visible, a collider or a proxy"),
-        ({"shapes__0__mesh": "a.ply"}, "must have either a box or a mesh"),
+        ({"shapes__0__mesh": "a.ply"}, "must have either a box, a bin or a mesh"),
         ({"shapes": [{"name": "a", "mesh": "b.ply"}] * 2}, "shapes[1].name: must be unique (got 'a' again)"),
         ({"shapes__0__colour": [0, 0, 2]}, "shapes[0].colour[2]: must be <= 1 (got 2)"),
         ({"camera": {"kind": "path", "keys": []}}, "camera.keys: must have at least 1 items (got [])"),

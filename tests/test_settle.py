@@ -17,7 +17,7 @@ from scipy.stats import kstest
 
 from mitsplat.errors import InputError
 from mitsplat.scene import load_scene
-from mitsplat.settle import Layout, settle_layout, warp_settings
+from mitsplat.settle import Layout, settle_layout, settle_layouts, warp_settings
 
 STEPPERS = ("warp", "mujoco")
 
@@ -87,7 +87,7 @@ def test_draws_are_uniform_and_apart(scene_data, write_scene):
 def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
     scene = load_scene(write_scene(scene_data))
     said = []
-    layout = settle_layout(scene, 0, progress=said.append)
+    layout = settle_layout(scene, 0, progress=said.append, cached=False)
     names = [scene.class_names[instance.class_index] for instance in layout.instances]
     assert [instance.id for instance in layout.instances] == list(range(1, len(names) + 1))
     assert names.count("bolt") == 1
@@ -99,18 +99,55 @@ def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
     assert certificate.rested
     assert certificate.max_speed < 1e-3
     assert certificate.surface_motion < 5e-4
-    assert certificate.deepest_penetration < 3e-4
+    assert certificate.inside
+    assert not certificate.overflow
+    assert certificate.collider_penetration < 3e-4
+    assert certificate.pair_penetration < 5e-4
     assert certificate.support_gap < 1e-3
+    assert certificate.standoff < 1e-6  # boxes are their own pieces
     assert certificate.attempts == len(certificate.refused) + 1
 
 
 def test_layouts_survive_json(scene_data, write_scene):
-    layout = settle_layout(load_scene(write_scene(scene_data)), 1)
+    layout = settle_layout(load_scene(write_scene(scene_data)), 1, cached=False)
     again = Layout.from_json(json.loads(json.dumps(layout.to_json())))
     assert again.certificate == layout.certificate
     assert again.to_json() == layout.to_json()
     for one, other in zip(again.instances, layout.instances, strict=True):
         np.testing.assert_array_equal(one.world_from_object, other.world_from_object)
+
+
+def test_a_layout_is_settled_once(scene_data, write_scene, tmp_path, monkeypatch):
+    """What changes the picture only does not settle anew; seed, index and meshes do, and so does a damaged file."""
+    from mitsplat import drop, settle
+
+    monkeypatch.setattr(settle, "cache_folder", lambda: tmp_path / "cache")
+    settled = []
+    real = drop.Drop.settle
+    monkeypatch.setattr(drop.Drop, "settle", lambda self, index: settled.append(index) or real(self, index))
+    scene_data["settle"] = {"stepper": "mujoco"}
+    first = settle_layout(load_scene(write_scene(scene_data)), 0)
+    scene_data["lights"], scene_data["output"]["width"] = [], 640
+    again = settle_layout(load_scene(write_scene(scene_data)), 0)
+    assert settled == [0]
+    assert again.to_json() == first.to_json()
+    settle_layout(load_scene(write_scene(scene_data)), 1)
+    settle_layout(load_scene(write_scene(scene_data), overrides={"seed": 8}), 0)
+    scaled = {**scene_data, "objects": [{"asset": "assets/nut", "count": [1, 2], "scale": 1.01}]}
+    settle_layout(load_scene(write_scene(scaled)), 0)
+    assert settled == [0, 1, 0, 0]
+    for path in (tmp_path / "cache").rglob("*.json"):
+        path.write_bytes(path.read_bytes()[:50])
+    assert settle_layout(load_scene(write_scene(scene_data)), 0).to_json() == first.to_json()
+    assert settled == [0, 1, 0, 0, 0]
+
+
+@pytest.mark.slow
+def test_processes_settle_what_one_process_settles(scene_data, write_scene):
+    scene_data["settle"] = {"stepper": "mujoco"}
+    scene = load_scene(write_scene(scene_data))
+    found = {layout.index: layout.to_json() for layout in settle_layouts(scene, range(3), workers=2, cached=False)}
+    assert found == {index: settle_layout(scene, index, cached=False).to_json() for index in range(3)}
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
@@ -119,11 +156,11 @@ def test_seed_and_index_decide_every_byte(stepper, scene_data, write_scene):
     scene_data["settle"] = {"stepper": stepper}
     path = write_scene(scene_data)
     scene = load_scene(path)
-    settle_layout(scene, 1)
-    here = json.dumps(settle_layout(scene, 2).to_json())
+    settle_layout(scene, 1, cached=False)
+    here = json.dumps(settle_layout(scene, 2, cached=False).to_json())
     program = (
         "import json, sys; from mitsplat.scene import load_scene; from mitsplat.settle import settle_layout;"
-        "sys.stdout.write(json.dumps(settle_layout(load_scene(sys.argv[1]), 2).to_json()))"
+        "sys.stdout.write(json.dumps(settle_layout(load_scene(sys.argv[1]), 2, cached=False).to_json()))"
     )
     there = subprocess.run(
         [sys.executable, "-c", program, str(path)],
@@ -133,7 +170,9 @@ def test_seed_and_index_decide_every_byte(stepper, scene_data, write_scene):
         cwd=Path(__file__).parents[1],
     ).stdout
     assert hashlib.sha256(there.encode()).hexdigest() == hashlib.sha256(here.encode()).hexdigest()
-    assert json.dumps(settle_layout(scene, 1).to_json()["instances"]) != json.dumps(json.loads(here)["instances"])
+    assert json.dumps(settle_layout(scene, 1, cached=False).to_json()["instances"]) != json.dumps(
+        json.loads(here)["instances"]
+    )
 
 
 def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):
@@ -142,7 +181,7 @@ def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):
     scene_data["region"] = {"min": [-0.1, -0.1, 0.01], "max": [0.1, 0.1, 0.1]}
     scene_data["settle"] = {"attempts": 30, "stepper": "mujoco"}
     scene = load_scene(write_scene(scene_data))
-    certificates = [settle_layout(scene, index).certificate for index in range(3)]
+    certificates = [settle_layout(scene, index, cached=False).certificate for index in range(3)]
     refused = [reason for certificate in certificates for reason in certificate.refused]
     assert refused
     assert all("left the enclosure" in reason for reason in refused)
@@ -152,20 +191,20 @@ def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):
 def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
     scene_data["settle"] = {"max_time": 0.05, "attempts": 3}
     with pytest.raises(InputError, match=r"layout 0 must come to rest .*3 x not at rest within 0\.05 s"):
-        settle_layout(load_scene(write_scene(scene_data)), 0)
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
 def test_a_region_too_small_is_an_error(scene_data, write_scene):
     scene_data["objects"][0]["count"] = 60
     scene_data["region"] = {"min": [-0.05, -0.05, 0.01], "max": [0.05, 0.05, 0.08]}
     with pytest.raises(InputError, match=r"scene.yaml: region must be large enough .*the 61 of a layout"):
-        settle_layout(load_scene(write_scene(scene_data)), 0)
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
 def test_a_scene_without_colliders_is_an_error(scene_data, write_scene):
     scene_data["shapes"][0]["collider"] = False
     with pytest.raises(InputError, match="something to rest on"):
-        settle_layout(load_scene(write_scene(scene_data)), 0)
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
 def test_an_environment_carries_objects(scene_data, write_scene):
@@ -175,12 +214,149 @@ def test_an_environment_carries_objects(scene_data, write_scene):
     region = scene.spec.region.model_copy(update={"min": (-0.2, -0.2, 0.03)})
     spec = scene.spec.model_copy(update={"region": region, "environment_collides": True})
     raised = replace(scene, environment=environment, spec=spec)
-    layout = settle_layout(raised, 0)
+    layout = settle_layout(raised, 0, cached=False)
     for instance in layout.instances:
         mesh = scene.assets[instance.asset].mesh
         assert lowest(mesh, instance.world_from_object) == pytest.approx(0.015, abs=3e-4)
 
 
+def drop_layout(scene_data, write_scene, **changes):
+    scene = load_scene(write_scene({**scene_data, **changes}))
+    return scene, settle_layout(scene, 0, cached=False)
+
+
+def placed_clearances(scene, layout):
+    """Clearances of a layout's objects from one another and from the colliders."""
+    from mitsplat.clearance import all_clearances
+    from mitsplat.drop import drop_of
+
+    drop = drop_of(scene, lambda text: None)
+    placed = [drop._placed(instance.asset, instance.world_from_object) for instance in layout.instances]
+    return all_clearances(placed, [], reach=0.005)
+
+
+BIN = {"name": "bin", "bin": {"size": [0.12, 0.09, 0.05], "position": [0, 0, 0.004], "rotate_z": 20}, "visible": True}
+
+
+def test_a_bin_is_five_boxes_around_its_inside(scene_data, write_scene):
+    """Volume of the walls: outer less inner; the inside is empty and the middle of its floor where it should be."""
+    from mitsplat.clearance import Surface
+
+    scene_data["shapes"].append(BIN)
+    mesh = load_scene(write_scene(scene_data)).shape_meshes[1]
+    assert mesh.is_watertight
+    outer, inner = 0.128 * 0.098 * 0.054, 0.12 * 0.09 * 0.05
+    assert mesh.volume == pytest.approx(outer - inner, rel=1e-6)
+    turn, floor = Rotation.from_euler("z", 20, degrees=True), np.array([0, 0, 0.004])
+    inside = turn.apply([[0, 0, 0.001], [0.059, 0.044, 0.049], [-0.059, 0.044, 0.001]]) + floor
+    walls = turn.apply([[0, 0, -0.002], [0.062, 0, 0.02], [0, -0.047, 0.049]]) + floor
+    assert (Surface(mesh).signed_distances(np.array([*inside, *walls])) < 0).tolist() == [False] * 3 + [True] * 3
+
+
+def test_a_pile_fills_a_bin(scene_data, write_scene):
+    """A dozen parts, more than the region has room for, come to rest in the bin, none beside it."""
+    scene_data["shapes"].append(BIN)
+    _, layout = drop_layout(
+        scene_data,
+        write_scene,
+        objects=[{"asset": "assets/nut", "count": 7}, {"asset": "assets/bolt", "count": 5}],
+        region={"min": [-0.04, -0.03, 0.02], "max": [0.04, 0.03, 0.06]},
+        settle={"arrangement": "pile", "stepper": "mujoco"},
+    )
+    assert len(layout.instances) == 12
+    positions = np.array([instance.world_from_object[:3, 3] for instance in layout.instances]) - [0, 0, 0.004]
+    local = Rotation.from_euler("z", -20, degrees=True).apply(positions)
+    assert (np.abs(local[:, :2]) < [0.06, 0.045]).all()
+    assert layout.certificate.collider_penetration < 3e-4
+    assert layout.certificate.pair_penetration < 5e-4
+
+
+def test_a_pile_that_finds_no_room_is_an_error(scene_data, write_scene):
+    with pytest.raises(InputError, match=r"region must be large enough .* settle\.arrangement pile"):
+        drop_layout(
+            scene_data,
+            write_scene,
+            objects=[{"asset": "assets/nut", "count": 150}],
+            region={"min": [-0.02, -0.02, 0.02], "max": [0.02, 0.02, 0.06]},
+            settle={"arrangement": "pile"},
+        )
+
+
+def test_what_is_scattered_does_not_touch(scene_data, write_scene):
+    scene, layout = drop_layout(
+        scene_data,
+        write_scene,
+        objects=[{"asset": "assets/nut", "count": 6}, {"asset": "assets/bolt", "count": 3}],
+        settle={"arrangement": "scatter", "stepper": "mujoco"},
+    )
+    assert min(pair.distance for pair in placed_clearances(scene, layout)) > 5e-4
+
+
+def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
+    """Box i of thickness h lies with its centre at (i + 1/2) h, all turned alike and in one line."""
+    scene_data["objects"] = [{"asset": "assets/nut", "count": 4}]
+    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "stack"})
+    poses = np.array(sorted((one.world_from_object for one in layout.instances), key=lambda pose: pose[2, 3]))
+    np.testing.assert_allclose(poses[:, 2, 3], 0.01 * (np.arange(4) + 0.5), atol=3e-4)
+    np.testing.assert_allclose(np.abs(poses[:, 2, 2]), 1.0, atol=1e-4)
+    assert np.ptp(poses[:, :2, 3], axis=0).max() < 5e-4
+    assert layout.certificate.surface_motion < 1e-4
+
+
+def test_what_is_upright_stands_as_the_asset_does(scene_data, write_scene):
+    """Bolts of 10 x 10 x 50 mm, which lie down when dropped, stand: the vertical stays, its turn is random."""
+    scene_data["objects"] = [{"asset": "assets/bolt", "count": 5}]
+    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "upright", "stepper": "mujoco"})
+    poses = np.array([instance.world_from_object for instance in layout.instances])
+    np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-4)
+    np.testing.assert_allclose(poses[:, 2, 3], 0.025, atol=3e-4)
+    assert np.ptp(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])) > 0.5
+
+
+def test_poses_may_be_given(scene_data, write_scene):
+    """A nut put down turned by 30 degrees stays there; one above it comes down by its clearance; others keep off."""
+    given = [
+        {"position": [0.05, 0.02, 0.005], "rotate": [0, 0, 30]},
+        {"position": [0.05, 0.02, 0.0153], "rotate": [0, 0, 30]},
+    ]
+    scene_data["objects"] = [{"asset": "assets/nut", "poses": given}, {"asset": "assets/bolt", "count": 2}]
+    _, layout = drop_layout(scene_data, write_scene, settle={"stepper": "mujoco"})
+    assert len(layout.instances) == 4
+    for i, instance in enumerate(layout.instances[:2]):
+        expected = pose_at((0.05, 0.02, 0.005 + 0.01 * i), Rotation.from_euler("z", 30, degrees=True))
+        np.testing.assert_allclose(instance.world_from_object, expected, atol=5e-4)
+    scene_data["objects"][0]["count"] = 2
+    with pytest.raises(InputError, match=r"objects\[0\].count: must not be given together with poses"):
+        load_scene(write_scene(scene_data))
+
+
+def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
+    from mitsplat.drop import drop_of
+
+    scene = load_scene(write_scene({**scene_data, "randomise": {"friction": [0.5, 1.5]}}))
+    drop = drop_of(scene, lambda text: None)
+    drawn = np.array([drop._draw_frictions(index) for index in range(200)])
+    nominal = scene.assets[0].friction
+    assert kstest(drawn.ravel(), "uniform", args=(0.5 * nominal, nominal)).pvalue > 1e-3
+    assert abs(np.corrcoef(drawn.T)[0, 1]) < 0.2
+    bodies = drop._world((0, 0, 1), drop._draw_frictions(3), 1.0).bodies
+    assert [body.friction for body in bodies] == [drawn[3, 0], drawn[3, 0], drawn[3, 1]]
+
+
+def test_standoff_of_a_hull(scene_data):
+    """The hull of an L of two plates spans its corner: (0, 0) is sqrt(2) / 2 of 20 mm from the hull's long face."""
+    from mitsplat.clearance import Surface, standoff
+
+    floor, wall = trimesh.creation.box((0.022, 0.01, 0.002)), trimesh.creation.box((0.002, 0.01, 0.022))
+    floor.apply_translation((0.009, 0, -0.001))
+    wall.apply_translation((-0.001, 0, 0.009))
+    bracket = trimesh.boolean.union([floor, wall])
+    surface = Surface(bracket)
+    assert standoff(surface, [floor, wall]) < 1e-5
+    # The middle of the hull's long face, from (20, 0) to (0, 20) mm, is 10 mm from both plates.
+    assert standoff(surface, [bracket.convex_hull]) == pytest.approx(0.01, abs=2e-4)
+
+
 def test_no_objects_make_an_empty_layout(scene_data, write_scene):
     scene_data["objects"] = []
-    assert settle_layout(load_scene(write_scene(scene_data)), 0).instances == ()
+    assert settle_layout(load_scene(write_scene(scene_data)), 0, cached=False).instances == ()

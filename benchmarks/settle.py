@@ -1,7 +1,14 @@
-"""CPU-seconds per settled layout, with both steppers: ``python benchmarks/settle.py [--layouts N]``.
+"""Settling, measured: ``python -m benchmarks.settle rate | faces | thin | bin | rest | worlds [--count N]``.
 
-Drops ten parts (nuts, bolts, washers, brackets, plates of 10 to 150 mm) into a box of 0.5 x 0.4 m, and then thirty.
-The first layout of each row includes what is made once: convex pieces, compiled kernels, the model.
+rate     layouts per minute of ten and of thirty objects, with both steppers, in one process
+faces    faces that a box of 1 : 1 : 0.3 comes to rest on, with both steppers, compared by a chi-squared test
+thin     random drops of a screw, a torus, a mug and a concave bracket, certified
+bin      forty objects poured into a bin
+rest     ten objects, seed after seed: time to rest, and what moves in the five seconds after
+worlds   CPU time of several layouts in one simulation, per layout
+
+Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless said otherwise.
+What is made once (convex pieces, compiled kernels) is made before the clock starts.
 """
 
 from __future__ import annotations
@@ -9,25 +16,36 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 from ruamel.yaml import YAML
-from trimesh.creation import annulus, box, cylinder
+from scipy.stats import chi2_contingency
+from trimesh.creation import annulus, box, cylinder, torus
 
 from mitsplat.assets import Asset
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces
-from mitsplat.scene import load_scene
-from mitsplat.settle import settle_layout
+from mitsplat.scene import Scene, load_scene
+from mitsplat.settle import Layout, settle_layout, warp_settings
 from mitsplat.splats import Splats
+
+if TYPE_CHECKING:
+    from mitsplat.physics import Body, Collider
+    from mitsplat.settle import FloatArray
+
+STEPPERS = ("warp", "mujoco")
+
+
+def at(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
+    return mesh.apply_translation(offset)
 
 
 def parts() -> dict[str, trimesh.Trimesh]:
-    def at(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
-        return mesh.apply_translation(offset)
-
     hexagon = cylinder(radius=0.00575, height=0.005, sections=6)
     plates = trimesh.boolean.union([box((0.06, 0.04, 0.004)), at(box((0.004, 0.04, 0.05)), -0.028, 0, 0.023)])
     return {
@@ -39,7 +57,30 @@ def parts() -> dict[str, trimesh.Trimesh]:
     }
 
 
-def write_scene(folder: Path, count: int, stepper: str) -> Path:
+def thin_parts() -> dict[str, trimesh.Trimesh]:
+    head, shaft = cylinder(radius=0.003, height=0.002, sections=24), cylinder(radius=0.0012, height=0.032, sections=16)
+    outside, inside = (
+        cylinder(radius=0.03, height=0.07, sections=24),
+        at(cylinder(radius=0.027, height=0.07), 0, 0, 0.004),
+    )
+    handle = torus(0.02, 0.004, major_sections=16, minor_sections=8)
+    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    mug = trimesh.boolean.difference([trimesh.boolean.union([outside, at(handle, 0.034, 0, 0)]), inside])
+    return {
+        "screw": trimesh.boolean.union([head, at(shaft, 0, 0, 0.0165)]),
+        "torus": torus(0.025, 0.006, major_sections=24, minor_sections=12),
+        "mug": mug,
+        "bracket": parts()["bracket"],
+    }
+
+
+def make_scene(meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, **changes: Any) -> Scene:
+    """A scene of ``count`` of each mesh on a table."""
+    with tempfile.TemporaryDirectory() as name:
+        return load_scene(write_scene(Path(name), meshes, count, stepper, **changes))
+
+
+def write_scene(folder: Path, meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, **changes: Any) -> Path:
     point = Splats(
         means=np.zeros((1, 3), np.float32),
         quats=np.float32([[0, 0, 0, 1]]),
@@ -47,49 +88,214 @@ def write_scene(folder: Path, count: int, stepper: str) -> Path:
         opacities=np.ones(1, np.float32),
         sh=np.zeros((1, 1, 3), np.float32),
     )
-    meshes = parts()
     for name, mesh in meshes.items():
         Asset(name, name, point, mesh=mesh, pieces=convex_pieces(mesh), density=3000.0).save(folder / name)
     scene = {
         "name": "settle",
         "shapes": [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}, "visible": True}],
-        "objects": [{"asset": name, "count": count // len(meshes)} for name in meshes],
-        "region": {"min": [-0.25, -0.2, 0.01], "max": [0.25, 0.2, 0.2 if count <= 10 else 0.45]},
+        "objects": [{"asset": name, "count": count} for name in meshes],
+        "region": {"min": [-0.25, -0.2, 0.01], "max": [0.25, 0.2, 0.2 if count * len(meshes) <= 10 else 0.45]},
         "enclosure": {},
-        "settle": {"stepper": stepper},
         "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 1, "height": 1},
         "lights": [{"kind": "point", "position": [0, 0, 1]}],
+        **changes,
     }
+    scene["settle"] = {"stepper": stepper, **scene.get("settle", {})}
     path = folder / "scene.yaml"
     YAML(typ="safe").dump(scene, path)
     return path
 
 
+def try_settle(scene: Scene, index: int) -> Layout | None:
+    try:
+        return settle_layout(scene, index, cached=False)
+    except InputError as error:
+        print(f"  given up: {error}")
+        return None
+
+
+def show(name: str, layouts: list[Layout], given_up: int, seconds: float) -> None:
+    found = [layout.certificate for layout in layouts]
+    times = [certificate.time_to_rest for certificate in found]
+    refused = Counter(reason.split(" by ")[0] for certificate in found for reason in certificate.refused)
+    print(
+        f"{name}: {len(found)} layouts, {given_up} given up, {sum(c.attempts for c in found)} draws; "
+        f"rest {np.median(times):.2f} s (median), {max(times):.2f} (slowest); deepest "
+        f"{max(c.collider_penetration for c in found) * 1e3:.2f} mm in colliders, "
+        f"{max(c.pair_penetration for c in found) * 1e3:.2f} in objects; "
+        f"gap {max(c.support_gap for c in found) * 1e3:.2f} mm; motion in 1 s "
+        f"{max(c.surface_motion for c in found) * 1e3:.2f} mm; {seconds / (len(found) + given_up):.2f} CPU s a layout"
+        + (f"; refused {dict(refused)}" if refused else ""),
+        flush=True,
+    )
+
+
+def settle_all(name: str, scene: Scene, count: int) -> list[Layout]:
+    settle_layout(scene, count, cached=False)  # pieces, kernels
+    start = time.process_time()
+    layouts = [try_settle(scene, index) for index in range(count)]
+    held = [layout for layout in layouts if layout is not None]
+    show(name, held, count - len(held), time.process_time() - start)
+    return held
+
+
+def measure_rate(count: int) -> None:
+    for objects in (10, 30):
+        for stepper in STEPPERS:
+            scene = make_scene(parts(), objects // 5, stepper)
+            start = time.perf_counter()
+            settle_all(f"{objects} objects, {stepper}", scene, count)
+            print(
+                f"  {60 * (count + 1) / (time.perf_counter() - start):.1f} layouts a minute of wall time, one process"
+            )
+
+
+def measure_faces(count: int) -> None:
+    """Resting faces: how often a box lies on each pair of faces; solid angles are what an overdamped box would do."""
+    sides = np.array([0.03, 0.03, 0.009])
+    rows = []
+    for stepper in STEPPERS:
+        scene = make_scene({"box": box(sides)}, 25, stepper, settle={"arrangement": "scatter"})
+        up = []
+        for index in range(-(-count // 25)):
+            layout = try_settle(scene, index)
+            up += [] if layout is None else [one.world_from_object[2, :3] for one in layout.instances]
+        axis = np.abs(up).argmax(axis=1)
+        sign = np.sign(np.take_along_axis(np.array(up), axis[:, None], axis=1))[:, 0]
+        off = np.degrees(np.arccos(np.minimum(1, np.abs(up).max(axis=1))))
+        rows.append(np.bincount(2 * axis + (sign > 0), minlength=6))
+        print(f"{stepper}: {len(up)} boxes, on -x +x -y +y -z +z: {rows[-1].tolist()}, on no face: {(off > 1).sum()}")
+    a, b, d = sides / 2
+    corner = np.arcsin(a * b / np.sqrt((a * a + d * d) * (b * b + d * d)))
+    print(f"large faces by solid angle: {2 * 4 * corner / (4 * np.pi):.3f}")
+    pairs = np.array(rows).reshape(2, 3, 2).sum(axis=2)
+    print(f"large faces found: {pairs[:, 2] / pairs.sum(axis=1)}")
+    table = np.stack([pairs[:, 2], pairs[:, :2].sum(axis=1)])
+    print(f"warp against mujoco: p = {chi2_contingency(table).pvalue:.3f}")
+
+
+def measure_thin(count: int) -> None:
+    for name, mesh in thin_parts().items():
+        for stepper in STEPPERS:
+            scene = make_scene({name: mesh}, 4, stepper, settle={"attempts": 8})
+            settle_all(f"4 x {name}, {stepper}", scene, count)
+
+
+def measure_bin(count: int) -> None:
+    meshes = parts()
+    del meshes["plate"]  # longer than the bin
+    tray = {"name": "bin", "bin": {"size": [0.24, 0.18, 0.1], "position": [0, 0, 0.004]}}
+    table = {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}
+    region = {"min": [-0.1, -0.07, 0.01], "max": [0.1, 0.07, 0.12]}
+    for stepper in STEPPERS:
+        scene = make_scene(
+            meshes, 10, stepper, shapes=[table, tray], region=region, enclosure=None, settle={"arrangement": "pile"}
+        )
+        settle_all(f"40 objects in a bin, {stepper}", scene, count)
+
+
+def measure_rest(count: int) -> None:
+    """Drop ten objects with each of some seeds once, without a second draw; then wait for five seconds more."""
+    from mitsplat.drop import drop_of
+    from mitsplat.physics import _surface_motion, run_to_rest
+
+    for stepper in STEPPERS:
+        drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)
+        times, moved, total = [], 0, 0
+        for seed in range(count):
+            assets, _ = drop._draw_objects(0)
+            world = drop._world(assets, drop._draw_frictions(0), 1.0)
+            world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
+            outcome = run_to_rest(world, max_time=6.0, bounds=drop._bounds)
+            if outcome.refused:
+                print(f"  seed {seed}: {outcome.refused}")
+                continue
+            times.append(outcome.time)
+            while world.time < outcome.time + 5.0:
+                world.advance()
+            for body, before, after in zip(world.bodies, outcome.poses, world.poses, strict=True):
+                total += 1
+                moved += _surface_motion([body], before[None], after[None]) > 5e-3
+        print(
+            f"{stepper}: {len(times)} of {count} at rest in 6 s, median {np.median(times):.2f} s; "
+            f"{moved} of {total} objects moved by more than 5 mm in the next 5 s",
+            flush=True,
+        )
+
+
+def measure_worlds(count: int) -> None:
+    """The step of :class:`mitsplat.physics.WarpWorld` for several worlds at once, up to ``count``."""
+    from mitsplat.drop import drop_of
+
+    scene = make_scene(parts(), 2, "warp")
+    drop = drop_of(scene, lambda text: None)
+    assets, _ = drop._draw_objects(0)
+    starts = [drop.draw_poses(assets, np.random.default_rng(world)) for world in range(count)]
+    bodies = [drop._objects[asset].body for asset in assets]
+    for worlds in (1, 2, count):
+        seconds = time_worlds(bodies, drop._colliders, starts[:worlds], scene.spec.settle.timestep)
+        print(f"{worlds} worlds of 10 objects: {seconds:.2f} CPU s per simulated second and world", flush=True)
+
+
+def time_worlds(bodies: list[Body], colliders: list[Collider], starts: list[FloatArray], timestep: float) -> float:
+    """CPU seconds per simulated second and world, over one and a half of fall and rest."""
+    import newton
+    import warp as wp
+    from newton.solvers import SolverMuJoCo
+
+    from mitsplat import physics
+
+    one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP)
+    contacts = 40 * len(bodies) + one.shape_count
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    SolverMuJoCo.register_custom_attributes(builder)
+    builder.replicate(one, len(starts))
+    model = builder.finalize(device="cpu")
+    solver = SolverMuJoCo(
+        model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics._SOLVER_OPTIONS
+    )
+    pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=len(starts) * contacts + 1)
+    found, states, control = pipeline.contacts(), (model.state(), model.state()), model.control()
+
+    def steps() -> None:
+        here, there = states
+        for _ in range(4):
+            pipeline.collide(here, found)
+            solver.step(here, there, control, found, timestep)
+            here, there = there, here
+
+    steps()
+    with wp.ScopedCapture(device="cpu") as capture:
+        steps()
+    coordinates = np.concatenate([physics._coordinates(bodies, poses) for poses in starts])
+    physics._assign(states[0].joint_q, coordinates.ravel())
+    physics._assign(states[0].body_q, coordinates)
+    physics._assign(states[0].joint_qd, np.zeros(6 * len(coordinates)))
+    physics._assign(states[0].body_qd, np.zeros((len(coordinates), 6)))
+    start = time.process_time()
+    for _ in range(round(1.5 / (4 * timestep))):
+        wp.capture_launch(capture.graph)
+    return (time.process_time() - start) / 1.5 / len(starts)
+
+
+MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
+    "rate": (measure_rate, 10),
+    "faces": (measure_faces, 500),
+    "thin": (measure_thin, 50),
+    "bin": (measure_bin, 3),
+    "rest": (measure_rest, 20),
+    "worlds": (measure_worlds, 8),
+}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--layouts", type=int, default=5)
-    layouts = parser.parse_args().layouts
-    print("objects stepper  first  others [CPU s]  simulated [s]  draws  given up  deepest [mm]  gap [mm]")
-    for count in (10, 30):
-        for stepper in ("warp", "mujoco"):
-            with tempfile.TemporaryDirectory() as folder:
-                scene = load_scene(write_scene(Path(folder), count, stepper))
-                seconds, certificates = [], []
-                for index in range(layouts):
-                    start = time.process_time()
-                    try:
-                        certificates.append(settle_layout(scene, index).certificate)
-                    except InputError:
-                        certificates.append(None)
-                    seconds.append(time.process_time() - start)
-            held = [certificate for certificate in certificates if certificate is not None]
-            print(
-                f"{count:7} {stepper:7} {seconds[0]:6.1f} {np.mean(seconds[1:]):7.2f}"
-                f"{np.mean([c.time_to_rest for c in held]):23.2f}{sum(c.attempts for c in held):7}"
-                f"{len(certificates) - len(held):10}"
-                f"{max(c.deepest_penetration for c in held) * 1e3:14.3f}{max(c.support_gap for c in held) * 1e3:10.3f}",
-                flush=True,
-            )
+    parser.add_argument("measure", choices=MEASURES)
+    parser.add_argument("--count", type=int)
+    arguments = parser.parse_args()
+    measure, count = MEASURES[arguments.measure]
+    with warp_settings():
+        measure(arguments.count or count)
 
 
 if __name__ == "__main__":

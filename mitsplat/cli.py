@@ -160,6 +160,45 @@ def preview(
 
 
 @app.command()
+def settle(
+    scene: SceneFile,
+    layouts: Annotated[int | None, typer.Option("--layouts", "-n", help="Only the first so many layouts.")] = None,
+    preview: Annotated[bool, typer.Option("--preview", help="Write the drop of the first layout as a GIF.")] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="GIF to write.")] = Path("settle.gif"),
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the GIF [px].")] = "480x270",
+    seed: Annotated[int | None, typer.Option(help="Decides everything that is random.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes that settle layouts.")] = 1,
+) -> None:
+    """Settle the layouts of SCENE and print their rest certificates.
+
+    They are kept, so that rendering finds them settled.
+    """
+    if out.suffix.lower() != ".gif":
+        raise InputError(f"--out must end in .gif (got {out})")
+    if not out.parent.is_dir():
+        raise InputError(f"--out must be in a folder that exists (got {out})")
+    from rich.console import Console
+
+    from mitsplat.rest import certificate_table, write_preview
+    from mitsplat.scene import load_scene
+    from mitsplat.settle import settle_layouts
+
+    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed))
+    wanted = loaded.spec.output.layouts if layouts is None else layouts
+    if not 1 <= wanted <= loaded.spec.output.layouts:
+        raise InputError(
+            f"--layouts must be 1 to {loaded.spec.output.layouts}, the scene's output.layouts (got {wanted})"
+        )
+    with Console(stderr=True).status("settling") as status:
+        found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
+        settled = sorted(found, key=lambda layout: layout.index)
+    Console().print(certificate_table(settled))
+    if preview:
+        pictures = write_preview(loaded, settled[0], out)
+        typer.echo(f"drop: {out} ({pictures} pictures)")
+
+
+@app.command()
 def export(
     scene: SceneFile,
     frame: FrameIndex = 0,

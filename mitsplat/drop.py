@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -143,6 +143,24 @@ class Drop:
             f"{self.scene.path}: layout {index} must come to rest in settle.attempts = {spec.settle.attempts} "
             f"draws (got {reasons})"
         )
+
+    def replay(self, layout: Layout, interval: float) -> Iterator[FloatArray]:
+        """Poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
+        assets, given = self._draw_objects(layout.index)
+        if not assets:
+            return
+        certificate = layout.certificate
+        rng = _random(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
+        capacity = 2.0 ** certificate.refused.count(OVERFLOW)
+        world = self._world(assets, self._draw_frictions(layout.index), capacity)
+        world.reset(self.draw_poses(assets, rng, given))
+        yield world.poses
+        shown = 0
+        while world.time < certificate.time_to_rest:
+            world.advance()
+            if world.time >= (shown + 1) * interval:
+                shown += 1
+                yield world.poses
 
     def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[FloatArray | None, ...]]:
         """Which entry each object of a layout is of, and the pose that the file gives it, if any."""

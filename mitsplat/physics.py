@@ -140,10 +140,7 @@ class World(ABC):
             velocities: As :attr:`velocities`, shape (N, 2, 3); at rest if None.
         """
         self.time = 0.0
-        coordinates = _parking(self.bodies)
-        coordinates[: len(poses)] = np.concatenate(
-            [poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1
-        )
+        coordinates = _coordinates(self.bodies, poses)
         motion = np.zeros((len(coordinates), 2, 3))
         if velocities is not None:
             motion[: len(velocities)] = velocities
@@ -386,7 +383,21 @@ def _parking(bodies: Sequence[Body]) -> FloatArray:
     return coordinates
 
 
+def _coordinates(bodies: Sequence[Body], poses: FloatArray) -> FloatArray:
+    """Position and xyzw quaternion of bodies at poses (N, 4, 4), and of those without shape, shape (M, 7)."""
+    coordinates = _parking(bodies)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    coordinates[: len(poses)] = np.concatenate([poses[:, :3, 3], turns], axis=1)
+    return coordinates
+
+
 def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]) -> newton.Model:
+    return _build_scene(bodies, colliders, impedance).finalize(device="cpu")
+
+
+def _build_scene(
+    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]
+) -> newton.ModelBuilder:
     contact = {"mujoco:condim": 6, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}  # with spin and roll friction
     builder = newton.ModelBuilder(gravity=_GRAVITY)
     builder.validate_inertia_detailed = True  # in Python: the other way compiles a kernel for 4 s
@@ -412,7 +423,7 @@ def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedanc
         )
         if body is not None:
             _add_hulls(builder, link, body.hulls, _shape_config(body.friction, size=body.size), contact)
-    return builder.finalize(device="cpu")
+    return builder
 
 
 def _add_hulls(

@@ -7,7 +7,7 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -163,6 +163,23 @@ def settle_layouts(
 
     layouts = {index: [index] for index in indices}
     return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
+
+
+def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:
+    """How a layout came to rest: the layout as it was every ``interval`` seconds [s], and at last as it is.
+
+    On a CPU the drop that is simulated again is the one that was.
+    """
+    with warp_settings():
+        from mitsplat.drop import drop_of
+
+        for poses in drop_of(scene, lambda text: None).replay(layout, interval):
+            moving = (
+                replace(instance, world_from_object=pose)
+                for instance, pose in zip(layout.instances, poses, strict=True)
+            )
+            yield replace(layout, instances=tuple(moving))
+    yield layout
 
 
 @lru_cache(maxsize=4)

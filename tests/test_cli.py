@@ -14,14 +14,15 @@ import typer
 import typer.core
 import typer.main
 from conftest import WriteScene, box_asset
-from PIL import Image
+from PIL import Image, ImageSequence
 
-from mitsplat import bake, dataset, frame, xml_scene
+from mitsplat import bake, dataset, frame, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
 from mitsplat.errors import InputError
 from mitsplat.scene import Scene
+from mitsplat.settle import Layout
 
 
 def run(*args: object) -> int:
@@ -186,6 +187,47 @@ def test_doctor_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     lines = capsys.readouterr().out.splitlines()
     failing = next(number for number, line in enumerate(lines) if line.startswith("FAIL  LLVM: /no/such/libLLVM.so"))
     assert "set DRJIT_LIBLLVM_PATH" in lines[failing + 1]
+
+
+def test_settle_prints_certificates_and_shows_the_drop(
+    scene_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The GIF moves, ends on the layout at rest, and has a picture for each 0.04 s of the drop."""
+    monkeypatch.setattr(settle, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setenv("COLUMNS", "200")
+    gif = tmp_path / "drop.gif"
+    assert run("settle", scene_path, "-n", 2, "--preview", "-o", gif, "--size", "64x36") == 0
+    out = capsys.readouterr().out
+    layouts = [Layout.from_json(json.loads(path.read_bytes())) for path in sorted((tmp_path / "cache").rglob("*.json"))]
+    assert [layout.index for layout in layouts] == [0, 1]
+    rows = [row.split("│")[1:-1] for row in out.splitlines() if row.startswith("│")]
+    for layout, row in zip(layouts, rows, strict=True):
+        assert int(row[0]) == layout.index
+        assert int(row[1]) == len(layout.instances)
+        assert float(row[2]) == pytest.approx(layout.certificate.time_to_rest, abs=0.005)
+        assert float(row[6]) == pytest.approx(layout.certificate.collider_penetration * 1e3, abs=5e-4)
+    with Image.open(gif) as picture:
+        frames = [np.array(frame.convert("RGB"), dtype=float) for frame in ImageSequence.Iterator(picture)]
+    assert frames[0].shape == (36, 64, 3)
+    assert len(frames) == pytest.approx(layouts[0].certificate.time_to_rest / 0.04 + 2, abs=1.5)
+    assert np.abs(frames[0] - frames[-1]).max() > 20
+    assert f"drop: {gif} ({len(frames)} pictures)" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["-o", "drop.png"], "--out must end in .gif (got drop.png)"),
+        (["-o", "gone/drop.gif"], "--out must be in a folder that exists (got gone/drop.gif)"),
+        (["-n", "4"], "--layouts must be 1 to 3, the scene's output.layouts (got 4)"),
+        (["--workers", "0"], "workers must be at least 1 (got 0)"),
+    ],
+)
+def test_bad_option_of_settle_is_one_sentence(
+    scene_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
+    assert run("settle", scene_path, *options) == 2
+    assert sentence in capsys.readouterr().err
 
 
 # Bad input

@@ -25,6 +25,7 @@ from mitsplat.spec import PILE_HEIGHT, Region
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
 _DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _WIDEST_GAP, _SHARE = 3e-4, 5e-4, 1e-3, 0.005
+_DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scene file says so [m]
 _NEAREST = 5e-4  # what is scattered is farther apart than this [m]
 _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
@@ -89,6 +90,7 @@ class Drop:
         self._colliders: list[Collider] = []
         self._obstacles: list[PlacedSurface] = []
         walls = self._add_colliders(progress)
+        self._check_given_poses()
         self._bounds = _enclosure(scene.spec.region, [item.bounds for item in self._obstacles], walls)
         if scene.spec.settle.arrangement == "pile":
             self._bounds[1][2] += PILE_HEIGHT
@@ -244,6 +246,20 @@ class Drop:
         if not self._colliders:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
         return walls
+
+    def _check_given_poses(self) -> None:
+        """Refuse poses of the scene file that start in one another or in a collider, which would part them anyhow."""
+        keys: dict[PlacedSurface, str] = {}
+        for entry, spec in enumerate(self.scene.spec.objects):
+            for number, pose in enumerate(spec.poses):
+                keys[self._placed(entry, fixed_pose(pose))] = f"objects[{entry}].poses[{number}]"
+        for pair in all_clearances(list(keys), self._obstacles, reach=_REACH):
+            if -pair.distance > _DEEPEST_GIVEN:
+                other = keys.get(pair.second, f"collider {pair.second.name!r}")
+                raise InputError(
+                    f"{self.scene.path}: {keys[pair.first]}: must not start in {other} "
+                    f"(got an overlap of {-pair.distance * 1e3:.1f} mm)"
+                )
 
     def draw_poses(
         self, assets: Sequence[int], rng: np.random.Generator, given: Sequence[FloatArray | None] = ()

@@ -54,7 +54,7 @@ def draw_poses(
     arrangement: Arrangement,
     rng: np.random.Generator,
 ) -> FloatArray | None:
-    """Poses (N, 4, 4) of all items, none of which touches another or an obstacle; None if they find no room.
+    """Poses (N, 4, 4) of all items; None if they find no room. None that is drawn touches another or an obstacle.
 
     Args:
         items: What to place.
@@ -103,17 +103,17 @@ class _Draw:
                 self._take(i, item.pose, _bounds(item.outline, item.pose))
         # Large ones first, for which room is scarce.
         free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
-        place: Callable[[int], bool] = {
-            "drop": self._drop,
-            "pile": self._pour,
-            "scatter": self._scatter,
-            "upright": lambda i: self._stand(i, np.eye(3)),
-        }.get(arrangement, self._drop)
         if arrangement == "stack":
             entries = dict.fromkeys(self._items[i].entry for i in free)
             done = all(self._stack([i for i in free if self._items[i].entry == entry]) for entry in entries)
         else:
-            done = all(place(i) for i in free)
+            place: dict[str, Callable[[int], bool]] = {
+                "drop": self._drop,
+                "pile": self._pour,
+                "scatter": self._scatter,
+                "upright": lambda i: self._stand(i, np.eye(3)),
+            }
+            done = all(place[arrangement](i) for i in free)
         return self._poses if done else None
 
     def _drop(self, i: int) -> bool:

@@ -86,8 +86,7 @@ def test_draws_are_uniform_and_apart(scene_data, write_scene):
 
 def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
     scene = load_scene(write_scene(scene_data))
-    said = []
-    layout = settle_layout(scene, 0, progress=said.append, cached=False)
+    layout = settle_layout(scene, 0, cached=False)
     names = [scene.class_names[instance.class_index] for instance in layout.instances]
     assert [instance.id for instance in layout.instances] == list(range(1, len(names) + 1))
     assert names.count("bolt") == 1
@@ -330,6 +329,19 @@ def test_poses_may_be_given(scene_data, write_scene):
         load_scene(write_scene(scene_data))
 
 
+@pytest.mark.parametrize(
+    ("height", "other", "overlap"), [(0.002, "collider 'table'", "3.0"), (0.013, r"objects\[0\].poses\[1\]", "2.0")]
+)
+def test_given_poses_must_not_overlap(scene_data, write_scene, height, other, overlap):
+    """A nut of 10 mm whose centre is 2 mm above the table, or 8 mm above that of one below."""
+    given = [{"position": [0.05, 0.02, height], "rotate": [0, 0, 30]}, {"position": [0.05, 0.02, 0.005]}]
+    given = given if height > 0.005 else given[:1]
+    scene_data["objects"] = [{"asset": "assets/nut", "poses": given}]
+    match = rf"scene.yaml: objects\[0\].poses\[0\]: must not start in {other} \(got an overlap of {overlap} mm"
+    with pytest.raises(InputError, match=match):
+        drop_layout(scene_data, write_scene)
+
+
 def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
     from mitsplat.drop import drop_of
 
@@ -343,8 +355,8 @@ def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
     assert [body.friction for body in bodies] == [drawn[3, 0], drawn[3, 0], drawn[3, 1]]
 
 
-def test_standoff_of_a_hull(scene_data):
-    """The hull of an L of two plates spans its corner: (0, 0) is sqrt(2) / 2 of 20 mm from the hull's long face."""
+def test_standoff_of_a_hull():
+    """Pieces that are the mesh stand off by nothing; the hull of an L by half a leg, where its long face spans it."""
     from mitsplat.clearance import Surface, standoff
 
     floor, wall = trimesh.creation.box((0.022, 0.01, 0.002)), trimesh.creation.box((0.002, 0.01, 0.022))

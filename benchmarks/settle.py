@@ -214,7 +214,8 @@ def measure_rest(count: int) -> None:
                 print(f"  seed {seed}: {outcome.refused}")
                 continue
             times.append(outcome.time)
-            while world.time < outcome.time + 5.0:
+            end = world.time + 5.0
+            while world.time < end:
                 world.advance()
             for body, before, after in zip(world.bodies, outcome.poses, world.poses, strict=True):
                 total += 1

@@ -34,9 +34,8 @@ OVERFLOW = "contact buffer overflow"
 _GRAVITY = (0.0, 0.0, -9.81)
 # Contacts of rounded hulls flicker from step to step: velocities of bodies that stay where they are.
 _MEAN_TIME = 0.05  # [s]
-_QUIET_TIME = 0.25  # how long every body must have been quiet [s]
-_MOTION, _MOTION_TIME = 5e-4, 0.5  # how far a surface may have moved [m] in how long [s]
-_WATCH_TIME = 1.0  # how long bodies at rest are watched for having moved on [s]
+_QUIET_TIME = 0.25  # how long every body must be quiet [s]
+_MOTION, _WATCH_TIME = 5e-4, 1.0  # how far no surface may move [m] in how long [s]
 # Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
 # 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
 _CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
@@ -104,10 +103,10 @@ class Outcome:
 
     Attributes:
         refused: Why it cannot be used, or empty.
-        time: Simulated time until the bodies were at rest [s].
-        max_speed, max_spin: Of the fastest body then [m/s, rad/s].
+        time: Simulated time from which the bodies were at rest [s].
         surface_motion: Farthest that a point of any body moved in the second after that [m]; infinite if refused.
-        poses: World-from-body transforms at the end, shape (N, 4, 4).
+        max_speed, max_spin: Of the fastest body at the end of that second [m/s, rad/s].
+        poses: World-from-body transforms then, shape (N, 4, 4).
     """
 
     refused: str
@@ -280,10 +279,10 @@ class MujocoWorld(World):
 
 
 def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> Outcome:
-    """Advance a world until its bodies rest, and watch them for a second more, or until it is clear that they will not.
+    """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
 
-    At rest every body has been slow for a quarter of a second, and no surface moved by half a millimetre in half a
-    second; nor may one while it is watched.
+    At rest every body is slow for a quarter of a second, and no surface moves by half a millimetre in the second that
+    begins with it.
 
     Args:
         world: Changed in place.
@@ -291,40 +290,33 @@ def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, Floa
         bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
     """
     try:
-        time, (speed, spin) = _fall(world, max_time, bounds)
-        rest, motion = world.poses, 0.0
-        while world.time < time + _WATCH_TIME:
-            motion = max(motion, _surface_motion(world.bodies, rest, _advance_within(world, bounds)))
-        if motion > _MOTION:
-            raise _Refused(f"moved on by {motion * 1e3:.1f} mm after it seemed at rest")
+        return _run_to_rest(world, max_time, bounds)
     except ContactOverflow:
-        return Outcome(OVERFLOW, world.time, np.inf, np.inf, np.inf, world.poses)
+        reason = OVERFLOW
     except _Refused as refused:
-        return Outcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses)
-    return Outcome("", time, speed, spin, motion, world.poses)
+        reason = str(refused)
+    return Outcome(reason, world.time, np.inf, np.inf, np.inf, world.poses)
 
 
 class _Refused(Exception):
     """Why a drop cannot be used."""
 
 
-def _fall(world: World, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> tuple[float, tuple[float, float]]:
-    """Advance until all has been quiet for a while; the time [s] and the fastest speeds [m/s, rad/s] then."""
-    frames = max(2, round(_MOTION_TIME / world.interval) + 1)
+def _run_to_rest(world: World, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> Outcome:
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
-    past: deque[FloatArray] = deque([world.poses], maxlen=frames)
-    moved_at = 0.0
-    while True:
-        past.append(_advance_within(world, bounds))
-        before = min(mean_frames, len(past) - 1)
-        speeds = _mean_speeds(world.bodies, past[-1 - before], past[-1], before * world.interval)
-        if speeds[0] >= QUIET_SPEED or speeds[1] >= QUIET_SPIN:
-            moved_at = world.time
-        quiet = world.time - moved_at >= _QUIET_TIME and len(past) == frames
-        if quiet and _surface_motion(world.bodies, past[0], past[-1]) < _MOTION:
-            return world.time, speeds
-        if world.time >= max_time:
+    past: deque[FloatArray] = deque([world.poses], maxlen=mean_frames + 1)
+    since, rest, motion = 0.0, world.poses, 0.0
+    while world.time - since < _WATCH_TIME:
+        poses = _advance_within(world, bounds)
+        past.append(poses)
+        speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
+        fast = speed >= QUIET_SPEED or spin >= QUIET_SPIN
+        motion = max(motion, _surface_motion(world.bodies, rest, poses))
+        if motion > _MOTION or (fast and world.time - since < _QUIET_TIME):
+            since, rest, motion = world.time, poses, 0.0
+        if since >= max_time:
             raise _Refused(f"not at rest within {max_time:g} s")
+    return Outcome("", since, speed, spin, motion, world.poses)
 
 
 def _advance_within(world: World, bounds: tuple[FloatArray, FloatArray]) -> FloatArray:

@@ -52,9 +52,9 @@ class RestCertificate:
         rested: Whether everything was within its limit.
         inside: Whether no object left the scene's enclosure, or what else there is to lie on.
         overflow: Whether any contact was dropped for want of room.
-        time_to_rest: Simulated time [s].
-        max_speed, max_spin: Residual motion of the fastest object [m/s, rad/s].
-        surface_motion: Farthest that a point of any surface moved in the second after that [m].
+        time_to_rest: Simulated time after which every object stayed where it was [s].
+        max_speed, max_spin: Residual motion of the fastest object a second later [m/s, rad/s].
+        surface_motion: Farthest that a point of any surface moved in that second [m].
         collider_penetration: Depth of the deepest object in a collider [m].
         pair_penetration: Depth of the deepest object in another [m].
         support_gap: Distance of the most isolated object from what is nearest to it [m]; 0 if all touch.

@@ -156,13 +156,14 @@ class Drop:
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
         world = self._world(assets, self._draw_frictions(layout.index), capacity)
         world.reset(self.draw_poses(assets, rng, given))
-        yield world.poses
-        shown = 0
-        while world.time < certificate.time_to_rest:
-            world.advance()
-            if world.time >= (shown + 1) * interval:
-                shown += 1
-                yield world.poses
+        moments = [world.poses]
+
+        def observe(time: float, poses: FloatArray) -> None:
+            if len(moments) * interval <= time <= certificate.time_to_rest:
+                moments.append(poses)
+
+        run_to_rest(world, max_time=self.scene.spec.settle.max_time, bounds=self._bounds, observe=observe)
+        yield from moments
 
     def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[FloatArray | None, ...]]:
         """Which entry each object of a layout is of, and the pose that the file gives it, if any."""

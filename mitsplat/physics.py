@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -130,6 +130,7 @@ class World(ABC):
         self.bodies = tuple(bodies)
         self.interval = _STEPS * timestep
         self.time = 0.0
+        self._rolls = False
 
     def reset(self, poses: FloatArray, velocities: FloatArray | None = None) -> None:
         """Put the bodies somewhere; nothing is left of the past.
@@ -139,6 +140,7 @@ class World(ABC):
             velocities: As :attr:`velocities`, shape (N, 2, 3); at rest if None.
         """
         self.time = 0.0
+        self.let_roll(False)
         coordinates = _coordinates(self.bodies, poses)
         motion = np.zeros((len(coordinates), 2, 3))
         if velocities is not None:
@@ -153,6 +155,12 @@ class World(ABC):
         """
         self._advance()
         self.time += self.interval
+
+    def let_roll(self, rolls: bool) -> None:
+        """Take roll friction away, or give it back."""
+        if rolls != self._rolls:
+            self._rolls = rolls
+            self._let_roll(rolls)
 
     @property
     def poses(self) -> FloatArray:
@@ -173,6 +181,9 @@ class World(ABC):
 
     @abstractmethod
     def _advance(self) -> None: ...
+
+    @abstractmethod
+    def _let_roll(self, rolls: bool) -> None: ...
 
     @abstractmethod
     def _coordinates(self) -> FloatArray:
@@ -208,6 +219,7 @@ class WarpWorld(World):
         with wp.ScopedCapture(device="cpu") as capture:
             self._record()
         self._graph = capture.graph
+        self._frictions = np.array(self._solver.mjw_model.geom_friction.numpy())
 
     @property
     def velocities(self) -> FloatArray:
@@ -234,6 +246,9 @@ class WarpWorld(World):
         if any(_array(observed.overflow).any() for observed in self._observables):
             raise ContactOverflow
 
+    def _let_roll(self, rolls: bool) -> None:
+        self._solver.mjw_model.geom_friction.assign(_without_roll(self._frictions) if rolls else self._frictions)
+
     def _coordinates(self) -> FloatArray:
         return _array(self._states[0].body_q)
 
@@ -249,6 +264,7 @@ class MujocoWorld(World):
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep = timestep
         self._centres = np.array([body.mass.centre for body in bodies])
+        self._frictions = np.array(self._model.geom_friction)
 
     @property
     def velocities(self) -> FloatArray:
@@ -274,23 +290,33 @@ class MujocoWorld(World):
         if any(self._data.warning[kind].number for kind in full):
             raise ContactOverflow
 
+    def _let_roll(self, rolls: bool) -> None:
+        self._model.geom_friction[:] = _without_roll(self._frictions) if rolls else self._frictions
+
     def _coordinates(self) -> FloatArray:
         return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]
 
 
-def run_to_rest(world: World, *, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> Outcome:
+def run_to_rest(
+    world: World,
+    *,
+    max_time: float,
+    bounds: tuple[FloatArray, FloatArray],
+    observe: Callable[[float, FloatArray], None] = lambda time, poses: None,
+) -> Outcome:
     """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
 
     At rest every body is slow for a quarter of a second, and no surface moves by half a millimetre in the second that
-    begins with it.
+    begins with it. From that quarter on nothing rolls with friction, which would let a box balance on its edge.
 
     Args:
         world: Changed in place.
         max_time: When they must have come to rest [s].
         bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+        observe: Told the time [s] and the poses (N, 4, 4) after each advance.
     """
     try:
-        return _run_to_rest(world, max_time, bounds)
+        return _run_to_rest(world, max_time, bounds, observe)
     except ContactOverflow:
         reason = OVERFLOW
     except _Refused as refused:
@@ -302,13 +328,20 @@ class _Refused(Exception):
     """Why a drop cannot be used."""
 
 
-def _run_to_rest(world: World, max_time: float, bounds: tuple[FloatArray, FloatArray]) -> Outcome:
+def _run_to_rest(
+    world: World,
+    max_time: float,
+    bounds: tuple[FloatArray, FloatArray],
+    observe: Callable[[float, FloatArray], None],
+) -> Outcome:
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
     past: deque[FloatArray] = deque([world.poses], maxlen=mean_frames + 1)
     since, rest, motion = 0.0, world.poses, 0.0
     while world.time - since < _WATCH_TIME:
+        world.let_roll(world.time - since >= _QUIET_TIME)
         poses = _advance_within(world, bounds)
         past.append(poses)
+        observe(world.time, poses)
         speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
         fast = speed >= QUIET_SPEED or spin >= QUIET_SPIN
         motion = max(motion, _surface_motion(world.bodies, rest, poses))
@@ -352,6 +385,13 @@ def _array(values: Any) -> FloatArray:
 
 def _assign(array: Any, values: FloatArray) -> None:
     array.assign(values.astype(np.float32))
+
+
+def _without_roll(frictions: NDArray[Any]) -> NDArray[Any]:
+    """Slide, spin and roll friction (..., 3) with next to none of the last."""
+    changed = frictions.copy()
+    changed[..., 2] = np.minimum(changed[..., 2], _LEAST_FRICTION)
+    return changed
 
 
 def _surface_motion(bodies: Sequence[Body], before: FloatArray, after: FloatArray) -> float:

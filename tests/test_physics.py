@@ -209,6 +209,26 @@ def test_a_box_ends_on_a_face_however_it_is_dropped(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_box_does_not_balance_on_its_edge(stepper):
+    """The centre of mass stands above the edge at a tilt of atan(d / b), where only roll friction could hold it."""
+    from mitsplat.physics import run_to_rest
+
+    breadth, depth = 0.03, 0.009
+    slab = trimesh.creation.box((breadth, breadth, depth))
+    upright = Rotation.from_euler("y", 90, degrees=True)
+    poses = []
+    for i, degrees in enumerate((-0.3, 0.3)):
+        tilt = np.arctan(depth / breadth) + np.radians(degrees)
+        height = (breadth * np.cos(tilt) + depth * np.sin(tilt)) / 2
+        poses.append(pose_at((0, 0.1 * i, height), Rotation.from_euler("y", tilt) * upright))
+    world = world_of(stepper, [body_of(slab)] * 2, [table()], poses)
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    # Back onto the narrow face, and over onto the large one.
+    np.testing.assert_allclose(np.abs(outcome.poses[:, 2, 2]), [0, 1], atol=1e-3)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_stack_of_five_stands(stepper):
     """Drift below 0.1 mm in 5 s."""
     box = trimesh.creation.box((0.04, 0.04, 0.02))

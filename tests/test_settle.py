@@ -17,7 +17,7 @@ from scipy.stats import kstest
 
 from mitsplat.errors import InputError
 from mitsplat.scene import load_scene
-from mitsplat.settle import Layout, settle_layout, settle_layouts, warp_settings
+from mitsplat.settle import Layout, replay_layout, settle_layout, settle_layouts, warp_settings
 
 STEPPERS = ("warp", "mujoco")
 
@@ -105,6 +105,21 @@ def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
     assert certificate.support_gap < 1e-3
     assert certificate.standoff < 1e-6  # boxes are their own pieces
     assert certificate.attempts == len(certificate.refused) + 1
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_replay_is_the_drop_that_was(stepper, scene_data, write_scene):
+    """It starts high, and where it ends no object is farther than 2 mm from where the layout has it."""
+    scene_data["settle"] = {"stepper": stepper}
+    scene = load_scene(write_scene(scene_data))
+    layout = settle_layout(scene, 0, cached=False)
+    *moments, last = replay_layout(scene, layout, interval=0.04)
+    assert last is layout
+    positions = np.array([[one.world_from_object[:3, 3] for one in moment.instances] for moment in moments])
+    resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
+    assert len(moments) == int(layout.certificate.time_to_rest / 0.04) + 1
+    assert positions[0, :, 2].min() > resting[:, 2].max()
+    np.testing.assert_allclose(positions[-1], resting, atol=2e-3)
 
 
 def test_layouts_survive_json(scene_data, write_scene):

@@ -157,7 +157,7 @@ def settle_layouts(
     """Settle many layouts over processes, in the order in which they are finished; see :func:`settle_layout`.
 
     Several layouts in one simulation (Newton's worlds) cost as much each as one alone on a CPU, and would wait for the
-    slowest (``python -m benchmarks.settle --worlds``).
+    slowest (``python -m benchmarks.settle worlds``).
     """
     from mitsplat.engine import run_frames
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import mitsplat as ms
 from mitsplat.audit import audit_dataset
 from mitsplat.scene import random_stream
-from mitsplat.settle import Instance, Layout, RestCertificate
+from mitsplat.settle import NOTHING_TO_REST, Instance, Layout
 from mitsplat.spec import FORMATS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +42,7 @@ def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
         kind = scene.class_names.index(scene.assets[asset].class_name)
         # Some ids need sixteen bits.
         instances.append(Instance(i + 1 if index % 2 else 300 * (i + 1), asset, kind, pose))
-    return Layout(index, tuple(instances), RestCertificate(False, 0, 0, 0, 0, 0, 0, 1))
+    return Layout(index, tuple(instances), NOTHING_TO_REST)
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 import mitsplat as ms
 from mitsplat.label import LabelRules, Truth, label_instances
-from mitsplat.settle import Instance, Layout, RestCertificate
+from mitsplat.settle import NOTHING_TO_REST, Instance, Layout
 from mitsplat.spec import FORMATS
 from mitsplat.writers import Catalogue, write_frame
 
@@ -49,7 +49,7 @@ def grid(scene: ms.Scene) -> Layout:
         pose[:3, 3] = (i % 5 - 2) * 0.055, (i // 5 - 1) * 0.055 - 0.08, -mesh.bounds[0][2] if mesh is not None else 0
         kind = scene.class_names.index(scene.assets[asset].class_name)
         instances.append(Instance(i + 1, asset, kind, pose))
-    return Layout(0, tuple(instances), RestCertificate(True, 0, 0, 0, 0, 0, 0, 1))
+    return Layout(0, tuple(instances), NOTHING_TO_REST)
 
 
 def truth_of(frame: ms.Frame) -> Truth:

@@ -19,7 +19,7 @@ from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, run_to_rest
 from mitsplat.place import Item, draw_poses, fixed_pose
 from mitsplat.scene import Scene, bin_walls
-from mitsplat.settle import FloatArray, Instance, Layout, Progress, RestCertificate
+from mitsplat.settle import NOTHING_TO_REST, FloatArray, Instance, Layout, Progress, RestCertificate
 from mitsplat.spec import PILE_HEIGHT, Region
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
@@ -29,22 +29,6 @@ _DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scen
 _NEAREST = 5e-4  # what is scattered is farther apart than this [m]
 _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
-
-
-_EMPTY = RestCertificate(
-    rested=True,
-    inside=True,
-    overflow=False,
-    time_to_rest=0.0,
-    max_speed=0.0,
-    max_spin=0.0,
-    surface_motion=0.0,
-    collider_penetration=0.0,
-    pair_penetration=0.0,
-    support_gap=0.0,
-    standoff=0.0,
-    attempts=0,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +88,7 @@ class Drop:
         spec, refused, capacity = self.scene.spec, [], 1.0
         assets, given = self._draw_objects(index)
         if not assets:
-            return Layout(index, (), _EMPTY)
+            return Layout(index, (), NOTHING_TO_REST)
         frictions = self._draw_frictions(index)
         for attempt in range(spec.settle.attempts):
             start = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt), given)

@@ -78,6 +78,23 @@ class RestCertificate:
     refused: tuple[str, ...] = ()
 
 
+NOTHING_TO_REST = RestCertificate(
+    rested=True,
+    inside=True,
+    overflow=False,
+    time_to_rest=0.0,
+    max_speed=0.0,
+    max_spin=0.0,
+    surface_motion=0.0,
+    collider_penetration=0.0,
+    pair_penetration=0.0,
+    support_gap=0.0,
+    standoff=0.0,
+    attempts=0,
+)
+"""Of a layout that physics had no part in: one without objects, or one whose poses are made up."""
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """Where the objects of one layout lie."""

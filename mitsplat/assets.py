@@ -83,6 +83,9 @@ class AssetSpec(BaseModel):
     keypoints: dict[str, tuple[float, float, float]] | None = Field(
         None, description="Named points in the units and axes of the files, for pose labels."
     )
+    white: Positive | None = Field(
+        None, description="Irradiance under which a white surface has the colour 1 in the splats [W/m^2]; if known."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> AssetSpec:
@@ -114,6 +117,8 @@ class Asset:
         capture_light: Light under which the colours were captured: ``uniform`` (a light tent, a turntable in the
             shade) is relit by the scene's lights, ``scene`` (already lit as it will be shown) is only shadowed.
         keypoints: Named points in the asset's frame [m], for pose labels.
+        white: Irradiance [W/m^2] of the scene's lights under which a white surface has the colour 1 in an environment's
+            splats: pi where it was baked. None where the exposure is unknown, as in photographs.
         folder: Where it was read from, or None.
     """
 
@@ -130,6 +135,7 @@ class Asset:
     specular: float = 0.04
     capture_light: Literal["uniform", "scene"] = "uniform"
     keypoints: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    white: float | None = None
     folder: Path | None = field(default=None, repr=False)
 
     @classmethod
@@ -162,6 +168,7 @@ class Asset:
             specular=spec.specular,
             capture_light=spec.capture_light,
             keypoints=spec.keypoints or {},
+            white=spec.white,
             folder=folder,
         )
         metres_from_file = np.eye(4)
@@ -197,6 +204,7 @@ class Asset:
                 specular=self.specular,
                 capture_light=self.capture_light,
                 keypoints=dict(stored.keypoints) or None,
+                white=self.white,
             )
         except ValidationError as error:
             first = error.errors()[0]

@@ -25,7 +25,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.fit import FitSettings, Picture, fit_splats
 from mitsplat.mesh import convex_pieces
-from mitsplat.plugins.light import Occluder, Proxies
+from mitsplat.plugins.proxies import Occluder, Proxies
 from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
@@ -181,6 +181,7 @@ def bake_asset(
         roughness=float(np.average([part.roughness for part in parts], weights=area)),
         specular=float(np.average([part.specular for part in parts], weights=area)),
         capture_light="uniform" if isinstance(light, str) else "scene",
+        white=None if isinstance(light, str) else float(np.pi),
     )
     if not settings.verify_views:
         return BakeResult(asset, float("nan"), float("nan"))

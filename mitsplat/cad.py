@@ -16,7 +16,7 @@ from trimesh.visual.material import PBRMaterial
 
 from mitsplat.errors import InputError
 from mitsplat.scene import LightSpec
-from mitsplat.surfels import CREASE_ANGLE
+from mitsplat.surfels import corner_normals
 from mitsplat.trace import decode_srgb
 
 FloatArray = npt.NDArray[np.float64]
@@ -77,23 +77,6 @@ class Part:
         barycentric = rng.dirichlet(np.ones(3), _DETAIL_SAMPLES)
         deviation = (self._face_colours(barycentric) ** (1 / 2.2)).std(axis=1).max(axis=1)
         return np.asarray(1.0 + gain * np.clip(deviation / _DETAIL_CONTRAST, 0.0, 1.0))
-
-    def corner_normals(self) -> FloatArray:
-        """Normals (F, 3, 3) at face corners, smooth except across creases, weighted by area."""
-        mesh = self.mesh
-        corner = np.repeat(np.arange(len(mesh.faces)), 3)
-        incidence = mesh.faces_sparse.astype(np.float64)
-        pairs = (incidence.T @ incidence).tocoo()
-        alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(CREASE_ANGLE)
-        row, col = pairs.row[alike], pairs.col[alike]
-        normals = np.zeros((len(mesh.faces), 3, 3))
-        weighted = mesh.face_normals * mesh.area_faces[:, None]
-        for k in range(3):
-            shares = (mesh.faces[col] == mesh.faces[row, k][:, None]).any(axis=1)
-            np.add.at(normals[:, k], row[shares], weighted[col[shares]])
-        length = np.linalg.norm(normals, axis=2, keepdims=True)
-        flat = mesh.face_normals[corner].reshape(-1, 3, 3)
-        return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))
 
 
 def read_parts(
@@ -198,7 +181,7 @@ def _mitsuba_mesh(part: Part, bsdf: dict[str, Any]) -> mi.Mesh:
         mesh.add_attribute("vertex_color", 3, np.ravel(part.colours).astype(np.float32))
     buffers = mi.traverse(mesh)
     buffers["vertex_positions"] = np.ravel(part.mesh.triangles).astype(np.float32)
-    buffers["vertex_normals"] = np.ravel(part.corner_normals()).astype(np.float32)
+    buffers["vertex_normals"] = np.ravel(corner_normals(part.mesh)).astype(np.float32)
     if part.uv is not None:
         buffers["vertex_texcoords"] = np.ravel(part.uv * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
     buffers["faces"] = np.arange(3 * count, dtype=np.uint32)

@@ -172,6 +172,7 @@ class _Studio:
             quality=quality,
             shadow="none" if scene.spec.composite.shadow == "none" else "traced",
             reference=reference_point(scene),
+            white=scene.environment.white if scene.environment is not None else None,
         )
         self.static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None

@@ -67,8 +67,10 @@ def make_integrator(
     *,
     quality: str | Quality = "balanced",
     shadow: str = "traced",
-    shadow_samples: int = 8,
+    shadow_samples: int = 64,
+    shadow_error: float = 0.03,
     reference: npt.ArrayLike = (0.0, 0.0, 0.0),
+    white: float | None = None,
 ) -> Any:
     """The integrator ``splat_proxy``, which keeps what it uploaded as long as it sees the same shapes."""
     ensure_variant()
@@ -77,7 +79,9 @@ def make_integrator(
             "type": "splat_proxy",
             "shadow": shadow,
             "shadow_samples": shadow_samples,
+            "shadow_error": shadow_error,
             "reference": [float(v) for v in np.asarray(reference)],
+            "white": white or 0.0,
         }
     )
     integrator.quality = resolve_quality(quality)

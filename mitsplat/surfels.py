@@ -410,3 +410,20 @@ class _CreaseIndex:
         position = np.einsum("nkd,nkd->nk", from_start, self.units[segment])
         inside = np.clip(position, 0.0, self.lengths[segment])
         return inside[..., None] * self.units[segment] - from_start, inside == position
+
+
+def corner_normals(mesh: trimesh.Trimesh) -> FloatArray:
+    """Unit normals (F, 3, 3) at the corners of faces, smooth except across creases, weighted by area."""
+    corner = np.repeat(np.arange(len(mesh.faces)), 3)
+    incidence = mesh.faces_sparse.astype(np.float64)
+    pairs = (incidence.T @ incidence).tocoo()
+    alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(CREASE_ANGLE)
+    row, col = pairs.row[alike], pairs.col[alike]
+    normals = np.zeros((len(mesh.faces), 3, 3))
+    weighted = mesh.face_normals * mesh.area_faces[:, None]
+    for k in range(3):
+        shares = (mesh.faces[col] == mesh.faces[row, k][:, None]).any(axis=1)
+        np.add.at(normals[:, k], row[shares], weighted[col[shares]])
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    flat = mesh.face_normals[corner].reshape(-1, 3, 3)
+    return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))

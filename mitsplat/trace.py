@@ -56,7 +56,8 @@ def render_mesh(
 ) -> tuple[FloatArray, FloatArray]:
     """Path-traced radiance (H, W, 3) of a pinhole ``camera``, black where nothing is, and coverage (H, W) in [0, 1].
 
-    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid.
+    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it is
+    encoded, because the mean of encoded noise is too dark; only the background counts encoded, as splats are blended.
     """
     side = max(1, round(samples**0.5))
     fine = camera.resized(camera.width * side, camera.height * side)
@@ -68,10 +69,11 @@ def render_mesh(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.broadcast_to(camera.centre, directions.shape)
     radiance, hit = trace_radiance(scene, origins, directions, samples=1, bounces=bounces, seed=seed, group=side * side)
-    radiance = np.where(hit[:, None], radiance, 0.0).reshape(camera.height, camera.width, side * side, 3)
-    # Pixels are averaged encoded, as splats are blended: light spilling over edges is no error of the bake.
-    mean = encode_srgb(radiance).mean(axis=2)
-    return decode_srgb(mean), hit.reshape(camera.height, camera.width, side * side).mean(axis=2)
+    pixels = camera.height, camera.width, side * side
+    cover = hit.reshape(pixels).mean(axis=2)
+    total = np.where(hit[:, None], radiance, 0.0).reshape(*pixels, 3).mean(axis=2)
+    mean = total / np.maximum(cover, 1e-9)[..., None]
+    return decode_srgb(encode_srgb(mean) * cover[..., None]), cover
 
 
 def encode_srgb(linear: npt.ArrayLike) -> FloatArray:

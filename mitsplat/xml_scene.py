@@ -53,6 +53,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
             "quality": scene.spec.quality,
             "shadow": "none" if scene.spec.composite.shadow == "none" else "traced",
             "reference": list(reference_point(scene)),
+            "white": (scene.environment.white if scene.environment is not None else None) or 0.0,
         },
         "sensor": describe_sensor(plan.camera),
         **shapes,

@@ -7,135 +7,43 @@ from scratch but a factor per visible point x with normal n,
     captured under uniform light:       ratio = E(x, n | static and dynamic occluders) / E_ref
 
 with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first is exactly 1 where no dynamic
-object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance of an unoccluded
-horizontal surface at the scene's reference point: an object taken in a light tent keeps its colours there, and is
-darker where less light arrives.
+object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance under which the
+colours of the surroundings are exposed: an object taken in a light tent keeps its colours there, and is darker where
+less light arrives.
+
+Rays are spent where they are needed. A few towards the dynamic objects alone find the points whose light may differ;
+those get ``FIRST_RAYS``, and as many more as the wanted standard error of the filtered ratio asks for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-import trimesh
 
+from mitsplat.plugins.emitters import Emitters, receiver
+from mitsplat.plugins.light_filter import Estimate, LightFilter
+from mitsplat.plugins.proxies import Proxies
 from mitsplat.plugins.rays import View
 
 BLOCK = 8
 """Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
 that follows averages a stratified set."""
 
-R2 = (0.7548776662466927, 0.5698402909980532)
-"""Additive recurrence of the two-dimensional golden ratio (Roberts 2018, "The unreasonable effectiveness of quasirandom
-sequences")."""
+R2 = (3242174889, 2447445414)
+"""Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
+effectiveness of quasirandom sequences")."""
 
-NOISE_LIMIT = 6.0
-"""Squared standard deviations within which two neighbours' shadows may be averaged."""
+SEARCH_RAYS = 2
+"""Rays per pixel that look for dynamic objects in the light, of which a tile and its neighbours have 1152."""
 
-GUESS_WEIGHT = 1e-3
-"""How much a point counts that is not known to lie on a surface, beside ones that are."""
+FAINT = 0.25
+"""Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced."""
 
-OPEN_LATTICE = (377, 233)
-"""Points and generator of the Fibonacci lattice that integrates light without occluders: consecutive Fibonacci numbers
-give the best two-dimensional lattices (Niederreiter 1992, section 5.3), here within 0.5 % for two lights."""
-
-REFERENCE_LATTICE = (4181, 2584)
-
-
-@dataclass(frozen=True, eq=False)
-class Occluder:
-    """A proxy surface in world space.
-
-    Attributes:
-        mesh: Surface [m].
-        instance: Instance id, 0 for the environment.
-        dynamic: Whether its shadow is missing in what was captured.
-    """
-
-    mesh: trimesh.Trimesh
-    instance: int
-    dynamic: bool
-
-
-class Proxies:
-    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones."""
-
-    def __init__(self, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> None:
-        """Proxies from meshes, and visible Mitsuba shapes, which are static."""
-        self.static = _TraceScene.build([o for o in occluders if not o.dynamic], visible)
-        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic])
-
-    def nearest(self, ray: Any) -> tuple[Hit, Hit]:
-        """What rays meet first, and what they would meet without the dynamic proxies."""
-        static = _TraceScene.nearest(self.static, ray, Hit.nothing())
-        return _TraceScene.nearest(self.dynamic, ray, static), static
-
-
-@dataclass(frozen=True, eq=False)
-class Hit:
-    """Where rays meet a proxy.
-
-    Attributes:
-        distance: Along the ray [m], infinite for a miss.
-        normal: Unit normal towards the ray's origin.
-        instance: Instance id, 0 for a miss.
-    """
-
-    distance: Any
-    normal: Any
-    instance: Any
-
-    @classmethod
-    def nothing(cls) -> Hit:
-        """A miss."""
-        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.UInt32(0))
-
-
-@dataclass(frozen=True, eq=False)
-class _TraceScene:
-    """All meshes as one (or None), with the instance id of every triangle, beside visible shapes."""
-
-    scene: Any
-    mesh: Any
-    instances: Any
-
-    def nearest(self: _TraceScene | None, ray: Any, other: Hit) -> Hit:
-        """The nearer of ``other`` and what the rays meet here."""
-        if self is None:
-            return other
-        si = self.scene.ray_intersect(ray)
-        closer = si.t < other.distance
-        facing = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
-        proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
-        number = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)
-        return Hit(
-            dr.select(closer, si.t, other.distance),
-            dr.select(closer, facing, other.normal),
-            dr.select(closer, number, other.instance),
-        )
-
-    @classmethod
-    def build(cls, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> _TraceScene | None:
-        others = {f"visible_{i}": shape for i, shape in enumerate(visible)}
-        occluders = [o for o in occluders if len(o.mesh.faces)]
-        if not occluders:
-            nothing = mi.UInt32([0])
-            return cls(mi.load_dict({"type": "scene", **others}), None, nothing) if others else None
-        vertices, faces = trimesh.util.append_faces(
-            [o.mesh.vertices for o in occluders], [o.mesh.faces for o in occluders]
-        )
-        mesh = mi.Mesh("proxies", len(vertices), len(faces))
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
-        params["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
-        params.update()
-        instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
-        scene = mi.load_dict({"type": "scene", "mesh": mesh, **others})
-        return cls(scene, mi.ShapePtr(mesh), mi.UInt32(instances.astype(np.uint32)))
+FIRST_RAYS = 4
+"""Rays per point after which its error is first estimated."""
 
 
 @dataclass(eq=False)
@@ -144,6 +52,8 @@ class Surface:
 
     Attributes:
         position, normal: Point [m] and unit normal towards the camera.
+        face: Unit normal of the proxy's triangle.
+        lift: Displacement [m] from the triangle to the smooth surface that it stands for.
         to_camera: Unit vector towards the camera.
         offset: How far shadow rays start off the surface [m].
         relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
@@ -154,6 +64,8 @@ class Surface:
 
     position: Any
     normal: Any
+    face: Any
+    lift: Any
     to_camera: Any
     offset: Any
     relit: Any
@@ -162,9 +74,36 @@ class Surface:
     known: Any
     valid: Any
 
+    def at(self, index: Any) -> Surface:
+        """The points of some pixels."""
+        values = [getattr(self, f.name) for f in fields(self)]
+        return Surface(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How many shadow rays are spent.
+
+    Attributes:
+        error: Standard error of the filtered light ratio that rays are spent for; 0 spends ``most`` everywhere.
+        most: Most rays per pixel.
+    """
+
+    error: float
+    most: int
+
 
 def light_factor(
-    scene: Any, proxies: Proxies, surface: Surface, group: Any, view: View, *, samples: int, seed: int, reference: Any
+    scene: Any,
+    proxies: Proxies,
+    surface: Surface,
+    group: Any,
+    view: View,
+    *,
+    accuracy: Accuracy,
+    seed: int,
+    point: tuple[float, ...],
+    reference: Any,
 ) -> tuple[Any, Any]:
     """Light factor and highlight (Color3f) of every visible point, see the module docstring.
 
@@ -178,94 +117,157 @@ def light_factor(
         surface: Visible points of an image.
         group: Instance id per pixel; light is not averaged across its borders.
         view: Camera.
-        samples: Shadow rays per pixel.
+        accuracy: How many rays to spend.
         seed: Offset into the low-discrepancy sequence.
+        point: Where in the scene rays are shared out among emitters by how much light they send [m].
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
     """
-    lit, base, shine, squares = _trace_light(scene, proxies, surface, view.width, samples=samples, seed=seed)
-    lit, base, shine = _smooth_light(lit, base, shine, squares, surface, group, view)
+    emitters = Emitters(scene, point)
+    tracer = _Tracer(emitters, proxies, surface, view.width, seed)
+    needed = surface.valid & (surface.relit | (surface.specular > 0))
+    if accuracy.error > 0:
+        rays = min(FIRST_RAYS, accuracy.most)
+        enough = FAINT * accuracy.error * SEARCH_RAYS * (3 * BLOCK) ** 2
+        needed = surface.valid & _spread(dr.select(needed, SEARCH_RAYS, tracer.search()), enough, view)
+    else:
+        rays = accuracy.most
+        needed = mi.Bool(surface.valid)
+    dr.eval(needed)
+    light, highlight = mi.Color3f(1), mi.Color3f(0)
+    index = dr.compress(needed)
+    if not dr.width(index):
+        return light, highlight
+    estimate = tracer.trace(index, Estimate.nothing(dr.width(surface.valid)), dr.opaque(mi.UInt32, rays))
+    light_filter = LightFilter(surface, group, view, index, needed)
+    if rays < accuracy.most:
+        wanted = light_filter.rays_for(estimate, accuracy.error)
+        # Doubled until enough: pixels with the same number of rays go together, so that no lane waits for another.
+        done = rays
+        while done < accuracy.most:
+            index_more = dr.gather(mi.UInt32, index, dr.compress(wanted > done))
+            if not dr.width(index_more):
+                break
+            extra = min(done, accuracy.most - done)
+            estimate = tracer.trace(index_more, estimate, dr.opaque(mi.UInt32, extra), first=done)
+            done += extra
+    lit, base, shine = light_filter.smooth(estimate)
     share = dr.select(base > 0, lit / base, 1)
-    factor = dr.select(surface.relit, share * _open_irradiance(scene, surface) / reference, share)
-    return dr.select(surface.valid, factor, 1), shine * (dr.pi / (samples * reference))
+    here = surface.at(index)
+    anew = dr.compress(here.relit)
+    if dr.width(anew):
+        own = here.at(anew)
+        relit = emitters.open_irradiance(receiver(own.position, own.normal), mi.Bool(own.valid)) / reference
+        scale = mi.Color3f(dr.full(mi.Float, 1, dr.width(index)))
+        dr.scatter(scale, relit, anew)
+        share *= scale
+    light = mi.Color3f(dr.full(mi.Float, 1, dr.width(surface.valid)))
+    highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(surface.valid)))
+    dr.scatter(light, share, index)
+    dr.scatter(highlight, shine * (dr.pi / reference), index)
+    return light, highlight
 
 
-def _trace_light(
-    scene: Any, proxies: Proxies, surface: Surface, width: int, *, samples: int, seed: int
-) -> tuple[Any, Any, Any, Any]:
-    """Sums over shadow rays: light that arrives, light to compare with, highlight; and squares of the second."""
-    count = dr.width(surface.valid)
-    pixel = dr.arange(mi.UInt32, count)
-    x, y = pixel % width, pixel // width
-    start = dr.opaque(mi.UInt32, seed * samples * BLOCK * BLOCK % (1 << 20)) + _bayer(x, y)
-    si = _receiver(surface.position, surface.normal)
-    origin = dr.fma(surface.normal, surface.offset, surface.position)
-    alpha2 = dr.square(dr.square(surface.roughness))
-    cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
+def _spread(found: Any, enough: float, view: View) -> Any:
+    """Whether enough was found in a pixel's tile of BLOCK x BLOCK pixels and those beside it.
 
-    def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
-        index = mi.Float((start + i * (BLOCK * BLOCK)) & 0xFFFFF) + 1.0
-        point = mi.Point2f(*[index * step - dr.floor(index * step) for step in R2])
-        sample, radiance = scene.sample_emitter_direction(si, point, False, surface.valid)
-        cosine = dr.dot(surface.normal, sample.d)
-        active = surface.valid & (cosine > 0) & (sample.pdf > 0)
-        ray = mi.Ray3f(origin, sample.d)
-        # The distance to a light at infinity comes from the extent of visible meshes, which proxies are not part of.
-        infinite = mi.has_flag(sample.emitter.flags(), mi.EmitterFlags.Infinite)
-        ray.maxt = dr.select(infinite, dr.inf, dr.maximum(sample.dist - 2 * surface.offset, 0))
-        blocked = mi.Bool(False)
-        if proxies.static is not None:
-            blocked = proxies.static.scene.ray_test(ray, active=active)
-        open_light = dr.select(active, radiance * cosine, 0)
-        static_light = dr.select(blocked, 0, open_light)
-        shadowed = mi.Bool(False)
-        if proxies.dynamic is not None:
-            shadowed = proxies.dynamic.scene.ray_test(ray, active=active & ~blocked)
-        light = dr.select(shadowed, 0, static_light)
-        compared = dr.select(surface.relit, open_light, static_light)
-        lit += light
-        base += compared
-        shine += light * _ggx(surface, sample.d, cosine, cos_camera, alpha2)
-        squares += dr.square(dr.sum(compared))
-        return i + 1, lit, base, shine, squares
-
-    rounds = dr.opaque(mi.UInt32, samples)
-    state = dr.zeros(mi.UInt32, count), mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.Float(0)
-    _, lit, base, shine, squares = dr.while_loop(state, lambda i, *_: i < rounds, body, label="light")
-    return lit, base, shine, squares
+    A pixel counts as often as its rays met something, and is enough alone where all of them did.
+    """
+    tiles_x, tiles_y = -(-view.width // BLOCK) + 2, -(-view.height // BLOCK) + 2
+    pixel = dr.arange(mi.UInt32, view.width * view.height)
+    tile = (pixel // view.width // BLOCK + 1) * tiles_x + pixel % view.width // BLOCK + 1
+    hits = dr.zeros(mi.Float, tiles_x * tiles_y)
+    alone = dr.opaque(mi.Float, enough)
+    value = dr.select(found < SEARCH_RAYS, mi.Float(found), alone)
+    dr.scatter_reduce(dr.ReduceOp.Add, hits, value, tile, found > 0)
+    beside = [dy * tiles_x + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    return sum((dr.gather(mi.Float, hits, mi.UInt32(mi.Int32(tile) + step)) for step in beside), mi.Float(0)) >= alone
 
 
-def _open_irradiance(scene: Any, surface: Surface) -> Any:
-    """Irradiance (Color3f) of relit points without any occluder, from the same directions for all."""
-    wanted = surface.relit & surface.valid
-    si = _receiver(surface.position, surface.normal)
+@dataclass(frozen=True, eq=False)
+class _Tracer:
+    """Shadow rays from the visible points of an image."""
 
-    def body(i: Any, total: Any) -> tuple[Any, Any]:
-        sample, radiance = scene.sample_emitter_direction(si, _lattice(i, OPEN_LATTICE), False, wanted)
-        return i + 1, total + radiance * dr.maximum(dr.dot(surface.normal, sample.d), 0)
+    emitters: Emitters
+    proxies: Proxies
+    surface: Surface
+    width: int
+    seed: int
 
-    rounds = dr.opaque(mi.UInt32, OPEN_LATTICE[0])
-    state = dr.zeros(mi.UInt32, dr.width(wanted)), mi.Color3f(0)
-    _, total = dr.while_loop(state, lambda i, total: wanted & (i < rounds), body, label="open light")
-    return total / OPEN_LATTICE[0]
+    def search(self) -> Any:
+        """How many of ``SEARCH_RAYS`` rays towards the light meet a dynamic proxy."""
+        if self.proxies.dynamic is None:
+            return mi.UInt32(0)
+        surface = self.surface
+        scene = self.proxies.dynamic.scene
+        start = self._start(dr.arange(mi.UInt32, dr.width(surface.valid)))
+        si = receiver(surface.position, surface.normal)
+        origin = _origin(surface)
+
+        def body(i: Any, found: Any) -> tuple[Any, Any]:
+            beam = self.emitters.sample(si, _sequence(start + i * (BLOCK * BLOCK)), surface.valid)
+            active = surface.valid & (dr.sum(beam.irradiance) > 0)
+            met = scene.ray_test(_shadow_ray(origin, beam, surface.offset), active=active)
+            return i + 1, found + dr.select(met, mi.UInt32(1), mi.UInt32(0))
+
+        rounds = dr.opaque(mi.UInt32, SEARCH_RAYS)
+        state = dr.zeros(mi.UInt32, dr.width(surface.valid)), mi.UInt32(0)
+        return dr.while_loop(state, lambda i, _: i < rounds, body, label="search")[1]
+
+    def trace(self, index: Any, before: Estimate, rays: Any, *, first: int = 0) -> Estimate:
+        """What ``rays`` more rays add to an estimate at the pixels ``index``, which have had ``first``."""
+        surface = self.surface.at(index)
+        start = self._start(index) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
+        si = receiver(surface.position, surface.normal)
+        origin = _origin(surface)
+        alpha2 = dr.square(dr.square(surface.roughness))
+        cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
+        static, dynamic = self.proxies.static, self.proxies.dynamic
+
+        def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
+            beam = self.emitters.sample(si, _sequence(start + i * (BLOCK * BLOCK)), surface.valid)
+            active = surface.valid & (dr.sum(beam.irradiance) > 0)
+            ray = _shadow_ray(origin, beam, surface.offset)
+            blocked = mi.Bool(False) if static is None else static.scene.ray_test(ray, active=active)
+            shadowed = mi.Bool(False) if dynamic is None else dynamic.scene.ray_test(ray, active=active & ~blocked)
+            static_light = dr.select(active & ~blocked, beam.irradiance, 0)
+            light = dr.select(shadowed, 0, static_light)
+            compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), static_light)
+            lit += light
+            base += compared
+            shine += light * _ggx(surface, beam.direction, cos_camera, alpha2)
+            squares += dr.square(dr.sum(compared))
+            return i + 1, lit, base, shine, squares
+
+        sums = [dr.gather(type(v), v, index) for v in (before.lit, before.base, before.shine, before.squares)]
+        state = dr.zeros(mi.UInt32, dr.width(index)), *sums
+        _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
+        count = dr.gather(mi.Float, before.rays, index) + mi.Float(rays)
+        return before.updated(index, *sums, count)
+
+    def _start(self, pixel: Any) -> Any:
+        start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
+        return start + _bayer(pixel % self.width, pixel // self.width)
 
 
-def _receiver(position: Any, normal: Any) -> Any:
-    """Surface interaction that light is sampled for."""
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
-    si.p = position
-    si.n = mi.Normal3f(normal)
-    si.sh_frame = mi.Frame3f(si.n)
-    return si
+def _origin(surface: Surface) -> Any:
+    """Where shadow rays start: on the smooth surface that the proxy stands for, and off the triangle itself."""
+    return surface.position + surface.lift + surface.face * surface.offset
 
 
-def _lattice(i: Any, lattice: tuple[int, int]) -> Any:
-    """Point ``i`` of a centred rank-1 lattice in the unit square."""
-    count, generator = lattice
-    return mi.Point2f((mi.Float(i) + 0.5) / count, (mi.Float(i * generator % count) + 0.5) / count)
+def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
+    ray = mi.Ray3f(origin, beam.direction)
+    ray.maxt = dr.maximum(beam.reach - 2 * offset, 0)
+    return ray
 
 
-def _ggx(surface: Surface, to_light: Any, cos_light: Any, cos_camera: Any, alpha2: Any) -> Any:
+def _sequence(i: Any) -> Any:
+    """Point ``i`` of the low-discrepancy sequence, to 24 bits however large ``i`` is."""
+    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in R2])
+
+
+def _ggx(surface: Surface, to_light: Any, cos_camera: Any, alpha2: Any) -> Any:
     """GGX microfacet reflection with height-correlated masking (Walter 2007; Heitz 2014) and Schlick's Fresnel term."""
+    cos_light = dr.dot(surface.normal, to_light)
     half = dr.normalize(to_light + surface.to_camera)
     cos_half = dr.dot(surface.normal, half)
     spread = dr.fma(cos_half * cos_half, alpha2 - 1, 1)
@@ -278,19 +280,6 @@ def _ggx(surface: Surface, to_light: Any, cos_light: Any, cos_camera: Any, alpha
     return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
 
 
-def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
-    """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
-
-    Where next to nothing reaches that element, it is the mean over all orientations, a quarter of the fluence.
-    """
-    i = dr.arange(mi.UInt32, REFERENCE_LATTICE[0])
-    si = _receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))
-    sample, radiance = scene.sample_emitter_direction(si, _lattice(i, REFERENCE_LATTICE), False)
-    irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
-    mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])
-    return dr.maximum(dr.select(irradiance > 1e-3 * mean, irradiance, mean), 1e-12)
-
-
 def _bayer(x: Any, y: Any) -> Any:
     """Rank of a pixel in an 8x8 ordered-dither matrix: neighbours take far-apart points of the sequence."""
     result = mi.UInt32(0)
@@ -298,65 +287,3 @@ def _bayer(x: Any, y: Any) -> Any:
         a, b = (x >> bit) & 1, (y >> bit) & 1
         result |= ((a ^ b) << (5 - 2 * bit)) | (b << (4 - 2 * bit))
     return result
-
-
-def _smooth_light(
-    lit: Any, base: Any, shine: Any, squares: Any, surface: Surface, group: Any, view: View, *, radius: int = 4
-) -> tuple[Any, Any, Any]:
-    """Average sums of light over neighbours on the same surface: a separable filter that keeps edges.
-
-    A neighbour counts where it belongs to the same ``group``, its normal agrees, it lies in the tangent plane, and its
-    share of light differs by no more than noise explains, so that a hard shadow keeps its edge while a penumbra becomes
-    smooth. A few rays per pixel say too little about that share; both are taken from 3 x 3 pixels. Their noise is that
-    of as many binary draws as equal weights would need for the same variance (Kish 1965, section 11.7). Equal sums stay
-    equal, so that the ratio of an unshadowed point is exactly 1.
-
-    At a silhouette a pixel may show one thing and its ray meet the proxy of another. Such a point has its light from
-    the known neighbours that show the same thing.
-    """
-    pixel = dr.arange(mi.UInt32, dr.width(group))
-    x, y = mi.Int32(pixel % view.width), mi.Int32(pixel // view.width)
-    footprint = surface.offset * 8
-
-    def average(values: list[Any], radius: int, alike: Callable[[Any, Any], Any] = lambda _, same: same) -> list[Any]:
-        for horizontal in (True, False):
-            weights = dr.select(surface.known, 1, GUESS_WEIGHT)
-            sums = [mi.Float(0) for _ in values]
-            for step in [s for r in range(1, radius + 1) for s in (-r, r)]:
-                nx, ny = (x + step, y) if horizontal else (x, y + step)
-                inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height) & surface.valid
-                other = mi.UInt32(ny * view.width + nx)
-                position = dr.gather(mi.Point3f, surface.position, other, inside)
-                normal = dr.gather(mi.Vector3f, surface.normal, other, inside)
-                same = inside & (dr.gather(mi.UInt32, group, other, inside) == group)
-                plane = dr.abs(dr.dot(surface.normal, position - surface.position))
-                known = dr.gather(mi.Bool, surface.known, other, same)
-                near = (dr.dot(surface.normal, normal) > 0.95) & (plane < footprint * abs(step)) & alike(other, same)
-                same &= (near & (known == surface.known)) | (known & ~surface.known)
-                # Halves at the ends: the filter spans one period of the dither, not one pixel more.
-                weight = dr.select(same, dr.select(known, 1.0, GUESS_WEIGHT), 0) * (0.5 if abs(step) == radius else 1.0)
-                weights += weight
-                # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
-                sums = [
-                    dr.fma(weight, dr.gather(mi.Float, v, other, same) - v, s)
-                    for v, s in zip(values, sums, strict=True)
-                ]
-            values = [v + s / weights for v, s in zip(values, sums, strict=True)]
-            dr.eval(values)
-        return values
-
-    values = [*lit, *base, *shine]
-    dr.eval(values, squares, surface.position, surface.normal)
-    near_lit, near_base, near_squares = average([dr.sum(lit), dr.sum(base), squares], 1)
-    share = dr.select(near_base > 0, near_lit / near_base, 1)
-    draws = dr.maximum(9 * dr.square(near_base) / dr.maximum(near_squares, 1e-20), 1)
-    likely = (share * draws + 0.5) / (draws + 1)
-    variance = likely * (1 - likely) / draws
-    dr.eval(share, variance)
-
-    def alike(other: Any, same: Any) -> Any:
-        noise = variance + dr.gather(mi.Float, variance, other, same)
-        return dr.square(dr.gather(mi.Float, share, other, same) - share) <= NOISE_LIMIT * noise
-
-    values = average(values, radius, alike)
-    return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])

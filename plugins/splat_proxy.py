@@ -12,8 +12,10 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
-from mitsplat.plugins.light import Hit, Occluder, Proxies, Surface, light_factor, reference_irradiance
+from mitsplat.plugins.emitters import reference_irradiance
+from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, march
+from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.tiles import CloudSet, Placement, bin_gaussians, merge_clouds
@@ -78,13 +80,23 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured.
          (Default: ``traced``)
 
+     * - shadow_error
+       - |float|
+       - Standard error of the light ratio for which shadow rays are spent, above 0 and below 1; or 0 for
+         ``shadow_samples`` at every pixel. (Default: 0.03)
+
      * - shadow_samples
        - |int|
-       - Shadow rays per pixel. (Default: 8)
+       - Most shadow rays per pixel. (Default: 64)
+
+     * - white
+       - |float|
+       - Irradiance under which uniformly captured colours are shown unchanged [W/m^2]: pi where radiance 1 is the white
+         of the surroundings, as in baked ones. (Default: 0, that of an unoccluded horizontal surface at ``reference``)
 
      * - reference
        - |point|
-       - Where an unoccluded horizontal surface shows uniformly captured colours unchanged. (Default: origin)
+       - A place in the middle of what is lit. (Default: origin)
 
     Every :monosp:`splats` shape is blended front to back per pixel; other meshes of the scene are visible as diffuse
     surfaces, hide splats behind them and are hidden by splats before them. The image holds linear R, G, B, A and the
@@ -97,7 +109,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
             <integrator type="splat_proxy">
                 <string name="quality" value="balanced"/>
-                <integer name="shadow_samples" value="16"/>
+                <float name="shadow_error" value="0.01"/>
             </integrator>
     """
 
@@ -107,7 +119,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow = _text(props, "shadow", "traced")
         if self.shadow not in ("traced", "none"):
             raise InputError(f"integrator 'splat_proxy': 'shadow' must be 'traced' or 'none' (got {self.shadow!r})")
-        self.shadow_samples = props.get("shadow_samples", 8)
+        self.shadow_error = _number(props, "shadow_error", 0.03)
+        if not 0 <= self.shadow_error < 1:
+            raise InputError(f"integrator 'splat_proxy': 'shadow_error' must be in [0, 1) (got {self.shadow_error!r})")
+        self.white = _number(props, "white", 0.0)
+        if not 0 <= self.white < np.inf:
+            raise InputError(f"integrator 'splat_proxy': 'white' must be >= 0 (got {self.white!r})")
+        self.shadow_samples = props.get("shadow_samples", 64)
         if type(self.shadow_samples) is not int or not 1 <= self.shadow_samples <= 4096:
             raise InputError(
                 f"integrator 'splat_proxy': 'shadow_samples' must be from 1 to 4096 (got {self.shadow_samples!r})"
@@ -165,16 +183,16 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             surface = _surface(contents, view, rays, alpha, depth, instance, hit, static)
             if behind:
                 surface.relit |= front
-            reference = reference_irradiance(scene, self.reference)
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
                 surface,
                 instance,
                 view,
-                samples=self.shadow_samples,
+                accuracy=Accuracy(self.shadow_error, self.shadow_samples),
                 seed=seed,
-                reference=reference,
+                point=self.reference,
+                reference=self._white(scene),
             )
         layers = {
             "rgb": colour * light + highlight * alpha,
@@ -208,6 +226,10 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
         return proxy_silhouettes(proxies, view)
 
+    def _white(self, scene: Any) -> Any:
+        """Irradiance (Color3f) that the colours of uniformly captured objects stand for."""
+        return mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
+
     def _trace_splats(self, contents: _Contents, view: View, z_max: Any | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
@@ -232,7 +254,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         number = {id(splats): i for i, splats in enumerate(distinct)}
         placements = tuple(Placement(number[id(c.splats)], c.world_from_splats, c.instance) for c in carriers)
         occluders = [
-            Occluder(c.proxy.copy().apply_transform(c.world_from_splats), c.instance, c.dynamic)
+            Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats)
             for c in carriers
             if c.proxy is not None
         ]
@@ -299,7 +321,8 @@ def _surface(
     behind = instance == 0
     same = dr.select(behind, static.distance < dr.inf, met & known)
     proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
-    normal = dr.select(behind, static.normal, hit.normal)
+    shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
+    towards = mi.Normal3f(-rays.d)
     # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
     on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
     z = dr.select(on_proxy, proxy_depth, depth)
@@ -308,7 +331,9 @@ def _surface(
     reach = dr.max(dr.abs(position))
     return Surface(
         position=position,
-        normal=mi.Vector3f(dr.select(same, normal, mi.Normal3f(-rays.d))),
+        normal=mi.Vector3f(dr.select(same, shown[0], towards)),
+        face=mi.Vector3f(dr.select(same, shown[1], towards)),
+        lift=dr.select(on_proxy, shown[2], 0),
         to_camera=-rays.d,
         offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
         relit=dr.gather(mi.Bool, contents.relit, instance),
@@ -341,6 +366,13 @@ def view_of(sensor: Any) -> View:
     pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     near = float(np.array(params["near_clip"]).ravel()[0])
     return View(width, height, focal, focal, width * (0.5 + shift[0]), height * (0.5 + shift[1]), pose, (), near)
+
+
+def _number(props: mi.Properties, name: str, default: float) -> float:
+    value = props.get(name, default)
+    if type(value) not in (int, float):
+        raise InputError(f"integrator 'splat_proxy': {name!r} must be a number (got {value!r})")
+    return float(value)
 
 
 def _text(props: mi.Properties, name: str, default: str) -> str:

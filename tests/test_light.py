@@ -40,7 +40,7 @@ def slab(extent: float = 1.0, top: float = 0.0) -> trimesh.Trimesh:
 
 
 def render(shapes: dict[str, Any], camera: Camera, *, samples: int = 64, **options: Any) -> Layers:
-    integrator = make_integrator(shadow_samples=samples, **options)
+    integrator = make_integrator(shadow_samples=samples, shadow_error=0, **options)
     return render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), camera)
 
 

@@ -1,0 +1,153 @@
+"""Proxy surfaces that rays are traced against: what stands in the light, and where light arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.surfels import corner_normals
+
+
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """A proxy surface.
+
+    Attributes:
+        mesh: Surface in its own frame [m].
+        instance: Instance id, 0 for the environment.
+        dynamic: Whether its shadow is missing in what was captured.
+        world_from_mesh: Where it is: a similarity transform, shape (4, 4).
+    """
+
+    mesh: trimesh.Trimesh
+    instance: int
+    dynamic: bool
+    world_from_mesh: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
+class Hit:
+    """Where rays meet a proxy.
+
+    Attributes:
+        distance: Along the ray [m], infinite for a miss.
+        face: Unit normal of the triangle, towards the ray's origin.
+        normal: The same of the smooth surface that the triangles stand for.
+        lift: Displacement from the triangle to that surface [m], where it bulges out; else zero.
+        instance: Instance id, 0 for a miss.
+    """
+
+    distance: Any
+    face: Any
+    normal: Any
+    lift: Any
+    instance: Any
+
+    @classmethod
+    def nothing(cls) -> Hit:
+        """A miss."""
+        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0))
+
+
+class Proxies:
+    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones."""
+
+    def __init__(self, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> None:
+        """Proxies from meshes, and visible Mitsuba shapes, which are static."""
+        self.static = _TraceScene.build([o for o in occluders if not o.dynamic], visible)
+        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic])
+
+    def nearest(self, ray: Any) -> tuple[Hit, Hit]:
+        """What rays meet first, and what they would meet without the dynamic proxies."""
+        static = _TraceScene.nearest(self.static, ray, Hit.nothing())
+        return _TraceScene.nearest(self.dynamic, ray, static), static
+
+
+@dataclass(frozen=True, eq=False)
+class _TraceScene:
+    """All meshes as one (or None), with the instance id of every triangle, beside visible shapes."""
+
+    scene: Any
+    mesh: Any
+    instances: Any
+    corners: Any
+    normals: Any
+
+    def nearest(self: _TraceScene | None, ray: Any, other: Hit) -> Hit:
+        """The nearer of ``other`` and what the rays meet here."""
+        if self is None:
+            return other
+        si = self.scene.ray_intersect(ray)
+        closer = si.t < other.distance
+        proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
+        number = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)
+        flip = dr.select(dr.dot(si.n, ray.d) > 0, -1.0, 1.0)
+        normal, lift = self._smooth(si, flip, proxy)
+        face = si.n * flip
+        return Hit(
+            dr.select(closer, si.t, other.distance),
+            dr.select(closer, face, other.face),
+            dr.select(closer, dr.select(proxy, normal, face), other.normal),
+            dr.select(closer, dr.select(proxy, lift, 0), other.lift),
+            dr.select(closer, number, other.instance),
+        )
+
+    def _smooth(self, si: Any, flip: Any, proxy: Any) -> tuple[Any, Any]:
+        """Interpolated normal, and the way to the surface that bulges out from a triangle's corners.
+
+        That surface is the mean of the projections on the corners' tangent planes: light that grazes it is not shadowed
+        by the triangles next to it (Hanika 2021, "Hacking the Shadow Terminator", Ray Tracing Gems II, chapter 4).
+        """
+        weights = 1 - si.uv.x - si.uv.y, si.uv.x, si.uv.y
+        normal, lift = mi.Normal3f(0), mi.Vector3f(0)
+        for corner, weight in enumerate(weights):
+            index = si.prim_index * 3 + corner
+            own = dr.gather(mi.Normal3f, self.normals, index, proxy) * flip
+            above = dr.dot(dr.gather(mi.Point3f, self.corners, index, proxy) - si.p, own)
+            normal += own * weight
+            lift += own * (dr.maximum(above, 0) * weight)
+        return mi.Normal3f(dr.normalize(normal)), lift
+
+    @classmethod
+    def build(cls, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> _TraceScene | None:
+        others = {f"visible_{i}": shape for i, shape in enumerate(visible)}
+        occluders = [o for o in occluders if len(o.mesh.faces)]
+        if not occluders:
+            if not others:
+                return None
+            nothing = mi.Float([0.0] * 9)
+            return cls(mi.load_dict({"type": "scene", **others}), None, mi.UInt32([0]), nothing, nothing)
+        corners, normals = [], []
+        for occluder in occluders:
+            turn, shift = occluder.world_from_mesh[:3, :3], occluder.world_from_mesh[:3, 3]
+            corners.append(occluder.mesh.triangles.reshape(-1, 3) @ turn.T + shift)
+            turn = turn / np.cbrt(np.linalg.det(turn))
+            normals.append(_smooth_normals(occluder.mesh).reshape(-1, 3) @ turn.T)
+        positions = mi.Float(np.concatenate(corners).ravel().astype(np.float32))
+        count = sum(len(c) for c in corners)
+        mesh = mi.Mesh("proxies", count, count // 3)
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = positions
+        params["faces"] = mi.UInt32(np.arange(count, dtype=np.uint32))
+        params.update()
+        instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
+        return cls(
+            mi.load_dict({"type": "scene", "mesh": mesh, **others}),
+            mi.ShapePtr(mesh),
+            mi.UInt32(instances.astype(np.uint32)),
+            positions,
+            mi.Float(np.concatenate(normals).ravel().astype(np.float32)),
+        )
+
+
+@lru_cache(maxsize=64)
+def _smooth_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Corner normals, kept from layout to layout."""
+    return corner_normals(mesh)

@@ -1,6 +1,6 @@
 """Shadows against truth: baked splats under our light, beside photographs of the same meshes by Mitsuba's path tracer.
 
-    python -m benchmarks.shadows [--out FOLDER] [--scenes table bin ...] [--lights lamp sky ...] [--error 0.02]
+    python -m benchmarks.shadows [--out FOLDER] [--scenes table bin ...] [--lights lamp sky ...]
 
 A scene's surroundings are baked under its lights without the objects, and every object alone under even light. The
 composite of both under ``shadow: none``, ``image`` and ``traced`` is compared with a path-traced photograph of
@@ -24,7 +24,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,8 @@ from mitsplat.bake import BakeSettings, bake_asset
 from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
 from mitsplat.composite import LUMINANCE, light_image
-from mitsplat.render import Layers, ensure_variant, make_integrator, make_splats_shape, render_layers
+from mitsplat.plugins.proxies import Occluder, Proxies
+from mitsplat.render import Layers, ensure_variant, make_integrator, make_sensor, make_splats_shape, render_layers
 from mitsplat.scene import AreaLight, EnvironmentLight, LightSpec, SpotLight
 from mitsplat.spec import Composite
 from mitsplat.trace import encode_srgb, trace_radiance
@@ -89,6 +90,7 @@ class Setup:
     room: trimesh.Scene
     things: Sequence[Thing]
     camera: Camera
+    density: Mapping[str, float] = field(default_factory=dict)
 
 
 def pose(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> FloatArray:
@@ -160,7 +162,7 @@ def bin_setup() -> Setup:
     rng = np.random.default_rng(3)
     outer, inner = block((-0.15, -0.11, 0), (0.15, 0.11, 0.09)), block((-0.14, -0.10, 0.01), (0.14, 0.10, 0.2))
     room = {
-        "bench": worn(block((-0.5, -0.4, -0.04), (0.5, 0.4, 0.0005)), m.beech(rng, 256, 256, 40)),
+        "bench": worn(block((-0.3, -0.25, -0.04), (0.3, 0.25, -0.002)), m.cast((190, 150, 105), rng)),
         "bin": worn(trimesh.boolean.difference([outer, inner], engine="manifold"), m.cast((60, 100, 170), rng)),
     }
     solids = {
@@ -169,7 +171,7 @@ def bin_setup() -> Setup:
         "marble": (trimesh.creation.icosphere(4, 0.022), (90, 170, 110), pose(0.06, 0.02, 0.032)),
         "roll": (trimesh.creation.cylinder(0.02, 0.05, sections=64), (210, 180, 60), pose(0.09, -0.05, 0.03, 30, 90)),
     }
-    return Setup(trimesh.Scene(room), coloured(solids), view((0.0, -0.36, 0.38)))
+    return Setup(trimesh.Scene(room), coloured(solids), view((0.0, -0.36, 0.38)), {"bench": 0.1})
 
 
 def parts_setup() -> Setup:
@@ -205,14 +207,22 @@ def view(eye: Sequence[float], target: Sequence[float] = (0, 0, 0.01), *, fov_x:
 
 
 def baked(
-    scene: trimesh.Scene, folder: Path, light: str | Sequence[LightSpec], gaussians: int, *, kind: Any, **how: Any
+    scene: trimesh.Scene,
+    folder: Path,
+    light: str | Sequence[LightSpec],
+    gaussians: int,
+    *,
+    kind: Any,
+    density: Mapping[str, float] | None = None,
 ) -> Asset:
     """The asset in ``folder``, baked if it is not there yet."""
     if not (folder / "asset.yaml").exists():
-        settings = BakeSettings(gaussians=gaussians, sh_degree=1, directions=16, fit_steps=0, verify_views=0)
+        settings = BakeSettings(
+            gaussians=gaussians, sh_degree=1, directions=16, fit_steps=0, verify_views=0, density=density
+        )
         mesh = trimesh.util.concatenate([part.mesh for part in read_parts(scene)])
         pieces = [trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull]  # for physics, which is not used here
-        result = bake_asset(scene, name=folder.name, kind=kind, light=light, settings=settings, pieces=pieces, **how)
+        result = bake_asset(scene, name=folder.name, kind=kind, light=light, settings=settings, pieces=pieces)
         result.asset.save(folder)
     return Asset.load(folder)
 
@@ -284,11 +294,22 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     bare, _ = shots.take(f"{light}_bare", room, lights, bounces=1, clay=True)
     ratio = np.where(bare > 1e-4, direct / np.maximum(bare, 1e-4), 1.0)
     surroundings = cover == 0
+    objects = (cover > 0.999) & nearest_is_object(setup, room, things)
     darker = surroundings & (photo @ LUMINANCE < 0.97 * (empty @ LUMINANCE)) & (bare @ LUMINANCE > 1e-3)
     # Speckles of noise are no shadow.
     darker = gaussian_filter(darker.astype(float), 1.5) > 0.5
     shadow = binary_dilation(darker, iterations=3) & surroundings
-    return Truth(photo, empty, alone, ratio, cover > 0.999, shadow, ~binary_dilation(~surroundings, iterations=1))
+    return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
+
+
+def nearest_is_object(
+    setup: Setup, room: Sequence[Part], things: Sequence[Sequence[Part]]
+) -> npt.NDArray[np.bool_]:
+    """Pixels (H, W) whose middle shows an object."""
+    occluders = [Occluder(part.mesh, 0, dynamic=False) for part in room]
+    occluders += [Occluder(part.mesh, 1, dynamic=True) for parts in things for part in parts]
+    hit, _ = Proxies(occluders).nearest(make_sensor(setup.camera).view().rays())
+    return np.array(hit.instance).reshape(setup.camera.height, setup.camera.width) > 0
 
 
 def composites(layers: Layers, truth: Truth) -> dict[str, FloatArray]:
@@ -354,15 +375,16 @@ def save_sheet(path: Path, pictures: Sequence[FloatArray], scale: int = 2) -> No
     Image.fromarray(sheet).resize((scale * sheet.shape[1], scale * sheet.shape[0]), Image.Resampling.NEAREST).save(path)
 
 
-def compare(name: str, light: str, out: Path, samples: int, options: Mapping[str, Any]) -> dict[str, Any]:
+def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
+    """Figures of one setup under one light, and the pictures side by side in ``out``."""
     setup = SETUPS[name]()
     truth = take_truth(setup, name, light, out, samples)
-    room = baked(setup.room, out / name / light, LIGHTS[light], 20000, kind="environment")
+    room = baked(setup.room, out / name / light, LIGHTS[light], 20000, kind="environment", density=setup.density)
     shapes = {"room": shape_of(room, np.eye(4), 0)}
     for number, thing in enumerate(setup.things, 1):
         shapes[f"thing_{number}"] = shape_of(thing.asset(out / name), thing.pose, number)
     scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(LIGHTS[light])})
-    layers = render_layers(make_integrator(white=room.white, **options), scene, setup.camera)
+    layers = render_layers(make_integrator(white=room.white), scene, setup.camera)
     pictures = composites(layers, truth)
     ratios = [truth.ratio @ LUMINANCE, layers.light @ LUMINANCE]
     ratios.append(pictures["capture image"] @ LUMINANCE / np.maximum(truth.empty @ LUMINANCE, 1e-6))
@@ -415,7 +437,7 @@ def main() -> None:
     for name in options.scenes:
         for light in options.lights:
             start = time.perf_counter()
-            results[name, light] = compare(name, light, options.out, options.samples, {})
+            results[name, light] = compare(name, light, options.out, options.samples)
             print(f"{name} {light}: {time.perf_counter() - start:.0f} s", flush=True)
     for quantity in ("shadow", "flip", "object", "whole"):
         print(f"\n{quantity:16s}" + "".join(f"{column:>16s}" for column in COLUMNS))

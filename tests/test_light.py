@@ -226,3 +226,175 @@ def test_point_seen_beside_its_proxy_takes_the_light_of_its_neighbours() -> None
     seam = (layers.instance == 0) & (layers.proxy_instance == 1)
     assert seam.sum() > 20
     assert layers.light[seam].min() > 0.3
+
+
+def noise_free(shapes: dict[str, Any], camera: Camera, **options: Any) -> Layers:
+    return render(shapes, camera, samples=1024, **options)
+
+
+def area_light(size: float, height: float, radiance: float = 5.0) -> dict[str, Any]:
+    """A square of edge ``size`` at ``height`` above the origin that shines down."""
+    pose = mi.ScalarTransform4f().look_at(origin=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0]).scale(0.5 * size)
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    return {"type": "rectangle", "to_world": pose, "emitter": emitter}
+
+
+def test_penumbra_of_a_square_light_has_the_width_of_similar_triangles() -> None:
+    """A half plane at height h under a square light of edge s at height H: the penumbra is s h / (H - h) wide.
+
+    In between the visible share of the light rises linearly, and its middle is under the half plane's edge.
+    """
+    make_integrator()
+    size, top, edge = 0.1, 2.0, 0.5
+    half_plane = trimesh.creation.box(bounds=[[-5, -5, edge], [0, 5, edge + 1e-4]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "half plane": make_splats_shape(nothing(), proxy=half_plane, instance=1),
+        "lamp": area_light(size, top),
+    }
+    camera = Camera.look_at((0, 0, 0.45), (0, 0, 0), up=(0, 1, 0), width=320, height=8, fov_x=10)
+    light = noise_free(shapes, camera).light[3, :, 0]
+    slopes = camera.ray_slopes(np.stack([np.arange(320) + 0.5, np.full(320, 4.0)], axis=1))
+    x = 0.45 * slopes[:, 0]
+    inside = (light > 0.1) & (light < 0.9)
+    slope, middle = np.polyfit(x[inside], light[inside], 1)
+    assert 1 / slope == pytest.approx(size * edge / (top - edge), rel=0.02)
+    assert -middle / slope + 0.5 / slope == pytest.approx(0.0, abs=0.02 / slope)
+
+
+def test_default_accuracy_keeps_its_promise_in_the_penumbra() -> None:
+    """Rays are spent until the filtered ratio has the stated error, and not evenly."""
+    make_integrator()
+    blocker = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.15], [0.1, 0.1, 0.2]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "blocker": make_splats_shape(nothing(), proxy=blocker, instance=1),
+        "lamp": area_light(0.4, 1.0),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
+    }
+    camera = Camera.look_at((0.0, -0.9, 0.6), (0, 0, 0), width=240, height=160, fov_x=45)
+    exact = noise_free(shapes, camera).light[..., 0]
+    seen = noise_free(shapes, camera).proxy_instance == 0
+    penumbra = seen & (exact > 0.15) & (exact < 0.97)
+    assert penumbra.sum() > 2000
+    for error in (0.03, 0.06):
+        layers = render_layers(
+            make_integrator(shadow_error=error), mi.load_dict({"type": "scene", **shapes}), camera, seed=3
+        )
+        difference = layers.light[..., 0] - exact
+        assert np.sqrt(np.mean(difference[penumbra] ** 2)) < error
+        assert abs(difference[penumbra].mean()) < 0.2 * error
+        assert np.abs(difference[seen & (exact > 0.97)]).max() < 3 * error
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
+def test_no_acne_beside_an_object_and_no_gap_under_it(unit: float) -> None:
+    """A cube on the floor under a slanting lamp: lit floor is lit to the last bit, and the shadow starts at the edge."""
+    make_integrator()
+    cube = trimesh.creation.box(bounds=np.multiply(unit, [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]]))
+    lamp = {"type": "directional", "direction": [1, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
+    shapes = {
+        "floor": make_splats_shape(floor(unit), proxy=slab(unit)),
+        "cube": make_splats_shape(nothing(), proxy=cube, instance=1),
+        "lamp": lamp,
+    }
+    eye = np.multiply(unit, (0.6, 0, 1.0))
+    camera = Camera.look_at(
+        eye, np.multiply(unit, (0.2, 0, 0)), up=(0, 1, 0), width=200, height=120, fov_x=45, near=0.01 * unit
+    )
+    light = render(shapes, camera, samples=4).light[..., 0]
+    centres = np.stack(np.meshgrid(np.arange(200) + 0.5, np.arange(120) + 0.5), axis=-1).reshape(-1, 2)
+    directions = np.column_stack([camera.ray_slopes(centres), np.ones(len(centres))])
+    directions = directions @ camera.world_from_camera[:3, :3].T
+    point = (eye - directions * (eye[2] / directions[:, 2:])).reshape(120, 200, 3) / unit
+    x, y = point[..., 0], point[..., 1]
+    pixel = np.abs(np.diff(x, axis=1)).max()
+    seen = (directions[:, 2].reshape(120, 200) < 0) & (np.abs(y) < 0.08)
+    shadow = seen & (x > 0.1 + 1.5 * pixel) & (x < 0.3 - 1.5 * pixel)
+    lit = seen & (x > 0.3 + 1.5 * pixel) | (np.abs(y) > 0.1 + 2 * pixel) & (x > 0.3)
+    assert shadow.sum() > 200 and lit.sum() > 200
+    assert (light[shadow] == 0).all()
+    assert (light[lit] == 1).all()
+
+
+@pytest.mark.parametrize("subdivisions", [2, 3])
+def test_grazing_light_ends_on_a_coarse_ball_where_it_ends_on_a_round_one(subdivisions: int) -> None:
+    """No dark facets at the terminator: irradiance is max(0, n.l) of the round ball, though it has few faces."""
+    make_integrator()
+    ball = trimesh.creation.icosphere(subdivisions, 0.3)
+    fine = trimesh.creation.icosphere(5, 0.3)
+    sphere = Splats(
+        fine.vertices,
+        np.tile([0, 0, 0, 1.0], (len(fine.vertices), 1)),
+        np.full((len(fine.vertices), 3), 0.008),
+        np.full(len(fine.vertices), 0.99),
+        np.zeros((len(fine.vertices), 1, 3)),
+    )
+    lamp = {"type": "directional", "direction": [-1, 0, 0], "irradiance": {"type": "rgb", "value": np.pi}}
+    shapes = {"ball": make_splats_shape(sphere, proxy=ball, instance=1), "lamp": lamp}
+    camera = Camera.look_at((0, -2, 0), (0, 0, 0), width=96, height=96, fov_x=18)
+    layers = render(shapes, camera, samples=16, white=np.pi)
+    u = (np.arange(96) + 0.5 - 48) / camera.fx * 2 / 0.3
+    x, z = np.meshgrid(u, -u)
+    inner = x**2 + z**2 < 0.8**2
+    # The camera is near: a little parallax is left in x.
+    expected = np.maximum(x, 0)
+    difference = np.abs(layers.light[..., 0] - expected)[inner]
+    assert difference.mean() < 0.03
+    assert np.percentile(difference, 99) < 0.12
+
+
+def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None:
+    """Relit white under white = pi: E/pi for a spot, a directional light, a point and a map, with nothing in the way."""
+    make_integrator()
+    pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0])
+    sky = np.zeros((256, 512, 3), np.float32)
+    polar = (np.arange(256) + 0.5) / 256 * np.pi
+    sky[:] = np.maximum(np.cos(polar), 0)[:, None, None]
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    rgb = {"type": "rgb", "value": 2.0}
+    lights = {
+        "spot": ({"type": "spot", "to_world": pose, "cutoff_angle": 30, "intensity": rgb}, 2.0 / 4),
+        "directional": ({"type": "directional", "direction": [1, 0, -1], "irradiance": rgb}, 2 / np.sqrt(2)),
+        "point": ({"type": "point", "position": [0, 0, 2], "intensity": rgb}, 2.0 / 4),
+        "constant": ({"type": "constant", "radiance": rgb}, 2 * np.pi),
+        # L = cos over the upper half: the integral of cos^2 is 2 pi / 3.
+        "map": ({"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": up}, 2 * np.pi / 3),
+    }
+    ground = make_splats_shape(floor(), proxy=slab(), instance=1, capture_light="uniform")
+    for name, (light, irradiance) in lights.items():
+        layers = render({"floor": ground, "light": light}, down_camera(fov=2.0), samples=256, white=np.pi)
+        assert layers.light.mean() == pytest.approx(irradiance / np.pi, rel=0.01), name
+
+
+def test_wall_hides_half_of_a_sky_to_a_thousandth() -> None:
+    make_integrator()
+    wall = trimesh.creation.box(bounds=[[0.0, -5000, 0.0], [0.5, 5000, 5000]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "wall": make_splats_shape(nothing(), proxy=wall, instance=1),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((-0.005, 0, 0.3), (-0.005, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=0.5)
+    light = noise_free(shapes, camera).light
+    assert light.mean() == pytest.approx(0.5, abs=2e-3)
+
+
+def test_highlight_takes_no_more_light_than_arrives() -> None:
+    """Under a uniform sky of radiance 1 a mirror-like or rough lobe of reflectance 1 shows at most 1 (white furnace)."""
+    make_integrator()
+    for roughness in (0.2, 0.5, 1.0):
+        shiny = make_splats_shape(
+            floor(), proxy=slab(), instance=1, capture_light="uniform", specular=1.0, roughness=roughness
+        )
+        for eye in ((0.0, -0.05, 1.0), (0.0, -1.0, 0.25)):
+            camera = Camera.look_at(eye, (0, 0, 0), width=32, height=32, fov_x=10)
+            highlight = noise_free({"floor": shiny, "sky": WHITE_SKY}, camera, white=np.pi).highlight
+            assert 0.3 < highlight.mean() < 1.02
+
+
+def test_bad_accuracy_is_refused() -> None:
+    make_integrator()
+    for name, value in (("shadow_error", 1.0), ("shadow_error", -0.1), ("white", -1.0), ("shadow_error", "fine")):
+        with pytest.raises(Exception, match=name):
+            mi.load_dict({"type": "splat_proxy", name: value})

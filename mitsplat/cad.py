@@ -14,6 +14,7 @@ import trimesh
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial
 
+from mitsplat.composite import black_body_colour
 from mitsplat.errors import InputError
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
@@ -209,6 +210,8 @@ def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
 def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]:
     """Mitsuba's description of one light; images of environments are relative to ``folder``."""
     colour = np.asarray(light.colour)
+    if light.kind != "environment" and light.temperature is not None:
+        colour = colour * black_body_colour(light.temperature)
     if light.kind == "environment":
         if light.image is None:
             return {"type": "constant", "radiance": _rgb(light.radiance * colour)}

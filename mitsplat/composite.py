@@ -1,4 +1,4 @@
-"""Layers to picture: shadow, highlight, white balance, exposure, tone curve, noise."""
+"""Layers to picture: shadow and highlight, then lens, sensor, colour, tone curve and compression of a camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.render import Layers
-from mitsplat.spec import Composite
+from mitsplat.spec import Composite, Sensor
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -87,19 +87,28 @@ def shadow_from_image(shadow_map: FloatArray, parameters: ImageShadow = ImageSha
 
 
 def develop(
-    linear: FloatArray, draws: Mapping[str, float], *, tone: Literal["neutral", "filmic"] = "neutral", seed: int = 0
+    linear: FloatArray,
+    draws: Mapping[str, float],
+    *,
+    tone: Literal["neutral", "filmic"] = "neutral",
+    sensor: Sensor = Sensor(),
+    seed: int = 0,
 ) -> npt.NDArray[np.uint8]:
     """Linear picture (H, W, 3) to display-encoded bytes, as a camera would develop it.
 
     Args:
         linear: Linear sRGB, 1 = display white.
-        draws: ``exposure`` [stops], ``white_balance`` [K], ``hue`` [degrees], ``saturation``, ``noise`` [1 sigma of the
-            encoded range]; what is missing changes nothing.
+        draws: ``exposure`` [stops], ``vignetting`` [stops in the corners], ``motion_blur`` [px] along ``motion_angle``
+            [degrees], ``iso``, ``white_balance`` [K], ``hue`` [degrees], ``saturation``, ``jpeg`` [quality]; what is
+            missing changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
+        sensor: What turns ``iso`` into noise.
         seed: Seed of the noise.
     """
+    linear = _through_lens(linear, draws)
+    if "iso" in draws:
+        linear = _sensed(linear, draws["iso"], sensor, seed)
     matrix = colour_matrix(
-        exposure=draws.get("exposure", 0.0),
         white_balance=draws.get("white_balance", 6504.0),
         hue=draws.get("hue", 0.0),
         saturation=draws.get("saturation", 1.0),
@@ -108,17 +117,68 @@ def develop(
         linear = linear @ matrix.T.astype(np.float32)
     position = np.sqrt(np.clip(linear, 0.0, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
     encoded = tone_curve(tone)[np.rint(position).astype(np.int32)]
-    noise = draws.get("noise", 0.0)
-    if noise > 0:
-        rng = np.random.default_rng(seed)
-        encoded = encoded + np.float32(noise) * rng.standard_normal(encoded.shape, dtype=np.float32)
-    return np.asarray(np.rint(np.clip(encoded, 0.0, 1.0) * 255.0), dtype=np.uint8)
+    image = np.asarray(np.rint(np.clip(encoded, 0.0, 1.0) * 255.0), dtype=np.uint8)
+    return _compressed(image, round(draws["jpeg"])) if "jpeg" in draws else image
+
+
+def _through_lens(linear: FloatArray, draws: Mapping[str, float]) -> FloatArray:
+    """Exposed, darker towards the corners, and blurred along a straight line by the camera's motion."""
+    height, width = linear.shape[:2]
+    if draws.get("exposure", 0.0):
+        linear = linear * np.float32(2.0 ** draws["exposure"])
+    if draws.get("vignetting", 0.0):
+        y, x = np.ogrid[:height, :width]
+        square = (x + 0.5 - width / 2) ** 2 + (y + 0.5 - height / 2) ** 2
+        share = square / (0.25 * (height**2 + width**2))
+        linear = linear * np.exp2(-draws["vignetting"] * share).astype(np.float32)[..., None]
+    if draws.get("motion_blur", 0.0):
+        import cv2
+
+        kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
+        linear = cv2.filter2D(np.ascontiguousarray(linear), -1, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(linear, dtype=np.float32)
+
+
+def motion_kernel(length: float, angle: float) -> FloatArray:
+    """Weights (K, K) of a line of ``length`` [px] through the middle, ``angle`` [degrees] above the x axis."""
+    reach = int(np.ceil(length / 2))
+    along = (np.arange(64 * (reach + 1)) + 0.5) / (64 * (reach + 1)) - 0.5
+    x, y = (length * along * f(np.radians(angle)) + reach for f in (np.cos, lambda a: -np.sin(a)))
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            weight = np.abs(1 - dx - (x - column)) * np.abs(1 - dy - (y - row))
+            inside = weight > 0
+            np.add.at(kernel, (row[inside] + dy, column[inside] + dx), weight[inside])
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
+
+
+def _sensed(linear: FloatArray, iso: float, sensor: Sensor, seed: int) -> FloatArray:
+    """With shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
+
+    Display white fills the wells at ISO 100. The Poisson noise of N is taken as normal.
+    """
+    electrons = np.float32(sensor.full_well * 100.0 / iso)
+    rng = np.random.default_rng(seed)
+    deviation = np.sqrt(np.maximum(linear, 0.0) / electrons + np.float32((sensor.read_noise / electrons) ** 2))
+    return np.asarray(linear + deviation * rng.standard_normal(linear.shape, dtype=np.float32), dtype=np.float32)
+
+
+def _compressed(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
+    """The picture after JPEG compression."""
+    import cv2
+
+    done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], dtype=np.uint8)
 
 
 def colour_matrix(
-    *, exposure: float = 0.0, white_balance: float = 6504.0, hue: float = 0.0, saturation: float = 1.0
+    *, white_balance: float = 6504.0, hue: float = 0.0, saturation: float = 1.0
 ) -> npt.NDArray[np.float64]:
-    """One 3x3 matrix on linear sRGB for exposure, white balance, hue and saturation.
+    """One 3x3 matrix on linear sRGB for white balance, hue and saturation.
 
     White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; hue turns colours
     about the grey axis; saturation scales their distance from the grey of the same luminance.
@@ -134,7 +194,17 @@ def colour_matrix(
     if saturation != 1.0:
         grey = np.broadcast_to(LUMINANCE.astype(np.float64), (3, 3))
         matrix = (saturation * np.eye(3) + (1 - saturation) * grey) @ matrix
-    return np.asarray(matrix * 2.0**exposure, dtype=np.float64)
+    return np.asarray(matrix, dtype=np.float64)
+
+
+@lru_cache(maxsize=256)
+def black_body_colour(kelvin: float) -> tuple[float, float, float]:
+    """Linear sRGB of a black body (Kang et al. 2002), of luminance 1; a negative component counts as 0."""
+    colour = _colour()
+    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="Kang 2002"))
+    rgb = np.maximum(np.linalg.inv(colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ) @ white, 0.0)
+    red, green, blue = (rgb / (LUMINANCE @ rgb)).tolist()
+    return red, green, blue
 
 
 def _colour() -> Any:

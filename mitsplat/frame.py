@@ -108,7 +108,8 @@ def render_frame(
         layers = render_layers(stage.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
     with _timed(seconds, "composite"):
         rgb = light_image(layers, scene.spec.composite)
-        image = develop(rgb, plan.draws, tone=scene.spec.composite.tone, seed=plan.seed)
+        composite = scene.spec.composite
+        image = develop(rgb, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed)
     rules = scene.spec.labels
     with _timed(seconds, "silhouettes"):
         silhouettes = render_silhouettes(stage.integrator, mitsuba_scene, plan.camera, source=rules.source)

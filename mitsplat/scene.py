@@ -88,6 +88,12 @@ __all__ = [
 
 FloatArray = npt.NDArray[np.float64]
 
+_DRAWN = (
+    *("exposure", "vignetting", "motion_blur", "motion_angle", "iso"),
+    *("white_balance", "hue", "saturation", "jpeg"),
+)
+"""What is drawn anew for every frame."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -126,7 +132,7 @@ class FramePlan:
         camera: Where the image is taken from.
         next_camera: Where the layout's next image is taken from, None for its last.
         lights: Lights as they are in this frame: paths and random factors applied.
-        draws: Random values by name: exposure [stops], hue [degrees], saturation, white_balance [K], noise.
+        draws: Random values by name, see :func:`mitsplat.composite.develop`.
         seed: Seed of the pixel noise.
     """
 
@@ -203,8 +209,9 @@ def plan_frame(scene: Scene, index: int) -> FramePlan:
         next_camera=_camera(spec, view + 1, index + 1) if view + 1 < spec.output.views else None,
         lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
         draws={
-            name: float(random_stream(spec.seed, name, index).uniform(*getattr(ranges, name)))
-            for name in ("exposure", "hue", "saturation", "white_balance", "noise")
+            name: float(random_stream(spec.seed, name, index).uniform(*bounds))
+            for name in _DRAWN
+            if (bounds := (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)) is not None
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
     )
@@ -329,6 +336,9 @@ def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> Light
             "position": tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3)),
             "path": (),
         }
+        if light.temperature is not None:
+            warmth = [1.0 / (key.temperature or light.temperature) for key in light.path]
+            state["temperature"] = float(1.0 / np.interp(time, times, warmth))
     factors = random_stream(spec.seed, f"light intensity {position}", layout)
     state[strength] *= float(factors.uniform(*spec.randomise.light_intensity))
     return light.model_copy(update=state)

@@ -52,6 +52,7 @@ CountRange = Annotated[
 ]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Kelvin = Annotated[float, Field(ge=1667, le=25000)]
+Quality = Annotated[float, Field(ge=1, le=100)]
 EmittedColour = Annotated[
     tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
     AfterValidator(_some_colour),
@@ -263,11 +264,12 @@ class LightKey(StrictModel):
 
     position: Vec3 | None = Field(None, description="Position [m].")
     intensity: Positive | None = Field(None, description="Intensity [W/sr], or an area light's radiance [W/(m^2 sr)].")
+    temperature: Kelvin | None = Field(None, description="Colour temperature [K]; needs that of the light.")
 
     @model_validator(mode="after")
     def _check(self) -> LightKey:
-        if self.position is None and self.intensity is None:
-            raise FieldError((), "must have a position, an intensity or both")
+        if self.position is None and self.intensity is None and self.temperature is None:
+            raise FieldError((), "must have a position, an intensity or a temperature")
         return self
 
 
@@ -276,9 +278,21 @@ class LocalLight(StrictModel):
 
     position: Vec3 = Field(description="Position [m].")
     colour: EmittedColour = (1, 1, 1)
-    path: tuple[LightKey, ...] = Field(
-        (), description="Keys evenly spaced over a layout's views, linear in between; empty for a light at rest."
+    temperature: Kelvin | None = Field(
+        None, description="Temperature of the black body whose colour multiplies that of the light [K]."
     )
+    path: tuple[LightKey, ...] = Field(
+        (),
+        description="Keys evenly spaced over a layout's views, linear in between (temperatures in 1/K); "
+        "empty for a light at rest.",
+    )
+
+    @model_validator(mode="after")
+    def _check_temperature(self) -> LocalLight:
+        for number, key in enumerate(self.path):
+            if key.temperature is not None and self.temperature is None:
+                raise FieldError(("path", number, "temperature"), "needs a temperature of the light itself")
+        return self
 
 
 class AimedLight(LocalLight):
@@ -339,11 +353,25 @@ class Randomise(StrictModel):
     white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(_ordered)] = Field(
         (6504.0, 6504.0), description="Correlated colour temperature that is shown as white [K]."
     )
-    noise: NonNegativeRange = Field((0.0, 0.0), description="Read noise, 1 sigma of the encoded range [0, 1].")
+    iso: PositiveRange | None = Field(None, description="Sensitivity of the sensor, hence its noise; none if absent.")
+    vignetting: NonNegativeRange = Field((0.0, 0.0), description="Loss of light in the image's corners [stops].")
+    motion_blur: NonNegativeRange = Field(
+        (0.0, 0.0), description="Length of the camera's motion in the image, in a direction drawn anew [px]."
+    )
+    jpeg: Annotated[tuple[Quality, Quality], AfterValidator(_ordered)] | None = Field(
+        None, description="Quality of a JPEG compression before the image is written; none if absent."
+    )
     friction: PositiveRange = Field(
         (1.0, 1.0), description="Factor on the friction of each entry of objects, drawn once for a layout."
     )
     light_intensity: PositiveRange = Field((1.0, 1.0), description="Factor on each light, drawn once for a layout.")
+
+
+class Sensor(StrictModel):
+    """What makes noise of ``randomise.iso``."""
+
+    full_well: Positive = Field(20000.0, description="Electrons of display white at ISO 100.")
+    read_noise: NonNegativeFloat = Field(3.0, description="Electrons, 1 sigma.")
 
 
 class Composite(StrictModel):
@@ -354,6 +382,7 @@ class Composite(StrictModel):
     )
     highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")
     tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
+    sensor: Sensor = Field(Sensor(), description="Noise of the sensor.")
 
 
 FormatName = Literal[

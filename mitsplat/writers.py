@@ -120,6 +120,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         "seed": plan.seed,
         "files": {},
         "draws": dict(frame.draws),
+        "lights": [light.model_dump(mode="json") for light in plan.lights],
         "camera": {
             "width": frame.camera.width,
             "height": frame.camera.height,

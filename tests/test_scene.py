@@ -149,10 +149,11 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"lights__0": {"kind": "spot", "position": [0, 0, 1], "cone": 90}}, "lights[0].cone: must be < 90 (got 90)"),
         ({"lights__0__target": [0.5, 0, 1]}, "lights[0].target: must differ from the light's positions"),
         ({"lights__0__colour": [0, 0, 0]}, "lights[0].colour: must not be black"),
-        ({"lights__0__path": [{}]}, "lights[0].path[0]: must have a position, an intensity or both"),
+        ({"lights__0__path": [{}]}, "lights[0].path[0]: must have a position, an intensity or a temperature"),
         ({"lights": [{"kind": "environment"}] * 2}, "lights[1].kind: must not be a second environment light"),
         ({"lights": [{"kind": "environment", "image": "sky.exr"}]}, "sky.exr: no such file"),
-        ({"randomise": {"noise": [-1, 0]}}, "randomise.noise[0]: must be >= 0 (got -1)"),
+        ({"randomise": {"vignetting": [-1, 0]}}, "randomise.vignetting[0]: must be >= 0 (got -1)"),
+        ({"randomise": {"jpeg": [0, 90]}}, "randomise.jpeg[0]: must be >= 1 (got 0)"),
         ({"randomise": {"exposure": [1, 0]}}, "randomise.exposure: must be [low, high] with low <= high"),
         (
             {"output__formats": ["yolo", "zip"]},
@@ -229,7 +230,7 @@ def random_scene(scene_data: SceneData, write_scene: WriteScene) -> Scene:
     }  # fmt: skip
     scene_data["randomise"] = {
         "exposure": [-1, 1], "hue": [-5, 5], "saturation": [0.8, 1.2], "white_balance": [5000, 7000],
-        "noise": [0, 0.02], "light_intensity": [0.5, 2],
+        "iso": [100, 800], "jpeg": [40, 95], "motion_blur": [0, 3], "light_intensity": [0.5, 2],
     }  # fmt: skip
     return load_scene(write_scene(scene_data))
 
@@ -383,6 +384,18 @@ def test_light_path_is_linear_in_time(scene_data: SceneData, write_scene: WriteS
     assert {area.position for _, area, _ in plans} == {(1, 0, 1)}
     assert all(sky == scene.spec.lights[2] for _, _, sky in plans)
     assert all(not light.path for light in plans[0][:2])
+
+
+def test_light_path_warms_evenly_in_reciprocal_temperature(scene_data: SceneData, write_scene: WriteScene) -> None:
+    path = [{"temperature": 2500}, {"temperature": 10000}]
+    scene_data["lights"] = [{"kind": "point", "position": [0, 0, 1], "temperature": 4000, "path": path}]
+    scene_data["output"]["views"] = 3
+    scene = load_scene(write_scene(scene_data))
+    temperatures = [plan_frame(scene, index).lights[0].temperature for index in range(3)]
+    assert temperatures == pytest.approx([2500, 4000, 10000])
+    del scene_data["lights"][0]["temperature"]
+    with pytest.raises(InputError, match=r"lights\[0\]\.path\[0\]\.temperature: needs a temperature"):
+        load_scene(write_scene(scene_data))
 
 
 # Schema

@@ -13,7 +13,8 @@ those of display-encoded pictures:
 
 ``capture`` replaces the splats by path-traced pictures of the surroundings and of each object alone, so that what
 remains is the error of the light. ``direct`` is that with the exact ratio of direct light: the best that shadow rays
-can do, without light that bounces off the objects. Penumbrae are measured in the light ratio itself, against direct
+can do, without light that bounces off the objects. ``no bounce`` is ``capture traced`` without the light that objects get
+from their surroundings. Penumbrae are measured in the light ratio itself, against direct
 light that is path-traced on white meshes: the distance [px] between 20 and 80 % of every edge.
 
 What takes time (photographs and bakes) is kept in FOLDER and reused.
@@ -285,16 +286,16 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     everything = [*room, *(part for parts in things for part in parts)]
     photo, _ = shots.take(f"{light}_photo", everything, lights)
     empty, _ = shots.take(f"{light}_empty", room, lights)
-    alone, cover = np.zeros_like(photo), np.zeros(photo.shape[:2])
-    for thing, parts in zip(setup.things, things, strict=True):
+    alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup, room, things)
+    for number, (thing, parts) in enumerate(zip(setup.things, things, strict=True), 1):
         captured, own = shots.take(f"alone_{thing.name}", parts, bake_lights("uniform"))
-        alone = np.where((own > cover)[..., None], captured / np.maximum(own, 1e-6)[..., None], alone)
+        alone = np.where((seen == number)[..., None], captured / np.maximum(own, 1e-6)[..., None], alone)
         cover = np.maximum(own, cover)
     direct, _ = shots.take(f"{light}_direct", everything, lights, bounces=1, clay=True)
     bare, _ = shots.take(f"{light}_bare", room, lights, bounces=1, clay=True)
     ratio = np.where(bare > 1e-4, direct / np.maximum(bare, 1e-4), 1.0)
     surroundings = cover == 0
-    objects = (cover > 0.999) & nearest_is_object(setup, room, things)
+    objects = (cover > 0.999) & (seen > 0)
     darker = surroundings & (photo @ LUMINANCE < 0.97 * (empty @ LUMINANCE)) & (bare @ LUMINANCE > 1e-3)
     # Speckles of noise are no shadow.
     darker = gaussian_filter(darker.astype(float), 1.5) > 0.5
@@ -302,23 +303,29 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
 
 
-def nearest_is_object(
-    setup: Setup, room: Sequence[Part], things: Sequence[Sequence[Part]]
-) -> npt.NDArray[np.bool_]:
-    """Pixels (H, W) whose middle shows an object."""
+def nearest_object(setup: Setup, room: Sequence[Part], things: Sequence[Sequence[Part]]) -> npt.NDArray[np.uint32]:
+    """Number of the object that the middle of each pixel shows (H, W), 0 for the surroundings."""
     occluders = [Occluder(part.mesh, 0, dynamic=False) for part in room]
-    occluders += [Occluder(part.mesh, 1, dynamic=True) for parts in things for part in parts]
+    occluders += [Occluder(part.mesh, i, dynamic=True) for i, parts in enumerate(things, 1) for part in parts]
     hit, _ = Proxies(occluders).nearest(make_sensor(setup.camera).view().rays())
-    return np.array(hit.instance).reshape(setup.camera.height, setup.camera.width) > 0
+    return np.array(hit.instance).reshape(setup.camera.height, setup.camera.width)
 
 
-def composites(layers: Layers, truth: Truth) -> dict[str, FloatArray]:
-    """Linear pictures to compare with the photograph, by name."""
+def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth) -> dict[str, FloatArray]:
+    """Linear pictures to compare with the photograph, by name.
+
+    ``relative`` are layers whose light is 1 at an open place, which is what the image-space chain works on.
+    """
     captured = np.where(truth.objects[..., None], truth.alone, truth.empty).astype(np.float32)
-    exact = replace(layers, captured=captured, alpha=np.ones_like(layers.alpha))
+    opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
+    exact = replace(layers, **opaque)
     ratio = np.where(truth.objects[..., None], layers.light, truth.ratio).astype(np.float32)
-    pictures = {name: light_image(layers, Composite(shadow=name)) for name in ("none", "image", "traced")}
-    pictures |= {f"capture {name}": light_image(exact, Composite(shadow=name)) for name in ("none", "image", "traced")}
+    pictures = {"none": light_image(layers, Composite(shadow="none", highlight=False))}
+    pictures |= {"image": light_image(relative, Composite(shadow="image"))}
+    pictures |= {"traced": light_image(layers, Composite())}
+    pictures |= {"capture image": light_image(replace(relative, **opaque), Composite(shadow="image"))}
+    pictures |= {"no bounce": light_image(replace(unbounced, **opaque), Composite())}
+    pictures |= {"capture traced": light_image(exact, Composite())}
     pictures["direct"] = light_image(replace(exact, light=ratio), Composite())
     return {name: np.asarray(picture, dtype=np.float64) for name, picture in pictures.items()}
 
@@ -384,8 +391,11 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
     for number, thing in enumerate(setup.things, 1):
         shapes[f"thing_{number}"] = shape_of(thing.asset(out / name), thing.pose, number)
     scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(LIGHTS[light])})
-    layers = render_layers(make_integrator(white=room.white), scene, setup.camera)
-    pictures = composites(layers, truth)
+    layers, unbounced, relative = (
+        render_layers(make_integrator(**how), scene, setup.camera)
+        for how in ({"white": room.white}, {"white": room.white, "bounce": False}, {"bounce": False})
+    )
+    pictures = composites(layers, unbounced, relative, truth)
     ratios = [truth.ratio @ LUMINANCE, layers.light @ LUMINANCE]
     ratios.append(pictures["capture image"] @ LUMINANCE / np.maximum(truth.empty @ LUMINANCE, 1e-6))
     widths = penumbra_widths(ratios, truth.edges)
@@ -421,7 +431,7 @@ def shape_of(asset: Asset, where: FloatArray, instance: int) -> Any:
     )
 
 
-COLUMNS = ("none", "image", "traced", "capture none", "capture image", "capture traced", "direct")
+COLUMNS = ("none", "image", "traced", "capture image", "no bounce", "capture traced", "direct")
 
 
 def main() -> None:

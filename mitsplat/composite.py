@@ -62,7 +62,7 @@ def light_image(layers: Layers, composite: Composite, *, image_shadow: ImageShad
     else:
         lit = layers.captured if composite.shadow == "none" else layers.captured * layers.light
         if composite.highlight:
-            lit = lit + layers.highlight * layers.alpha[..., None]
+            lit = np.maximum(lit + layers.highlight * layers.alpha[..., None], 0)
     return np.asarray(lit + (BACKGROUND * (1 - layers.alpha))[..., None], dtype=np.float32)
 
 

@@ -173,7 +173,8 @@ class _Studio:
             quality=quality,
             shadow="none" if scene.spec.composite.shadow == "none" else "traced",
             reference=reference_point(scene),
-            white=scene.environment.white if scene.environment is not None else None,
+            white=white_irradiance(scene),
+            bounce=scene.spec.composite.bounce,
         )
         self.static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None
@@ -242,6 +243,16 @@ def srgb_to_linear(encoded: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Linear values of display-encoded ones (IEC 61966-2-1)."""
     values = np.asarray(encoded, dtype=np.float64)
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def white_irradiance(scene: Scene) -> float | None:
+    """Irradiance [W/m^2] of display white in the surroundings, where it is known and matters.
+
+    The image-space shadow only looks at light relative to its brightest.
+    """
+    if scene.environment is None or scene.spec.composite.shadow == "image":
+        return None
+    return scene.environment.white
 
 
 def reference_point(scene: Scene) -> tuple[float, float, float]:

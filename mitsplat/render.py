@@ -36,7 +36,8 @@ class Layers:
         proxy_instance: Id of the nearest proxy mesh, (H, W) uint16.
         normal: World-space unit normal of the nearest proxy, zero where there is none, (H, W, 3) float32.
         light: Factor that light and shadow put on the linear colour, (H, W, 3) float32.
-        highlight: Linear colour that was added, (H, W, 3) float32.
+        highlight: Linear colour to add to captured colours in light, less what they hold of their own light's mirror
+            image, (H, W, 3) float32.
     """
 
     rgb: FloatArray
@@ -71,6 +72,7 @@ def make_integrator(
     shadow_error: float = 0.03,
     reference: npt.ArrayLike = (0.0, 0.0, 0.0),
     white: float | None = None,
+    bounce: bool = True,
 ) -> Any:
     """The integrator ``splat_proxy``, which keeps what it uploaded as long as it sees the same shapes."""
     ensure_variant()
@@ -82,6 +84,7 @@ def make_integrator(
             "shadow_error": shadow_error,
             "reference": [float(v) for v in np.asarray(reference)],
             "white": white or 0.0,
+            "bounce": bounce,
         }
     )
     integrator.quality = resolve_quality(quality)

@@ -381,6 +381,7 @@ class Composite(StrictModel):
         "traced", description="Shadow rays, the image-space approximation, or no shadow."
     )
     highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")
+    bounce: bool = Field(True, description="Whether objects get the light that the environment reflects to them.")
     tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
     sensor: Sensor = Field(Sensor(), description="Noise of the sensor.")
 

@@ -14,7 +14,7 @@ from mitsplat.assets import Asset
 from mitsplat.cad import emitter_dict
 from mitsplat.composite import develop
 from mitsplat.errors import InputError
-from mitsplat.frame import reference_point, srgb_to_linear
+from mitsplat.frame import reference_point, srgb_to_linear, white_irradiance
 from mitsplat.render import describe_sensor, ensure_variant
 from mitsplat.scene import Scene, layout_of, plan_frame
 from mitsplat.settle import settle_layout
@@ -53,7 +53,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
             "quality": scene.spec.quality,
             "shadow": "none" if scene.spec.composite.shadow == "none" else "traced",
             "reference": list(reference_point(scene)),
-            "white": (scene.environment.white if scene.environment is not None else None) or 0.0,
+            "white": white_irradiance(scene) or 0.0,
+            "bounce": scene.spec.composite.bounce,
         },
         "sensor": describe_sensor(plan.camera),
         **shapes,

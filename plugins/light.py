@@ -4,12 +4,13 @@ A splat stores what the camera saw, shadows included. Rendering it among new obj
 from scratch but a factor per visible point x with normal n,
 
     captured under the scene's light:   ratio = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
-    captured under uniform light:       ratio = E(x, n | static and dynamic occluders) / E_ref
+    captured under uniform light:       ratio = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
 
 with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first is exactly 1 where no dynamic
 object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance under which the
 colours of the surroundings are exposed: an object taken in a light tent keeps its colours there, and is darker where
-less light arrives.
+less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.plugins.bounce`. The highlight is what the
+lights mirror, less what a light tent would have mirrored into the captured colour: under even light it adds nothing.
 
 Rays are spent where they are needed. A few towards the dynamic objects alone find the points whose light may differ;
 those get ``FIRST_RAYS``, and as many more as the wanted standard error of the filtered ratio asks for.
@@ -23,8 +24,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.plugins.bounce import RadianceGrid, bounced_light
 from mitsplat.plugins.emitters import Emitters, receiver
-from mitsplat.plugins.light_filter import Estimate, LightFilter
+from mitsplat.plugins.light_filter import RADIUS, Estimate, LightFilter
 from mitsplat.plugins.proxies import Proxies
 from mitsplat.plugins.rays import View
 
@@ -41,6 +43,10 @@ SEARCH_RAYS = 2
 
 FAINT = 0.25
 """Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced."""
+
+CAPTURED_SPECULAR = 0.08
+"""Reflectance up to which the light tent's mirror image counts as part of a captured colour, to be replaced by that of
+the scene's lights. Metals reflect more, and keep the rest as it was captured: it stands for what else they mirror."""
 
 FIRST_RAYS = 4
 """Rays per point after which its error is first estimated."""
@@ -104,6 +110,7 @@ def light_factor(
     seed: int,
     point: tuple[float, ...],
     reference: Any,
+    grid: RadianceGrid | None = None,
 ) -> tuple[Any, Any]:
     """Light factor and highlight (Color3f) of every visible point, see the module docstring.
 
@@ -121,6 +128,7 @@ def light_factor(
         seed: Offset into the low-discrepancy sequence.
         point: Where in the scene rays are shared out among emitters by how much light they send [m].
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
+        grid: Captured colours of the surroundings, for the light that they reflect to objects; None leaves it out.
     """
     emitters = Emitters(scene, point)
     tracer = _Tracer(emitters, proxies, surface, view.width, seed)
@@ -160,10 +168,14 @@ def light_factor(
         scale = mi.Color3f(dr.full(mi.Float, 1, dr.width(index)))
         dr.scatter(scale, relit, anew)
         share *= scale
+        if grid is not None and proxies.static is not None:
+            share += tracer.bounce(grid, group, view, index)
+    shine *= dr.pi / reference
+    shine -= dr.select(here.relit, share * _mirrored(here), 0)
     light = mi.Color3f(dr.full(mi.Float, 1, dr.width(surface.valid)))
     highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(surface.valid)))
     dr.scatter(light, share, index)
-    dr.scatter(highlight, shine * (dr.pi / reference), index)
+    dr.scatter(highlight, shine, index)
     return light, highlight
 
 
@@ -244,6 +256,28 @@ class _Tracer:
         count = dr.gather(mi.Float, before.rays, index) + mi.Float(rays)
         return before.updated(index, *sums, count)
 
+    def bounce(self, grid: RadianceGrid, group: Any, view: View, index: Any) -> Any:
+        """Irradiance from the surroundings over that of display white (Color3f) at those pixels of ``index`` that are
+        relit; zero elsewhere."""
+        surface = self.surface
+        pixels = dr.gather(mi.UInt32, index, dr.compress(dr.gather(mi.Bool, surface.relit, index)))
+        here = surface.at(pixels)
+        start = self._start(pixels)
+        total = bounced_light(
+            grid, self.proxies, _origin(here), here.normal, lambda i: _sequence(start + i * (BLOCK * BLOCK))
+        )
+        count = dr.width(surface.valid)
+        images = [dr.zeros(mi.Float, count) for _ in range(3)]
+        traced, rays = dr.zeros(mi.Bool, count), dr.full(mi.Float, 1, count)
+        dr.scatter(traced, mi.Bool(True), pixels)
+        for image, channel in zip(images, total, strict=True):
+            dr.scatter(image, channel, pixels)
+        dr.eval(images, traced)
+        smooth = LightFilter(surface, group, view, pixels, traced).average(images, rays, RADIUS)
+        for image, channel in zip(images, smooth, strict=True):
+            dr.scatter(image, channel, pixels)
+        return mi.Color3f(*[dr.gather(mi.Float, image, index) for image in images])
+
     def _start(self, pixel: Any) -> Any:
         start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
         return start + _bayer(pixel % self.width, pixel // self.width)
@@ -278,6 +312,19 @@ def _ggx(surface: Surface, to_light: Any, cos_camera: Any, alpha2: Any) -> Any:
     grazing = dr.power(dr.clip(1 - dr.dot(half, to_light), 0, 1), 5)
     fresnel = dr.select(surface.specular > 0, dr.fma(1 - surface.specular, grazing, surface.specular), 0)
     return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
+
+
+def _mirrored(surface: Surface) -> Any:
+    """Part of the captured colour that is light of the tent, mirrored: the lobe's reflectance under even light.
+
+    Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine).
+    """
+    cosine = dr.maximum(dr.dot(surface.normal, surface.to_camera), 0)
+    rough = surface.roughness
+    x, y, z, w = 1 - rough, dr.fma(-0.0275, rough, 0.0425), dr.fma(-0.572, rough, 1.04), dr.fma(0.022, rough, -0.04)
+    bend = dr.fma(dr.minimum(x * x, dr.exp2(-9.28 * cosine)), x, y)
+    specular = dr.minimum(surface.specular, CAPTURED_SPECULAR)
+    return dr.select(specular > 0, dr.maximum(specular * dr.fma(-1.04, bend, z) + dr.fma(1.04, bend, w), 0), 0)
 
 
 def _bayer(x: Any, y: Any) -> Any:

@@ -97,7 +97,7 @@ class LightFilter:
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for colour in (estimate.lit, estimate.base, estimate.shine) for c in colour]
         dr.eval(values)
-        values = self._average(values, estimate.rays, RADIUS, alike)
+        values = self.average(values, estimate.rays, RADIUS, alike)
         return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])
 
     def _share(self, estimate: Estimate) -> tuple[Any, Any]:
@@ -105,7 +105,7 @@ class LightFilter:
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [dr.sum(estimate.lit) * weight, dr.sum(estimate.base) * weight, estimate.squares * weight]
         dr.eval(values)
-        lit, base, squares = self._average(values, estimate.rays, 1)
+        lit, base, squares = self.average(values, estimate.rays, 1)
         share = dr.select(base > 0, lit / base, 1)
         rays = SMALL * dr.gather(mi.Float, estimate.rays, self.index)
         draws = dr.maximum(rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
@@ -122,7 +122,7 @@ class LightFilter:
         dr.eval(images)
         return images
 
-    def _average(
+    def average(
         self, images: list[Any], rays: Any, radius: int, alike: Callable[[Any, Any], Any] = lambda _, same: same
     ) -> list[Any]:
         """Averages of images, weighted by their rays, at the pixels of ``index``."""

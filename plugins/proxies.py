@@ -139,7 +139,7 @@ class _TraceScene:
         params.update()
         instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
         return cls(
-            mi.load_dict({"type": "scene", "mesh": mesh, **others}),
+            mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh, **others}),
             mi.ShapePtr(mesh),
             mi.UInt32(instances.astype(np.uint32)),
             positions,

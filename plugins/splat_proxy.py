@@ -12,6 +12,7 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
+from mitsplat.plugins.bounce import RadianceGrid
 from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, march
@@ -64,6 +65,7 @@ class _Contents:
     relit: Any
     roughness: Any
     specular: Any
+    grid: RadianceGrid | None
 
 
 class SplatProxyIntegrator(mi.CppADIntegrator):
@@ -88,6 +90,10 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
      * - shadow_samples
        - |int|
        - Most shadow rays per pixel. (Default: 64)
+
+     * - bounce
+       - |bool|
+       - Whether uniformly captured objects also get the light that the surroundings reflect. (Default: true)
 
      * - white
        - |float|
@@ -122,6 +128,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow_error = _number(props, "shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
             raise InputError(f"integrator 'splat_proxy': 'shadow_error' must be in [0, 1) (got {self.shadow_error!r})")
+        self.bounce = props.get("bounce", True)
+        if type(self.bounce) is not bool:
+            raise InputError(f"integrator 'splat_proxy': 'bounce' must be true or false (got {self.bounce!r})")
         self.white = _number(props, "white", 0.0)
         if not 0 <= self.white < np.inf:
             raise InputError(f"integrator 'splat_proxy': 'white' must be >= 0 (got {self.white!r})")
@@ -133,6 +142,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
+        self._grid: tuple[Any, RadianceGrid | None] | None = None
 
     def aov_names(self) -> list[str]:
         """Names of the channels after R, G, B and A."""
@@ -193,9 +203,10 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 seed=seed,
                 point=self.reference,
                 reference=self._white(scene),
+                grid=contents.grid if self.bounce else None,
             )
         layers = {
-            "rgb": colour * light + highlight * alpha,
+            "rgb": dr.maximum(colour * light + highlight * alpha, 0),
             "alpha": alpha,
             "captured": colour,
             "depth": depth,
@@ -275,8 +286,19 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             mi.Bool(relit),
             mi.Float(roughness),
             mi.Float(specular),
+            self._surroundings(carriers),
         )
         return self._contents
+
+    def _surroundings(self, carriers: list[Any]) -> RadianceGrid | None:
+        """Captured colours of the largest of the splats that were captured under the scene's light."""
+        static = [c for c in carriers if not c.dynamic and c.capture_light == "scene" and len(c.splats)]
+        if not static:
+            return None
+        largest = max(static, key=lambda c: len(c.splats))
+        if self._grid is None or self._grid[0] is not largest:
+            self._grid = largest, RadianceGrid.build(largest.splats, largest.world_from_splats)
+        return self._grid[1]
 
     def _upload(self, distinct: list[Any]) -> CloudSet | None:
         """Device copies of splats; those of the last call are kept, because layouts of a scene share their assets."""

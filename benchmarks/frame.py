@@ -14,10 +14,16 @@ import statistics
 import time
 from pathlib import Path
 
-import mitsplat as ms
+import mitsplat as ms  # before Mitsuba
+
+# isort: split
+import mitsuba as mi
+
 from benchmarks.captures import CAMERA, crowd
 from benchmarks.volprim import render_volprim, volprim_scene
-from mitsplat.scene import layout_of
+from mitsplat.frame import _Studio
+from mitsplat.render import render_layers
+from mitsplat.scene import layout_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -38,6 +44,24 @@ def time_frames(path: Path, frames: int) -> None:
     print(f"median of {frames} frames, {size.width}x{size.height}, seconds:")
     for stage in rows[1]:
         print(f"  {stage:12s} {statistics.median(row[stage] for row in rows[1:]):.3f}")
+
+
+def time_light(path: Path, repeats: int = 8) -> None:
+    """Print what shadows and highlights add to the time of a frame's layers, in frames that take turns."""
+    scene = ms.load_scene(path)
+    layout = ms.settle_layout(scene, layout_of(scene, 0))
+    studio = _Studio.of(scene, scene.spec.quality)
+    seconds: dict[str, list[float]] = {"none": [], "traced": []}
+    for index in range(repeats + 1):
+        plan = plan_frame(scene, index % scene.spec.output.views)
+        for shadow, times in seconds.items():
+            studio.integrator.shadow = shadow
+            placed = mi.load_dict(studio.describe(layout, plan.lights))
+            start = time.perf_counter()
+            render_layers(studio.integrator, placed, plan.camera, seed=plan.seed)
+            times.append(time.perf_counter() - start)
+    plain, lit = (statistics.median(times[1:]) for times in seconds.values())
+    print(f"layers without light {plain:.3f} s, with {lit:.3f} s: light takes {lit / plain - 1:.2f} of the rest")
 
 
 def compare_with_volprim(repeats: int = 5) -> None:
@@ -70,6 +94,7 @@ def main() -> None:
     options = parser.parse_args()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     time_frames(options.scene, options.frames)
+    time_light(options.scene)
     print(f"peak memory of the frames: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     if not options.no_volprim:
         compare_with_volprim()

@@ -13,9 +13,9 @@ those of display-encoded pictures:
 
 ``capture`` replaces the splats by path-traced pictures of the surroundings and of each object alone, so that what
 remains is the error of the light. ``direct`` is that with the exact ratio of direct light: the best that shadow rays
-can do, without light that bounces off the objects. ``no bounce`` is ``capture traced`` without the light that objects get
-from their surroundings. Penumbrae are measured in the light ratio itself, against direct
-light that is path-traced on white meshes: the distance [px] between 20 and 80 % of every edge.
+can do, without light that bounces off the objects. ``no bounce`` is ``capture traced`` without the light that objects
+get from their surroundings. Penumbrae are measured in the light ratio itself, against direct light that is path-traced
+on white meshes: the distance [px] between 20 and 80 % of every edge.
 
 What takes time (photographs and bakes) is kept in FOLDER and reused.
 """
@@ -200,7 +200,9 @@ SETUPS = {"table": table_setup, "corner": corner_setup, "bin": bin_setup, "parts
 
 def coloured(solids: Mapping[str, tuple[trimesh.Trimesh, m.Colour, FloatArray]]) -> list[Thing]:
     rng = np.random.default_rng(5)
-    return [simple(name, worn(mesh, m.cast(c, rng, size=64), roughness=0.6), p) for name, (mesh, c, p) in solids.items()]
+    return [
+        simple(name, worn(mesh, m.cast(c, rng, size=64), roughness=0.6), p) for name, (mesh, c, p) in solids.items()
+    ]
 
 
 def view(eye: Sequence[float], target: Sequence[float] = (0, 0, 0.01), *, fov_x: float = 40.0) -> Camera:
@@ -440,7 +442,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "shadows")
     parser.add_argument("--scenes", nargs="*", choices=SETUPS, default=list(SETUPS))
     parser.add_argument("--lights", nargs="*", choices=LIGHTS, default=list(LIGHTS))
-    parser.add_argument("--samples", type=int, default=144, help="paths per pixel of a photograph")
+    parser.add_argument("--samples", type=int, default=72, help="paths per pixel of a photograph")
     options = parser.parse_args()
     ensure_variant()
     results = {}

@@ -22,6 +22,8 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 BACKGROUND = 0.18
 """Linear grey where a scene shows nothing."""
 
+SENSOR = Sensor()
+
 CURVE_STEPS = 1 << 14
 """Entries of the tone curve's table, evenly spaced in the square root of the input."""
 
@@ -91,7 +93,7 @@ def develop(
     draws: Mapping[str, float],
     *,
     tone: Literal["neutral", "filmic"] = "neutral",
-    sensor: Sensor = Sensor(),
+    sensor: Sensor = SENSOR,
     seed: int = 0,
 ) -> npt.NDArray[np.uint8]:
     """Linear picture (H, W, 3) to display-encoded bytes, as a camera would develop it.
@@ -135,7 +137,8 @@ def _through_lens(linear: FloatArray, draws: Mapping[str, float]) -> FloatArray:
         import cv2
 
         kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
-        linear = cv2.filter2D(np.ascontiguousarray(linear), -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        blurred = cv2.filter2D(np.ascontiguousarray(linear), -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(blurred, dtype=np.float32)
     return np.asarray(linear, dtype=np.float32)
 
 
@@ -172,7 +175,7 @@ def _compressed(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.ui
     done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], dtype=np.uint8)
+    return np.ascontiguousarray(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)[..., ::-1])
 
 
 def colour_matrix(

@@ -56,8 +56,8 @@ def render_mesh(
 ) -> tuple[FloatArray, FloatArray]:
     """Path-traced radiance (H, W, 3) of a pinhole ``camera``, black where nothing is, and coverage (H, W) in [0, 1].
 
-    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it is
-    encoded, because the mean of encoded noise is too dark; only the background counts encoded, as splats are blended.
+    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it
+    is encoded, because the mean of encoded noise is too dark. Only the background counts encoded, as splats blend.
     """
     side = max(1, round(samples**0.5))
     fine = camera.resized(camera.width * side, camera.height * side)

@@ -1,12 +1,11 @@
 """Light that reaches objects from their surroundings: the radiance that the surroundings' splats have captured.
 
-What a ray from an object meets, if it is not another object, shines with the colour that was captured there, which holds
-all earlier bounces. A grid of mean colours is enough, because irradiance blurs it over the hemisphere.
+What a ray from an object meets, if it is not another object, shines with the colour that was captured there, which
+holds all earlier bounces. A grid of mean colours is enough, because irradiance blurs it over the hemisphere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 

@@ -65,12 +65,12 @@ class Emitters:
         skies = [i for i, e in enumerate(emitters) if _is_sky(e)]
         self.sky = skies[0] if skies else None
         self.even_sky = self.sky is not None and emitters[self.sky].class_name() == "ConstantBackgroundEmitter"
-        self.local = len(emitters) > len(skies)
         point = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in reference])
         fluence = self._survey(len(emitters), point)
         share = LEAST_CHANCE / len(emitters) + (1 - LEAST_CHANCE) * fluence / max(fluence.sum(), 1e-30)
         self.choice = _Choice(share)
-        self.local_choice = _Choice(np.where(np.arange(len(emitters)) == self.sky, 0, share)) if self.local else None
+        local = np.where(np.arange(len(emitters)) == self.sky, 0, share)
+        self.local_choice = _Choice(local) if len(emitters) > len(skies) else None
         infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
         self.infinite = mi.UInt32([int(v) for v in infinite])
         self.sky_colour = None
@@ -127,7 +127,8 @@ class Emitters:
         """Irradiance (Color3f) without any occluder, from the same directions for all."""
         total = mi.Color3f(0)
         if self.local_choice is not None:
-            total += self._integrate(si, active, OPEN_LATTICE, lambda u: self._local_light(si, u, active))
+            choice = self.local_choice
+            total += self._integrate(si, active, OPEN_LATTICE, lambda u: self._local_light(si, choice, u, active))
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, mi.UInt32(self.sky))
             if self.even_sky:
@@ -136,8 +137,8 @@ class Emitters:
                 total += self._integrate(si, active, SKY_LATTICE, lambda u: _facing(si, emitter, u, active))
         return total
 
-    def _local_light(self, si: Any, point: Any, active: Any) -> Any:
-        index, x, chance = self.local_choice.sample(point.x)
+    def _local_light(self, si: Any, choice: _Choice, point: Any, active: Any) -> Any:
+        index, x, chance = choice.sample(point.x)
         emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
         return _facing(si, emitter, mi.Point2f(x, point.y), active) / chance
 

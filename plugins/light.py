@@ -9,8 +9,8 @@ from scratch but a factor per visible point x with normal n,
 with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first is exactly 1 where no dynamic
 object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance under which the
 colours of the surroundings are exposed: an object taken in a light tent keeps its colours there, and is darker where
-less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.plugins.bounce`. The highlight is what the
-lights mirror, less what a light tent would have mirrored into the captured colour: under even light it adds nothing.
+less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.plugins.bounce`. The highlight is what
+the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
 Rays are spent where they are needed. A few towards the dynamic objects alone find the points whose light may differ;
 those get ``FIRST_RAYS``, and as many more as the wanted standard error of the filtered ratio asks for.
@@ -257,8 +257,7 @@ class _Tracer:
         return before.updated(index, *sums, count)
 
     def bounce(self, grid: RadianceGrid, group: Any, view: View, index: Any) -> Any:
-        """Irradiance from the surroundings over that of display white (Color3f) at those pixels of ``index`` that are
-        relit; zero elsewhere."""
+        """Irradiance from the surroundings over that of display white (Color3f), at ``index``; zero if not relit."""
         surface = self.surface
         pixels = dr.gather(mi.UInt32, index, dr.compress(dr.gather(mi.Bool, surface.relit, index)))
         here = surface.at(pixels)

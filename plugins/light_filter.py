@@ -48,8 +48,8 @@ class Estimate:
     @classmethod
     def nothing(cls, count: int) -> Estimate:
         """No rays yet at ``count`` pixels."""
-        colours = [dr.zeros(mi.Color3f, count) for _ in range(3)]
-        return cls(*colours, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
+        lit, base, shine = (dr.zeros(mi.Color3f, count) for _ in range(3))
+        return cls(lit, base, shine, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
 
     def updated(self, index: Any, *values: Any) -> Estimate:
         """The estimate with new values at some pixels."""

@@ -11,9 +11,9 @@ import numpy as np
 
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
-from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.bounce import RadianceGrid
 from mitsplat.plugins.emitters import reference_irradiance
+from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, march
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
@@ -239,7 +239,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
     def _white(self, scene: Any) -> Any:
         """Irradiance (Color3f) that the colours of uniformly captured objects stand for."""
-        return mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
+        return (
+            mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
+        )
 
     def _trace_splats(self, contents: _Contents, view: View, z_max: Any | None) -> Image:
         if contents.clouds is None:
@@ -265,9 +267,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         number = {id(splats): i for i, splats in enumerate(distinct)}
         placements = tuple(Placement(number[id(c.splats)], c.world_from_splats, c.instance) for c in carriers)
         occluders = [
-            Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats)
-            for c in carriers
-            if c.proxy is not None
+            Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats) for c in carriers if c.proxy is not None
         ]
         size = 1 + max([0, *(c.instance for c in carriers)])
         relit, roughness, specular = np.zeros(size, bool), np.full(size, 0.4, np.float32), np.zeros(size, np.float32)

@@ -14,12 +14,13 @@ import mitsplat
 from mitsplat.assets import Asset
 from mitsplat.bake import BakeSettings, bake_asset
 from mitsplat.cad import bake_lights, emitter_dict, mitsuba_scene, read_parts
+from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.render import ensure_variant
 from mitsplat.scene import AreaLight, EnvironmentLight
 from mitsplat.splats import Splats, evaluate_sh
 from mitsplat.surfels import CREASE_ANGLE, corner_normals, place_surfels, poisson_subset
-from mitsplat.trace import encode_srgb, trace_radiance
+from mitsplat.trace import encode_srgb, render_mesh, trace_radiance
 
 FACE_COLOURS = np.array(
     [[230, 40, 40], [40, 200, 60], [50, 70, 220], [220, 200, 40], [40, 200, 210], [200, 60, 200]], dtype=np.uint8
@@ -222,7 +223,9 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
     np.testing.assert_allclose(corner_normals(part.mesh), part.mesh.triangles, atol=0.01)
     (part,) = read_parts(trimesh.creation.box())
     assert np.pi / 2 > CREASE_ANGLE
-    np.testing.assert_allclose(corner_normals(part.mesh), np.repeat(part.mesh.face_normals[:, None], 3, axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        corner_normals(part.mesh), np.repeat(part.mesh.face_normals[:, None], 3, axis=1), atol=1e-6
+    )
 
 
 def test_studio_has_mean_radiance_one() -> None:
@@ -307,3 +310,16 @@ def test_proxy_keeps_a_textured_table_and_leaves_out_a_label() -> None:
     flat = (np.abs(proxy.triangles_center[:, 2]) < 1e-6) & (proxy.face_normals[:, 2] > 0.999)
     assert proxy.area_faces[flat].sum() == pytest.approx(1.0, rel=1e-6)
     assert proxy.bounds[1, 2] == pytest.approx(0.1, abs=1e-4)
+
+
+def test_picture_of_few_samples_is_no_darker_than_one_of_many() -> None:
+    """One path a ray, two emitters: noise must be averaged before it is encoded (Jensen's inequality)."""
+    lights = [
+        AreaLight(position=(0.3, 0.2, 0.8), size=(0.3, 0.3), radiance=14.0),
+        AreaLight(position=(-0.6, 0.2, 0.8), size=(0.3, 0.3), radiance=7.0),
+    ]
+    table = white(trimesh.creation.box(bounds=[[-0.5, -0.5, -0.1], [0.5, 0.5, 0.0]]))
+    scene = mitsuba_scene(read_parts(table), bake_lights(lights))
+    camera = Camera.look_at((0, -0.3, 0.5), (0, 0, 0), width=40, height=30, fov_x=30)
+    few, many = (render_mesh(scene, camera, samples=samples)[0].mean() for samples in (16, 1024))
+    assert few == pytest.approx(many, rel=0.02)

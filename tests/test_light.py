@@ -289,7 +289,7 @@ def test_default_accuracy_keeps_its_promise_in_the_penumbra() -> None:
 
 @pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
 def test_no_acne_beside_an_object_and_no_gap_under_it(unit: float) -> None:
-    """A cube on the floor under a slanting lamp: lit floor is lit to the last bit, and the shadow starts at the edge."""
+    """A cube on the floor under a slanting lamp: lit floor is lit to the last bit, the shadow starts at the edge."""
     make_integrator()
     cube = trimesh.creation.box(bounds=np.multiply(unit, [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]]))
     lamp = {"type": "directional", "direction": [1, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
@@ -345,7 +345,7 @@ def test_grazing_light_ends_on_a_coarse_ball_where_it_ends_on_a_round_one(subdiv
 
 
 def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None:
-    """Relit white under white = pi: E/pi for a spot, a directional light, a point and a map, with nothing in the way."""
+    """Relit white under white = pi: E/pi for every kind of light, with nothing in the way."""
     make_integrator()
     pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0])
     sky = np.zeros((256, 512, 3), np.float32)
@@ -381,7 +381,7 @@ def test_wall_hides_half_of_a_sky_to_a_thousandth() -> None:
 
 
 def test_highlight_takes_no_more_light_than_arrives() -> None:
-    """Under a uniform sky of radiance 1 a mirror-like or rough lobe of reflectance 1 shows at most 1 (white furnace)."""
+    """Under a uniform sky of radiance 1 a lobe of reflectance 1 shows at most 1 (white furnace)."""
     make_integrator()
     for roughness in (0.3, 0.5, 1.0):
         shiny = make_splats_shape(
@@ -415,7 +415,7 @@ def test_in_the_light_of_its_capture_an_object_looks_as_captured(roughness: floa
 
 
 def test_red_wall_lights_what_stands_before_it() -> None:
-    """Light from all sides but a half space of captured red: E_bounce over that of white is half the wall's colour."""
+    """A sky of which a captured red wall hides half: E_bounce over that of white is half the wall's colour."""
     make_integrator()
     wall = trimesh.creation.box(bounds=[[0.3, -500, -500], [0.4, 500, 500]])
     red = np.array([0.8, 0.2, 0.1])

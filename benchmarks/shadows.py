@@ -414,8 +414,8 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
     result["ratio rms"] = float(np.sqrt(np.mean(error**2)))
     result["edges"], result["width"] = len(widths), float(np.median(widths[:, 0])) if len(widths) else np.nan
     for column, key in ((1, "traced"), (2, "image")):
-        relative = np.abs(widths[:, column] - widths[:, 0]) / np.maximum(widths[:, 0], 0.5)
-        result[f"width error {key}"] = float(np.nanmedian(relative)) if len(widths) else np.nan
+        error = np.abs(widths[:, column] - widths[:, 0]) / np.maximum(widths[:, 0], 0.5)
+        result[f"width error {key}"] = float(np.nanmedian(error)) if len(widths) else np.nan
     shown = [truth.photo, pictures["none"], pictures["image"], pictures["traced"]]
     save_sheet(out / f"{name}_{light}.png", [*shown, pictures["capture traced"], layers.light.astype(np.float64)])
     return result

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.render import Layers
-from mitsplat.spec import Composite, Sensor
+from mitsplat.spec import Composite, ImageShadow, Sensor
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -31,33 +30,10 @@ CURVE_WHITE = 16.0
 """Linear input at the end of the table."""
 
 
-@dataclass(frozen=True)
-class ImageShadow:
-    """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2).
-
-    The shadow map is normalised, blurred, bent by a sigmoid and multiplied; where it is brightest, light is added.
-
-    Attributes:
-        blur: Standard deviation of the Gaussian blur [px at a width of 1280].
-        slope: Steepness of the sigmoid.
-        midpoint: Value of the normalised map that the sigmoid takes to one half.
-        darkest: Factor in full shadow.
-        highlight_start: Value of the normalised map above which the highlight starts.
-        highlight_gain: Linear value that the highlight adds at most.
-    """
-
-    blur: float = 5.0
-    slope: float = 10.0
-    midpoint: float = 0.5
-    darkest: float = 0.35
-    highlight_start: float = 0.85
-    highlight_gain: float = 0.06
-
-
-def light_image(layers: Layers, composite: Composite, *, image_shadow: ImageShadow = ImageShadow()) -> FloatArray:
+def light_image(layers: Layers, composite: Composite) -> FloatArray:
     """Linear picture (H, W, 3) from captured colour, shadow and highlight, over a grey background."""
     if composite.shadow == "image":
-        factor, shine = shadow_from_image(layers.light @ LUMINANCE, image_shadow)
+        factor, shine = shadow_from_image(layers.light @ LUMINANCE, composite.image_shadow)
         lit = layers.captured * factor[..., None]
         if composite.highlight:
             lit += (shine * layers.alpha)[..., None]
@@ -68,7 +44,7 @@ def light_image(layers: Layers, composite: Composite, *, image_shadow: ImageShad
     return np.asarray(lit + (BACKGROUND * (1 - layers.alpha))[..., None], dtype=np.float32)
 
 
-def shadow_from_image(shadow_map: FloatArray, parameters: ImageShadow = ImageShadow()) -> tuple[FloatArray, FloatArray]:
+def shadow_from_image(shadow_map: FloatArray, parameters: ImageShadow) -> tuple[FloatArray, FloatArray]:
     """Factor and highlight (H, W) that the published chain makes of a shadow map (H, W)."""
     import cv2
 

@@ -340,7 +340,7 @@ def _asset_hash(asset: Asset) -> str:
     arrays: list[Any] = [splats.means, splats.quats, splats.scales, splats.opacities, splats.sh]
     arrays += [array for mesh in meshes for array in (mesh.vertices, mesh.faces)]
     arrays += [asset.keypoint_array]
-    physics = [asset.density, asset.mass or 0.0, asset.friction, asset.roughness, asset.specular]
+    physics = [asset.density, asset.mass or 0.0, asset.friction, asset.roughness, asset.specular, asset.white or 0.0]
     return _hash(*arrays, np.array(physics), np.frombuffer(asset.capture_light.encode(), dtype=np.uint8))
 
 

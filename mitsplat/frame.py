@@ -175,6 +175,7 @@ class _Studio:
             reference=reference_point(scene),
             white=white_irradiance(scene),
             bounce=scene.spec.composite.bounce,
+            shadow_error=scene.spec.composite.shadow_error,
         )
         self.static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None

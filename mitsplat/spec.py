@@ -374,12 +374,32 @@ class Sensor(StrictModel):
     read_noise: NonNegativeFloat = Field(3.0, description="Electrons, 1 sigma.")
 
 
+class ImageShadow(StrictModel):
+    """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2).
+
+    The shadow map is normalised, blurred, bent by a sigmoid and multiplied; where it is brightest, light is added.
+    """
+
+    blur: Positive = Field(5.0, description="Standard deviation of the Gaussian blur [px at a width of 1280].")
+    slope: Positive = Field(10.0, description="Steepness of the sigmoid.")
+    midpoint: Unit = Field(0.5, description="Value of the normalised map that the sigmoid takes to one half.")
+    darkest: Unit = Field(0.35, description="Factor in full shadow.")
+    highlight_start: float = Field(
+        0.85, ge=0, lt=1, description="Value of the normalised map above which the highlight starts."
+    )
+    highlight_gain: NonNegativeFloat = Field(0.06, description="Linear value that the highlight adds at most.")
+
+
 class Composite(StrictModel):
     """How layers become a picture."""
 
     shadow: Literal["traced", "image", "none"] = Field(
         "traced", description="Shadow rays, the image-space approximation, or no shadow."
     )
+    shadow_error: float = Field(
+        0.03, gt=0, lt=1, description="Standard error of traced light for which shadow rays are spent."
+    )
+    image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of shadow: image.")
     highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")
     bounce: bool = Field(True, description="Whether objects get the light that the environment reflects to them.")
     tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")

@@ -55,6 +55,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
             "reference": list(reference_point(scene)),
             "white": white_irradiance(scene) or 0.0,
             "bounce": scene.spec.composite.bounce,
+            "shadow_error": scene.spec.composite.shadow_error,
         },
         "sensor": describe_sensor(plan.camera),
         **shapes,

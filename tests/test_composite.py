@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
 from mitsplat.composite import (
-    ImageShadow,
     black_body_colour,
     colour_matrix,
     develop,
+    light_image,
     motion_kernel,
     shadow_from_image,
     tone_curve,
 )
-from mitsplat.spec import Sensor
+from mitsplat.render import Layers
+from mitsplat.spec import Composite, ImageShadow, Sensor
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
@@ -138,3 +141,16 @@ def test_published_shadow_is_darkest_in_shadow_and_one_in_light() -> None:
     assert factor[32, 120] == pytest.approx(1.0, abs=0.01)
     assert (np.diff(factor[32]) >= -1e-6).all()
     assert shine[32, 2] == 0 and shine[32, 120] == pytest.approx(parameters.highlight_gain, rel=0.01)
+
+
+def test_parameters_of_the_published_shadow_reach_the_picture() -> None:
+    light = np.ones((64, 128, 3), np.float32)
+    light[:, :40] = 0.0
+    layers = dict.fromkeys((f.name for f in fields(Layers)), np.zeros((64, 128), np.float32))
+    layers |= {"captured": np.full((64, 128, 3), 0.5, np.float32), "alpha": np.ones((64, 128), np.float32)}
+    layers = Layers(**{**layers, "light": light})
+    for darkest in (0.2, 0.6):
+        shadow = ImageShadow(darkest=darkest, highlight_gain=0.1)
+        picture = light_image(layers, Composite(shadow="image", image_shadow=shadow))
+        np.testing.assert_allclose(picture[32, 2], 0.5 * darkest, atol=0.005)
+        np.testing.assert_allclose(picture[32, 120], 0.5 + 0.1, atol=0.005)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -9,9 +10,13 @@ import numpy as np
 import pytest
 from conftest import WriteScene
 from PIL import Image
+from pydantic import TypeAdapter
 
 import mitsplat as ms
+from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.scene import FramePlan, LightSpec
+from mitsplat.writers import write_frame
 from mitsplat.xml_scene import export_xml, render_xml
 
 
@@ -81,6 +86,53 @@ def test_silhouettes_are_labels_of_the_instances_alone(
         np.testing.assert_array_equal(only.mask, label.amodal.mask)
         assert (only.box, only.visible_fraction) == (label.amodal.box, 1)
         assert label.visible_fraction == label.area / only.area
+
+
+def test_frame_is_remade_from_its_record(
+    scene_data: dict[str, Any],
+    write_scene: WriteScene,
+    scene: ms.Scene,
+    settled: dict[str, Any],
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A scene of another seed, given only what the manifest says of a frame, shows the same picture."""
+    layout = layout_of_small_scene(scene, settled)
+    path = [{"position": [0.1, 0, 0.4], "temperature": 3000}, {"position": [-0.1, 0, 0.5], "temperature": 8000}]
+    scene_data["lights"] = [
+        {"kind": "point", "position": [0, 0, 0.5], "intensity": 0.3, "temperature": 5000, "path": path},
+        {"kind": "environment", "radiance": 0.5},
+    ]
+    scene_data["randomise"] = {
+        "exposure": [-1, 1], "hue": [-5, 5], "saturation": [0.8, 1.2], "white_balance": [5000, 7000], "iso": [100, 800],
+        "vignetting": [0, 1], "motion_blur": [0, 3], "jpeg": [40, 95], "light_intensity": [0.5, 2],
+    }  # fmt: skip
+    first = ms.load_scene(write_scene(scene_data))
+    frame = ms.render_frame(first, 2, layout=layout)
+    (tmp_path / "images" / frame.plan.split).mkdir(parents=True)
+    (tmp_path / "labels" / frame.plan.split).mkdir(parents=True)
+    record = json.loads(json.dumps(write_frame(frame, tmp_path, first.spec.output)))
+
+    taken = record["camera"]
+    (fx, _, cx), (_, fy, cy), _ = taken["intrinsics"]
+    camera = Camera(
+        taken["width"],
+        taken["height"],
+        *(fx, fy, cx, cy),
+        np.array(taken["world_from_camera"]),
+        tuple(taken["distortion"]),
+        taken["near"],
+    )
+    plan = FramePlan(
+        **{name: record[name] for name in ("index", "layout", "view", "split", "draws", "seed")},
+        camera=camera,
+        lights=tuple(TypeAdapter(LightSpec).validate_python(light) for light in record["lights"]),
+    )
+    scene_data["seed"] = 999
+    other = ms.load_scene(write_scene(scene_data))
+    assert ms.render_frame(other, 2, layout=layout).image.tobytes() != frame.image.tobytes()
+    monkeypatch.setattr("mitsplat.frame.plan_frame", lambda *_: plan)
+    assert ms.render_frame(other, 2, layout=layout).image.tobytes() == frame.image.tobytes()
 
 
 @pytest.mark.parametrize("shadow", ["none", "image"])

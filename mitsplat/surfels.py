@@ -412,12 +412,12 @@ class _CreaseIndex:
         return inside[..., None] * self.units[segment] - from_start, inside == position
 
 
-def corner_normals(mesh: trimesh.Trimesh) -> FloatArray:
-    """Unit normals (F, 3, 3) at the corners of faces, smooth except across creases, weighted by area."""
+def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE) -> FloatArray:
+    """Unit normals (F, 3, 3) at the corners of faces, smooth except across creases [rad], weighted by area."""
     corner = np.repeat(np.arange(len(mesh.faces)), 3)
     incidence = mesh.faces_sparse.astype(np.float64)
     pairs = (incidence.T @ incidence).tocoo()
-    alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(CREASE_ANGLE)
+    alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(crease_angle)
     row, col = pairs.row[alike], pairs.col[alike]
     normals = np.zeros((len(mesh.faces), 3, 3))
     weighted = mesh.face_normals * mesh.area_faces[:, None]

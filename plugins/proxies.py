@@ -12,7 +12,14 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.surfels import corner_normals
+from mitsplat.surfels import CREASE_ANGLE, corner_normals
+
+NOISE_CREASE = 10.0
+"""Dihedral angle of a crease over the lower quartile of a mesh, which is zero where it was drawn: flat faces have edges
+inside; and from 2 to 8 degrees where a smooth surface was reconstructed."""
+
+SHARPEST = np.radians(80.0)
+"""Dihedral angle that is a crease in any mesh [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +136,7 @@ class _TraceScene:
             turn, shift = occluder.world_from_mesh[:3, :3], occluder.world_from_mesh[:3, 3]
             corners.append(occluder.mesh.triangles.reshape(-1, 3) @ turn.T + shift)
             turn = turn / np.cbrt(np.linalg.det(turn))
-            normals.append(_smooth_normals(occluder.mesh).reshape(-1, 3) @ turn.T)
+            normals.append(smooth_normals(occluder.mesh).reshape(-1, 3) @ turn.T)
         positions = mi.Float(np.concatenate(corners).ravel().astype(np.float32))
         count = sum(len(c) for c in corners)
         mesh = mi.Mesh("proxies", count, count // 3)
@@ -148,6 +155,14 @@ class _TraceScene:
 
 
 @lru_cache(maxsize=64)
-def _smooth_normals(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Corner normals, kept from layout to layout."""
-    return corner_normals(mesh)
+def smooth_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Corner normals, kept from layout to layout.
+
+    Reconstructed surfaces are rough everywhere: what would be a crease in a drawing is noise there, and no edge is one
+    that is not much sharper than the flattest quarter of the others, by length.
+    """
+    angles, ends = mesh.face_adjacency_angles, mesh.vertices[mesh.face_adjacency_edges]
+    order = np.argsort(angles)
+    lengths = np.cumsum(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order])
+    usual = angles[order[np.searchsorted(lengths, 0.25 * lengths[-1])]] if len(order) else 0.0
+    return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))

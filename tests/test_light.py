@@ -10,8 +10,10 @@ import pytest
 import trimesh
 
 from mitsplat.camera import Camera
+from mitsplat.plugins.proxies import smooth_normals
 from mitsplat.render import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.splats import SH_C0, Splats
+from mitsplat.surfels import CREASE_ANGLE
 
 WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
 
@@ -344,6 +346,22 @@ def test_grazing_light_ends_on_a_coarse_ball_where_it_ends_on_a_round_one(subdiv
     assert np.percentile(difference, 99) < 0.12
 
 
+def test_scan_that_is_rough_everywhere_has_no_creases_and_a_drawing_keeps_its_own() -> None:
+    rng = np.random.default_rng(0)
+    scan = trimesh.creation.icosphere(3, 0.1)
+    scan.vertices *= 1 + 0.025 * rng.normal(size=(len(scan.vertices), 1))
+    assert (scan.face_adjacency_angles > CREASE_ANGLE).mean() > 0.15
+    normals = smooth_normals(scan).reshape(-1, 3)
+    order = np.argsort(scan.faces.ravel(), kind="stable")
+    _, first, which = np.unique(scan.faces.ravel()[order], return_index=True, return_inverse=True)
+    agreement = np.einsum("ij,ij->i", normals[order], normals[order][first][which])
+    assert np.percentile(agreement, 2) > 0.99
+    for height in (0.01, 0.1, 2.0):
+        prism = trimesh.creation.cylinder(0.1, height, sections=6)
+        sharp = np.repeat(prism.face_normals[:, None], 3, axis=1)
+        np.testing.assert_allclose(smooth_normals(prism), sharp, atol=1e-6)
+
+
 def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None:
     """Relit white under white = pi: E/pi for every kind of light, with nothing in the way."""
     make_integrator()
@@ -367,7 +385,7 @@ def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None
         assert layers.light.mean() == pytest.approx(irradiance / np.pi, rel=0.01), name
 
 
-def test_wall_hides_half_of_a_sky_to_a_thousandth() -> None:
+def test_wall_hides_half_of_a_sky() -> None:
     make_integrator()
     wall = trimesh.creation.box(bounds=[[0.0, -5000, 0.0], [0.5, 5000, 5000]])
     shapes = {

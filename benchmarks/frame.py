@@ -14,16 +14,10 @@ import statistics
 import time
 from pathlib import Path
 
-import mitsplat as ms  # before Mitsuba
-
-# isort: split
-import mitsuba as mi
-
+import mitsplat as ms
 from benchmarks.captures import CAMERA, crowd
 from benchmarks.volprim import render_volprim, volprim_scene
-from mitsplat.frame import _Studio
-from mitsplat.render import render_layers
-from mitsplat.scene import layout_of, plan_frame
+from mitsplat.scene import layout_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -47,21 +41,19 @@ def time_frames(path: Path, frames: int) -> None:
 
 
 def time_light(path: Path, repeats: int = 8) -> None:
-    """Print what shadows and highlights add to the time of a frame's layers, in frames that take turns."""
-    scene = ms.load_scene(path)
-    layout = ms.settle_layout(scene, layout_of(scene, 0))
-    studio = _Studio.of(scene, scene.spec.quality)
-    seconds: dict[str, list[float]] = {"none": [], "traced": []}
+    """Print what shadows and highlights cost: the same frames with and without, in turns."""
+    scenes = [ms.load_scene(path, overrides={"composite.shadow": shadow}) for shadow in ("none", "traced")]
+    layout = ms.settle_layout(scenes[0], layout_of(scenes[0], 0))
+    wall, processor = [], []
     for index in range(repeats + 1):
-        plan = plan_frame(scene, index % scene.spec.output.views)
-        for shadow, times in seconds.items():
-            studio.integrator.shadow = shadow
-            placed = mi.load_dict(studio.describe(layout, plan.lights))
-            start = time.perf_counter()
-            render_layers(studio.integrator, placed, plan.camera, seed=plan.seed)
-            times.append(time.perf_counter() - start)
-    plain, lit = (statistics.median(times[1:]) for times in seconds.values())
-    print(f"layers without light {plain:.3f} s, with {lit:.3f} s: light takes {lit / plain - 1:.2f} of the rest")
+        for scene in scenes:
+            start = time.perf_counter(), time.process_time()
+            ms.render_frame(scene, index % scene.spec.output.views, layout=layout)
+            wall.append(time.perf_counter() - start[0])
+            processor.append(time.process_time() - start[1])
+    for name, times in (("seconds", wall), ("processor seconds of all threads", processor)):
+        plain, lit = (statistics.median(times[2 + k :: 2]) for k in (0, 1))
+        print(f"frame without light {plain:.3f}, with {lit:.3f}: light takes {lit - plain:.3f} {name}")
 
 
 def compare_with_volprim(repeats: int = 5) -> None:

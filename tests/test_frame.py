@@ -16,7 +16,7 @@ import mitsplat as ms
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.scene import FramePlan, LightSpec
-from mitsplat.writers import write_frame
+from mitsplat.writers import Catalogue, write_frame
 from mitsplat.xml_scene import export_xml, render_xml
 
 
@@ -111,7 +111,7 @@ def test_frame_is_remade_from_its_record(
     frame = ms.render_frame(first, 2, layout=layout)
     (tmp_path / "images" / frame.plan.split).mkdir(parents=True)
     (tmp_path / "labels" / frame.plan.split).mkdir(parents=True)
-    record = json.loads(json.dumps(write_frame(frame, tmp_path, first.spec.output)))
+    record = json.loads(json.dumps(write_frame(frame, tmp_path, first.spec, Catalogue.of(first))))
 
     taken = record["camera"]
     (fx, _, cx), (_, fy, cy), _ = taken["intrinsics"]
@@ -126,6 +126,7 @@ def test_frame_is_remade_from_its_record(
     plan = FramePlan(
         **{name: record[name] for name in ("index", "layout", "view", "split", "draws", "seed")},
         camera=camera,
+        next_camera=None,
         lights=tuple(TypeAdapter(LightSpec).validate_python(light) for light in record["lights"]),
     )
     scene_data["seed"] = 999

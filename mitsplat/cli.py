@@ -59,6 +59,10 @@ def render(
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")] = None,
     seed: Annotated[int | None, typer.Option(help="Decides everything that is random.")] = None,
     quality: Annotated[QualityName | None, typer.Option(help="Rendering preset.")] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Choose the cheapest preset within this error (RMSE of encoded colours), as `chart` does."),
+    ] = None,
     workers: Annotated[int, typer.Option(help="Processes that make images.")] = 1,
     formats: Annotated[
         str | None,
@@ -77,7 +81,7 @@ def render(
     if out is None:
         out = Path("out") / scene.stem
     if scene.suffix == ".xml":
-        if overrides or frames is not None:
+        if overrides or frames is not None or tolerance is not None:
             raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
         from mitsplat.xml_scene import render_xml
 
@@ -87,12 +91,59 @@ def render(
     from mitsplat.scene import load_scene
 
     loaded = load_scene(scene, overrides=overrides)
+    if tolerance is not None:
+        if quality is not None:
+            raise InputError("--quality and --tolerance both choose the preset: give one of them")
+        from mitsplat.chart import choose_preset
+
+        with _progress_bar() as progress:
+            best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
+        typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
+        loaded = load_scene(scene, overrides=overrides | {"quality": best.name})
     with _progress_bar() as progress:
         summary = write_dataset(loaded, out, frames=frames, workers=workers, overwrite=overwrite, progress=progress)
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
     typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
     typer.echo(f"contact sheet: {summary.contact_sheet}")
+
+
+@app.command()
+def chart(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a file of splats.")],
+    frames: Annotated[int, typer.Option("--frames", "-n", help="Images to compare, spread over the scene's.")] = 3,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 640x360.")] = None,
+    tolerance: Annotated[
+        float, typer.Option(help="Mark the cheapest preset within this error (RMSE of encoded colours).")
+    ] = 0.004,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Chart to write (.png); a .csv of the same name goes beside it.")
+    ] = Path("chart.png"),
+) -> None:
+    """Chart speed against accuracy for SCENE.
+
+    Every preset, and cheaper models of light, beside the preset exact. Times are those of this machine, now.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from mitsplat.chart import cheapest, draw_chart, measure_steps, write_csv
+
+    if out.suffix.lower() != ".png" or not out.parent.is_dir():
+        raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
+    with _progress_bar() as progress:
+        rows = measure_steps(scene, frames=frames, overrides=_overrides(size=size), note=progress)
+    best = cheapest(rows, tolerance)
+    table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "SSIM", "mask IoU", "peak [GiB]")
+    for row in rows:
+        name = f"{row.name} *" if row == best else row.name
+        numbers = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.ssim:.4f}", f"{row.mask_iou:.4f}"
+        table.add_row(name, f"{row.seconds:.2f}", *numbers, f"{row.memory:.2f}")
+    Console(width=100).print(table)
+    typer.echo(f"* the cheapest preset within {tolerance:g}")
+    write_csv(rows, out.with_suffix(".csv"))
+    draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)
+    typer.echo(f"chart: {out}, {out.with_suffix('.csv')}")
 
 
 @app.command()

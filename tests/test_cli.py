@@ -17,7 +17,7 @@ import typer.main
 from conftest import WriteScene, box_asset
 from PIL import Image, ImageSequence
 
-from mitsplat import bake, dataset, frame, settle, xml_scene
+from mitsplat import bake, chart, dataset, frame, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
@@ -98,6 +98,19 @@ def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_d
     assert (scene.spec.output.width, scene.spec.seed, scene.spec.quality) == (64, 7, "balanced")
     write_dataset.kwargs.pop("progress")
     assert write_dataset.kwargs == {"frames": None, "workers": 1, "overwrite": False}
+
+
+def test_render_chooses_the_preset_within_a_tolerance(
+    scene_path: Path, write_dataset: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = Calls(chart.Row("fast", 0.5, 0.01, 40.0, 0.1, 0.9, 0.9, 1.0))
+    monkeypatch.setattr(chart, "choose_preset", chosen)
+    assert run("render", scene_path, "--tolerance", "0.02", "--seed", 3) == 0
+    assert chosen.args == (scene_path, 0.02)
+    assert chosen.kwargs["overrides"] == {"seed": 3}
+    scene, _ = write_dataset.args
+    assert (scene.spec.quality, scene.spec.seed) == ("fast", 3)
+    assert "preset: fast (RMSE 0.01, 0.50 s an image)" in capsys.readouterr().out
 
 
 def test_progress_bar_tells_images_and_rate(
@@ -250,6 +263,7 @@ def test_bad_option_of_settle_is_one_sentence(
         (["-n", "13"], "(got 13)"),
         (["-n", "0"], "(got 0)"),
         (["--workers", "0"], "(got 0)"),
+        (["--quality", "fast", "--tolerance", "0.1"], "--quality and --tolerance both choose the preset"),
     ],
 )
 def test_bad_option_is_one_sentence(

@@ -6,7 +6,7 @@ for a packet of rays: the more pixels share a fetch, the better, until registers
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,9 +14,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.errors import MissingResourceError
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.rays import TILE, View
-from mitsplat.plugins.tiles import TileLists
+from mitsplat.plugins.tiles import CloudSet, CrowdedError, Placement, TileLists, bin_gaussians
 from mitsplat.quality import KERNELS, Quality
 
 SORT_SLOTS = 8
@@ -47,6 +48,13 @@ class Image:
         """Rays that met nothing."""
         nothing = dr.zeros(mi.Float, count)
         return cls([nothing] * 3, nothing, nothing, dr.zeros(mi.UInt32, count), nothing)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Image]) -> Image:
+        """The image whose rows are those of the parts, one after the other."""
+        rgb = [dr.concat([part.rgb[c] for part in parts]) for c in range(3)]
+        rest = [dr.concat([getattr(p, name) for p in parts]) for name in ("alpha", "depth", "instance", "share")]
+        return cls(rgb, *rest)
 
 
 Pixel = list[Any]
@@ -146,6 +154,38 @@ class Lanes:
         """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
         pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(TILE)]
         return [u for u, _ in pairs], [v for _, v in pairs]
+
+
+def trace(
+    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, *, z_max: Any | None = None
+) -> Image:
+    """Image of all placements; one that is too crowded for the memory is made in parts.
+
+    Args:
+        clouds: Gaussians on the device.
+        placements: Where they are.
+        view: The camera, from :meth:`View.sampled`.
+        quality: Order, cut-offs and kernel.
+        z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
+
+    Raises:
+        MissingResourceError: If even one row of tiles is too crowded.
+    """
+    try:
+        return march(bin_gaussians(clouds, placements, view, quality), view, quality, z_max=z_max)
+    except CrowdedError:
+        if view.tiles_y == 1:
+            raise MissingResourceError(
+                "the splats cover too much of the image for the memory: render a smaller image, or split the splats"
+            ) from None
+    middle = view.tiles_y // 2 * TILE
+    parts = []
+    for start, stop in ((0, middle), (middle, view.height)):
+        pixels = dr.arange(mi.UInt32, (stop - start) * view.width) + start * view.width
+        part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
+        parts.append(trace(clouds, placements, view.rows(start, stop), quality, z_max=part_z))
+        dr.eval(parts[-1])
+    return Image.joined(parts)
 
 
 def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None = None) -> Image:

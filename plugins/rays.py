@@ -68,6 +68,10 @@ class View:
         """The same view with ``samples`` x ``samples`` rays per pixel."""
         return self if samples == self.samples else replace(self, samples=samples)
 
+    def rows(self, start: int, stop: int) -> View:
+        """The part of the view from pixel row ``start`` up to ``stop``."""
+        return replace(self, height=stop - start, cy=self.cy - start)
+
     def rays(self) -> Any:
         """World-space rays through the pixels' centres, row-major, of unit direction."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)

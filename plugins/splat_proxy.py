@@ -15,11 +15,11 @@ from mitsplat.plugins.bounce import RadianceGrid
 from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
-from mitsplat.plugins.march import Image, march
+from mitsplat.plugins.march import Image, trace
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
-from mitsplat.plugins.tiles import CloudSet, Placement, bin_gaussians, merge_clouds
+from mitsplat.plugins.tiles import CloudSet, Placement, merge_clouds
 from mitsplat.quality import resolve_quality
 
 AOVS = (
@@ -246,10 +246,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _trace_splats(self, contents: _Contents, view: View, z_max: Any | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
-        quality = self.quality
-        fine = view.sampled(quality.samples)
-        lists = bin_gaussians(contents.clouds, contents.placements, fine, quality)
-        return march(lists, fine, quality, z_max=z_max)
+        fine = view.sampled(self.quality.samples)
+        return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
 
     def _read(self, scene: Any) -> _Contents:
         """Upload what the shapes hold, unless they are those of the last call."""

@@ -90,6 +90,14 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     return CloudSet(counts, first, geometry, scales, sh, max(c.sh_count for c in clouds), stride)
 
 
+CANDIDATES_MAX = 1 << 26
+"""Most pairs of a Gaussian and a tile in its box that are held at once, about 40 bytes each."""
+
+
+class CrowdedError(Exception):
+    """A view has more pairs than :data:`CANDIDATES_MAX`: render a part of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class TileLists:
     """Depth-sorted Gaussians of every tile.
@@ -115,7 +123,11 @@ class TileLists:
 
 
 def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality) -> TileLists:
-    """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`."""
+    """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
+
+    Raises:
+        CrowdedError: If the view has too many pairs to hold.
+    """
     tiles = view.tiles_x * view.tiles_y
     table, owner, local = _placement_table(clouds, placements, view)
     total = dr.width(local)
@@ -133,6 +145,9 @@ def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View,
     dr.eval(owner, local)
 
     records, near, bounds, box, candidates = source.records(owner, local)
+    # As floats, because a sum of integers would wrap.
+    if dr.sum(mi.Float(candidates))[0] > CANDIDATES_MAX:
+        raise CrowdedError
     entries, nearest, start, stop = _pair(dr.detach(records), bounds, box, candidates, view, tiles, quality.order)
     return TileLists(records, near, entries, nearest, start, stop, count, dr.width(entries))
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
 from mitsplat.composite import tone_curve
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.quality import KERNELS, PRESETS, Quality
 from mitsplat.render import Layers, make_sensor, render_splats
 from mitsplat.splats import SH_C0, Splats
@@ -247,6 +247,27 @@ def test_nothing_to_see_is_black_and_empty() -> None:
     for splats in (behind.select(np.zeros(1, bool)), behind):
         layers = render_splats(splats, CAMERA)
         assert not layers.rgb.any() and not layers.alpha.any() and not layers.depth.any() and not layers.instance.any()
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+    from mitsplat.plugins import march, tiles
+
+    joined = []
+    join = march.Image.joined
+    monkeypatch.setattr(march.Image, "joined", lambda parts: joined.append(parts) or join(parts))
+    splats = make_splats(300, 8)
+    quality = replace(PRESETS["exact"], samples=samples)
+    camera = replace(CAMERA, height=27)
+    whole = render_splats(splats, camera, quality=quality)
+    monkeypatch.setattr(tiles, "CANDIDATES_MAX", 3000)
+    parts = render_splats(splats, camera, quality=quality)
+    assert joined
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=2e-6)
+    monkeypatch.setattr(tiles, "CANDIDATES_MAX", 10)
+    with pytest.raises(MissingResourceError, match="cover too much of the image"):
+        render_splats(splats, camera, quality=quality)
 
 
 def test_instance_is_the_one_with_the_largest_share() -> None:

@@ -110,7 +110,12 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
     )
     following = Camera.look_at((0.05, 0, 1), (0.05, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60)
     plan = SimpleNamespace(
-        layout=index // 2, view=index % 2, split="train" if index % 4 < 2 else "val", seed=index, next_camera=following
+        layout=index // 2,
+        view=index % 2,
+        split="train" if index % 4 < 2 else "val",
+        seed=index,
+        next_camera=following,
+        lights=(),
     )
     return SimpleNamespace(
         index=index,

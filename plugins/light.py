@@ -168,10 +168,11 @@ def light_factor(
         scale = mi.Color3f(dr.full(mi.Float, 1, dr.width(index)))
         dr.scatter(scale, relit, anew)
         share *= scale
-        if grid is not None and proxies.static is not None:
-            share += tracer.bounce(grid, group, view, index)
     shine *= dr.pi / reference
     shine -= dr.select(here.relit, share * _mirrored(here), 0)
+    if dr.width(anew) and grid is not None and proxies.static is not None:
+        # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest known.
+        share += tracer.bounce(grid, group, view, index)
     light = mi.Color3f(dr.full(mi.Float, 1, dr.width(surface.valid)))
     highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(surface.valid)))
     dr.scatter(light, share, index)
@@ -316,9 +317,10 @@ def _ggx(surface: Surface, to_light: Any, cos_camera: Any, alpha2: Any) -> Any:
 def _mirrored(surface: Surface) -> Any:
     """Part of the captured colour that is light of the tent, mirrored: the lobe's reflectance under even light.
 
-    Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine).
+    Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60 degrees: colours
+    of few SH bands do not show it, so that to take it away would blacken silhouettes.
     """
-    cosine = dr.maximum(dr.dot(surface.normal, surface.to_camera), 0)
+    cosine = dr.maximum(dr.dot(surface.normal, surface.to_camera), 0.5)
     rough = surface.roughness
     x, y, z, w = 1 - rough, dr.fma(-0.0275, rough, 0.0425), dr.fma(-0.572, rough, 1.04), dr.fma(0.022, rough, -0.04)
     bend = dr.fma(dr.minimum(x * x, dr.exp2(-9.28 * cosine)), x, y)

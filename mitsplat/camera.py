@@ -1,4 +1,4 @@
-"""Pinhole cameras in OpenCV convention, and paths between key cameras.
+"""Cameras in OpenCV convention, pinhole, distorted or fisheye, and paths between key cameras.
 
 Conventions are those of :mod:`mitsplat.splats`: x right, y down, z forward in the camera; pixel centres at +0.5.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 FloatArray = npt.NDArray[np.float64]
+
+FISHEYE_MAX = float(np.radians(85.0))
+"""Widest angle to the optical axis that a fisheye may show [rad]: rays are held as slopes, which grow beyond bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +29,15 @@ class Camera:
         fx, fy: Focal lengths [px].
         cx, cy: Principal point [px], pixel centres at +0.5 (the middle of an image is ``width / 2``).
         world_from_camera: Rigid transform of camera coordinates to world coordinates [m], shape (4, 4).
-        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole.
+        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole; of a fisheye
+            ``k1, k2, k3, k4``.
         near: Nearest depth at which anything is seen [m].
+        lens: ``opencv``, or ``fisheye`` for OpenCV's fisheye model (Kannala and Brandt 2006).
 
     Raises:
         ValueError: If a size is below 1, a focal length is not positive, the pose is not rigid, or the number of
-            distortion coefficients is not 0, 4, 5 or 8.
+            distortion coefficients is not 0, 4, 5 or 8 (of a fisheye 4), or if a fisheye shows more than 85 degrees to
+            any side of its axis.
     """
 
     width: int
@@ -42,6 +49,7 @@ class Camera:
     world_from_camera: FloatArray
     distortion: tuple[float, ...] = ()
     near: float = 0.01
+    lens: Literal["opencv", "fisheye"] = "opencv"
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -50,7 +58,9 @@ class Camera:
             raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
         if not self.near > 0:
             raise ValueError(f"near must be > 0 (got {self.near})")
-        if len(self.distortion) not in (0, 4, 5, 8):
+        if self.lens == "fisheye":
+            self._check_fisheye()
+        elif len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(f"distortion takes 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
         pose = np.array(self.world_from_camera, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -60,6 +70,19 @@ class Camera:
             raise ValueError("world_from_camera must be a rotation and a translation, without scale or mirror")
         pose.flags.writeable = False
         object.__setattr__(self, "world_from_camera", pose)
+
+    def _check_fisheye(self) -> None:
+        if len(self.distortion) != 4:
+            raise ValueError(f"the distortion of a fisheye takes 4 coefficients (got {len(self.distortion)})")
+        x, y = np.meshgrid([0, self.width], [0, self.height])
+        farthest = float(np.hypot((x - self.cx) / self.fx, (y - self.cy) / self.fy).max())
+        angle = np.linspace(0, FISHEYE_MAX, 200)
+        shown = _fisheye_radius(angle, self.distortion)
+        if np.any(np.diff(shown) <= 0) or farthest > shown[-1]:
+            raise ValueError(
+                f"a fisheye must show at most 85 degrees to each side, in growing distance from the principal point "
+                f"(got a corner at {farthest:.3g} focal lengths, where 85 degrees are at {shown[-1]:.3g})"
+            )
 
     @classmethod
     def look_at(
@@ -138,6 +161,11 @@ class Camera:
         pixels = np.full((len(local), 2), np.nan)
         if not self.distortion:
             pixels[front] = local[front, :2] / depth[front, None] * (self.fx, self.fy) + (self.cx, self.cy)
+        elif self.lens == "fisheye":
+            slopes = local[front, :2] / depth[front, None]
+            slope = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
+            shown = slopes * _fisheye_radius(np.arctan(slope), self.distortion) / slope
+            pixels[front] = shown * (self.fx, self.fy) + (self.cx, self.cy)
         elif front.any():
             import cv2
 
@@ -153,6 +181,12 @@ class Camera:
         slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion or not len(slopes):
             return slopes
+        if self.lens == "fisheye":
+            radius = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
+            angle = radius.copy()
+            for _ in range(20):
+                angle -= (_fisheye_radius(angle, self.distortion) - radius) / _fisheye_rate(angle, self.distortion)
+            return np.asarray(slopes * np.tan(np.clip(angle, 0, FISHEYE_MAX)) / radius, dtype=np.float64)
         import cv2
 
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
@@ -160,6 +194,18 @@ class Camera:
             slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria
         )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+
+
+def _fisheye_radius(angle: FloatArray, k: Sequence[float]) -> FloatArray:
+    """Distance from the principal point in focal lengths, of rays at an angle to the axis [rad]."""
+    square = angle * angle
+    return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+
+
+def _fisheye_rate(angle: FloatArray, k: Sequence[float]) -> FloatArray:
+    """Derivative of :func:`_fisheye_radius`."""
+    square = angle * angle
+    return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
 
 
 def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:

@@ -138,8 +138,8 @@ def camera_of(record: Record) -> Camera:
     """The camera that a record states."""
     stored = record["camera"]
     ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
-    pose = np.array(stored["world_from_camera"])
-    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, tuple(stored["distortion"]))
+    pose, distortion = np.array(stored["world_from_camera"]), tuple(stored["distortion"])
+    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, distortion, lens=stored["lens"])
 
 
 def image_file(record: Record) -> str:

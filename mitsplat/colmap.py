@@ -34,10 +34,13 @@ def write_colmap(root: Path, records: Iterable[Record]) -> None:
 
 
 def camera_model(camera: Camera) -> str:
-    """Model, size and parameters: PINHOLE, OPENCV (k1 k2 p1 p2) or FULL_OPENCV (k1 k2 p1 p2 k3 k4 k5 k6)."""
+    """Model, size and parameters: PINHOLE, OPENCV (k1 k2 p1 p2), FULL_OPENCV (and k3 k4 k5 k6), OPENCV_FISHEYE."""
     values = [camera.fx, camera.fy, camera.cx, camera.cy]
     if not camera.distortion:
         model = "PINHOLE"
+    elif camera.lens == "fisheye":
+        model = "OPENCV_FISHEYE"
+        values += camera.distortion
     elif len(camera.distortion) == 4:
         model = "OPENCV"
         values += camera.distortion

@@ -107,6 +107,7 @@ def describe_sensor(camera: Camera) -> dict[str, Any]:
         "cx": camera.cx,
         "cy": camera.cy,
         "distortion": " ".join(repr(float(k)) for k in camera.distortion),
+        "lens": camera.lens,
         "near_clip": camera.near,
         "to_world": mi.ScalarTransform4f(pose),
         "film": {

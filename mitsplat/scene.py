@@ -375,6 +375,7 @@ def _camera_at(pose: FloatArray, intrinsics: Intrinsics, output: Output) -> Came
         world_from_camera=pose,
         distortion=intrinsics.distortion,
         near=intrinsics.near,
+        lens=intrinsics.lens,
     )
     return camera.resized(output.width, output.height)
 

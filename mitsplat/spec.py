@@ -184,8 +184,9 @@ class Intrinsics(StrictModel):
         None, description="Width and height that fx, fy, cx and cy refer to [px]; the output's if absent."
     )
     distortion: tuple[float, ...] = Field(
-        (), description="OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole."
+        (), description="OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole. A fisheye's k1, k2, k3, k4."
     )
+    lens: Literal["opencv", "fisheye"] = Field("opencv", description="Which of OpenCV's camera models.")
     near: Positive = Field(0.01, description="Nearest depth at which anything is seen [m].")
 
     @model_validator(mode="after")
@@ -195,7 +196,10 @@ class Intrinsics(StrictModel):
         for key in ("fy", "cx", "cy", "size"):
             if self.fx is None and getattr(self, key) is not None:
                 raise FieldError(key, "needs fx")
-        if len(self.distortion) not in (0, 4, 5, 8):
+        if self.lens == "fisheye":
+            if self.fx is None or len(self.distortion) != 4:
+                raise FieldError("lens", "fisheye needs fx and 4 coefficients of distortion")
+        elif len(self.distortion) not in (0, 4, 5, 8):
             raise FieldError("distortion", f"must have 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
         return self
 

@@ -52,6 +52,7 @@ class _Camera(_Stored):
     height: Pixels
     intrinsics: tuple[Point, Point, Point]
     distortion: list[float]
+    lens: Literal["opencv", "fisheye"]
     world_from_camera: Pose
 
 

@@ -126,6 +126,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
             "height": frame.camera.height,
             "intrinsics": frame.camera.intrinsics.tolist(),
             "distortion": list(frame.camera.distortion),
+            "lens": frame.camera.lens,
             "near": frame.camera.near,
             "world_from_camera": frame.camera.world_from_camera.tolist(),
         },

@@ -1,4 +1,4 @@
-"""The sensor plugin ``opencv_camera``: a pinhole with OpenCV intrinsics and lens distortion."""
+"""The sensor plugin ``opencv_camera``: OpenCV intrinsics with lens distortion, or a fisheye."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.plugins.rays import View
 
@@ -27,7 +28,11 @@ class OpenCVCamera(mi.Sensor):
 
      * - distortion
        - |string|
-       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``. (Default: none)
+       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``, or ``k1 k2 k3 k4`` of a fisheye. (Default: none)
+
+     * - lens
+       - |string|
+       - ``opencv``, or ``fisheye`` for OpenCV's fisheye model. (Default: ``opencv``)
 
      * - to_world
        - |transform|
@@ -56,17 +61,22 @@ class OpenCVCamera(mi.Sensor):
             self.distortion = tuple(float(v) for v in str(text).replace(",", " ").split())
         except ValueError:
             raise InputError(f"sensor 'opencv_camera': 'distortion' must be numbers (got {text!r})") from None
-        if len(self.distortion) not in (0, 4, 5, 8):
-            raise InputError(
-                f"sensor 'opencv_camera': 'distortion' takes 0, 4, 5 or 8 numbers (got {len(self.distortion)})"
-            )
+        self.lens = props.get("lens", "opencv")
+        if self.lens not in ("opencv", "fisheye"):
+            raise InputError(f"sensor 'opencv_camera': 'lens' must be opencv or fisheye (got {self.lens!r})")
+        intrinsics = self.fx, self.fy, self.cx, self.cy
+        try:
+            Camera(int(width), int(height), *intrinsics, np.eye(4), self.distortion, self.near, self.lens)
+        except ValueError as error:
+            raise InputError(f"sensor 'opencv_camera': {error}") from None
 
     def view(self, samples: int = 1) -> View:
         """What the splat renderer needs of this camera."""
         width, height = (int(n) for n in self.film().size())
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         pose = self.world_from_mitsuba @ flip
-        return View(width, height, self.fx, self.fy, self.cx, self.cy, pose, self.distortion, self.near, samples)
+        intrinsics = self.fx, self.fy, self.cx, self.cy
+        return View(width, height, *intrinsics, pose, self.distortion, self.near, samples, self.lens)
 
     def sample_ray(  # noqa: D102 - Mitsuba's interface
         self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True

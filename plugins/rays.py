@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mitsplat.camera import FISHEYE_MAX, Camera
 
 TILE = 4
 """Edge of a tile [px]. Smaller tiles make more pairs to sort; larger ones idle more lanes, blend further from the order
@@ -22,10 +24,11 @@ class View:
     Attributes:
         width, height: Image size [px].
         fx, fy, cx, cy: Intrinsics [px].
-        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6, or empty.
+        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6, or empty; k1, k2, k3, k4 of a fisheye.
         near: Nearest depth that is seen [m].
         world_from_camera: Pose, OpenCV axes, shape (4, 4).
         samples: Rays per pixel along each axis.
+        lens: Model of the lens.
     """
 
     width: int
@@ -38,11 +41,13 @@ class View:
     distortion: tuple[float, ...] = ()
     near: float = 0.01
     samples: int = 1
+    lens: Literal["opencv", "fisheye"] = "opencv"
     _opaque: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        padded = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
-        object.__setattr__(self, "distortion", padded if any(padded) else ())
+        if self.lens == "opencv":
+            padded = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+            object.__setattr__(self, "distortion", padded if any(padded) else ())
         # Opaque, so that a new camera reuses the compiled kernels.
         for name in ("fx", "fy", "cx", "cy", "near"):
             self._opaque[name] = dr.opaque(mi.Float, getattr(self, name))
@@ -67,6 +72,19 @@ class View:
     def sampled(self, samples: int) -> View:
         """The same view with ``samples`` x ``samples`` rays per pixel."""
         return self if samples == self.samples else replace(self, samples=samples)
+
+    @property
+    def camera(self) -> Camera:
+        """The same camera on the host, one ray per pixel."""
+        return Camera(
+            self.width,
+            self.height,
+            *(self.fx, self.fy, self.cx, self.cy),
+            self.world_from_camera,
+            self.distortion,
+            self.near,
+            self.lens,
+        )
 
     def rows(self, start: int, stop: int) -> View:
         """The part of the view from pixel row ``start`` up to ``stop``."""
@@ -97,6 +115,8 @@ class View:
         xd, yd = (x - o["cx"]) / o["fx"], (y - o["cy"]) / o["fy"]
         if not self.distortion:
             return xd, yd
+        if self.lens == "fisheye":
+            return self._fisheye_slopes(xd, yd)
         u, v = xd, yd
         # Newton's method on the 2-D distortion map with a numerical-free Jacobian: converges in 3 to 5 steps.
         for _ in range(8):
@@ -106,11 +126,39 @@ class View:
             u, v = u + (j[3] * ru - j[1] * rv) / det, v + (j[0] * rv - j[2] * ru) / det
         return u, v
 
+    def _fisheye_slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
+        radius = dr.maximum(dr.sqrt(x * x + y * y), 1e-9)
+        angle = mi.Float(radius)
+        for _ in range(8):
+            shown, rate = self._fisheye_radius(angle)
+            angle -= (shown - radius) / rate
+        scale = dr.tan(dr.clip(angle, 0, FISHEYE_MAX)) / radius
+        return x * scale, y * scale
+
+    def _fisheye_radius(self, angle: Any) -> tuple[Any, Any]:
+        """Distance from the principal point in focal lengths, and its derivative, of rays at an angle to the axis."""
+        k1, k2, k3, k4 = (self._opaque[f"k{i}"] for i in range(4))
+        s = angle * angle
+        shown = angle * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
+        return shown, 1 + s * (3 * k1 + s * (5 * k2 + s * (7 * k3 + s * 9 * k4)))
+
+    def _fisheye_distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+        slope2 = dr.maximum(u * u + v * v, 1e-12)
+        slope = dr.sqrt(slope2)
+        shown, rate = self._fisheye_radius(dr.atan(slope))
+        scale = shown / slope
+        # Along the radius the map grows by d(shown)/d(slope), across it by the scale.
+        growth = (rate / (1 + slope2) - scale) / slope2
+        return u * scale, v * scale, (scale + growth * u * u, growth * u * v, growth * u * v, scale + growth * v * v)
+
     def distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
         """OpenCV's distortion of slopes, and its Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
 
-        Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational model.
+        Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational model, and "Fisheye camera
+        model" (Kannala and Brandt 2006).
         """
+        if self.lens == "fisheye":
+            return self._fisheye_distort(u, v)
         k1, k2, p1, p2, k3, k4, k5, k6 = (self._opaque[f"k{i}"] for i in range(8))
         r2 = u * u + v * v
         top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -74,7 +74,7 @@ def proxy_silhouettes(
 
 def _canvas(view: View) -> tuple[View, int, int]:
     """The view on a larger canvas, and where on it the image begins."""
-    share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion)
+    share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion, view.lens)
     left, top = int(share * view.width), int(share * view.height)
     size = {"width": view.width + 2 * left, "height": view.height + 2 * top}
     return replace(view, **size, cx=view.cx + left, cy=view.cy + top), left, top
@@ -82,11 +82,18 @@ def _canvas(view: View) -> tuple[View, int, int]:
 
 @lru_cache(maxsize=8)
 def _margin(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...]
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    distortion: tuple[float, ...],
+    lens: Literal["opencv", "fisheye"],
 ) -> float:
     if not distortion:
         return MARGINS[0]
-    camera = Camera(width, height, fx, fy, cx, cy, np.eye(4), distortion)
+    camera = Camera(width, height, fx, fy, cx, cy, np.eye(4), distortion, lens=lens)
     for share in MARGINS[:-1]:
         x, y = np.meshgrid(
             np.linspace(-share * width, (1 + share) * width, 33), np.linspace(-share * height, (1 + share) * height, 33)
@@ -199,9 +206,7 @@ def _assemble(
 
 def _window(view: View, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
     """Box of pixels on the canvas that meshes may cover, or None."""
-    camera = Camera(
-        view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.world_from_camera, view.distortion, view.near
-    )
+    camera = view.camera
     points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
     pixels, depth = camera.project(points)
     if (depth <= view.near).any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -127,9 +128,10 @@ def test_small_gaussians_keep_their_light_wherever_they_fall_in_a_pixel() -> Non
 
 def test_kernel_of_a_distorted_lens_has_the_size_of_its_pixels() -> None:
     camera = replace(CAMERA, distortion=(-0.2, 0.05, 0.01, -0.02, 0.01))
+    sensor = make_sensor(camera)
     from mitsplat.plugins.splat_proxy import view_of
 
-    view = view_of(make_sensor(camera))
+    view = view_of(sensor)
     pixel = np.array([3.0, 20.0])
     u, v = camera.ray_slopes(pixel)[0]
     step = 1e-3
@@ -179,18 +181,43 @@ def test_wide_lens_is_exact_in_the_corners() -> None:
     assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 1e-4
 
 
-def test_distorted_lens_follows_the_twin() -> None:
-    camera = Camera.look_at(
-        (0, 0, -2),
-        (0, 0, 0),
-        up=(0, -1, 0),
-        width=40,
-        height=30,
-        fov_x=70,
-        distortion=(-0.25, 0.08, 0.002, -0.001, -0.01),
-    )
-    splats = make_splats(60, 13, spread=1.0)
+LENSES = {
+    "opencv": {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)},
+    "fisheye": {"distortion": (0.05, -0.02, 0.01, -0.003), "lens": "fisheye", "fx": 18.0, "fy": 17.0},
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_lens_follows_the_twin(lens: str) -> None:
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=40, height=30, fov_x=70)
+    camera = replace(camera, **LENSES[lens])
+    splats = make_splats(60, 13, spread=1.0 if lens == "opencv" else 2.0)
     assert error(render_splats(splats, camera, quality="exact"), splats, camera) < 2e-4
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_picture_through_a_lens_undistorts_to_the_pinhole(lens: str) -> None:
+    """Every pixel of a pinhole is looked up where OpenCV says that the lens shows it."""
+    pinhole = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=48, height=36, fov_x=60)
+    focal = {"fx": 8 * 48.0, "fy": 8 * 48.0}
+    bent = replace(pinhole.resized(8 * 48, 8 * 36), **LENSES[lens] | focal)
+    splats = make_splats(40, 17, scales=(0.1, 0.3), bands=1)
+    splats = replace(splats, sh=np.full_like(splats.sh, 0.7))  # of one colour: where orders change there is no edge
+    x, y = np.meshgrid(np.arange(48) + 0.5, np.arange(36) + 0.5)
+    rays = np.concatenate([pinhole.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1)), np.ones((48 * 36, 1))], axis=1)
+    if lens == "fisheye":
+        shown, _ = cv2.fisheye.projectPoints(
+            rays[:, None], np.zeros(3), np.zeros(3), bent.intrinsics, np.array(bent.distortion)
+        )
+    else:
+        shown, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), bent.intrinsics, np.array(bent.distortion))
+    where = shown.reshape(36, 48, 2).astype(np.float32) - 0.5
+    picture = render_splats(splats, bent, quality="exact").rgb
+    undistorted = cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_CUBIC)
+    inside = ((where > 2) & (where < (8 * 48 - 3, 8 * 36 - 3))).all(axis=2)
+    assert inside.mean() > 0.5
+    expected = render_splats(splats, pinhole, quality="exact").rgb
+    assert np.abs(undistorted - expected)[inside].max() < 2e-3
 
 
 def test_means_far_from_the_origin_keep_their_place() -> None:
@@ -214,6 +241,28 @@ def test_rotating_object_and_camera_together_changes_nothing() -> None:
     a = render_splats(splats, CAMERA, quality="exact").rgb
     b = render_splats(splats.transformed(turn), turned, quality="exact").rgb
     assert np.abs(a - b).max() < 5e-5
+
+
+def test_turning_the_camera_changes_no_ray() -> None:
+    """Popping: while the camera turns by 0.1 degrees a step, one line of sight keeps its colour, wherever in the image
+    and in its tile it falls. In the order of tiles it does not, because its neighbours decide."""
+    splats = make_splats(150, 31, scales=(0.1, 0.5), bands=1)
+    sight = CAMERA.world_from_camera[:3, :3] @ (0.03, -0.02, 1.0)
+
+    def changes(quality: Quality) -> float:
+        seen = []
+        for i in range(12):
+            pose = CAMERA.world_from_camera.copy()
+            pose[:3, :3] @= Rotation.from_euler("yx", (0.1 * i, -0.05 * i), degrees=True).as_matrix()
+            u, v, depth = pose[:3, :3].T @ sight
+            x, y = 12 + i % 5, 9 + i % 3
+            shifted = {"cx": x + 0.5 - CAMERA.fx * u / depth, "cy": y + 0.5 - CAMERA.fy * v / depth}
+            layers = render_splats(splats, replace(CAMERA, world_from_camera=pose, **shifted), quality=quality)
+            seen.append(layers.rgb[y, x])
+        return float(np.abs(np.array(seen) - seen[0]).max())
+
+    assert changes(PRESETS["exact"]) < 1e-5
+    assert 1e-3 < changes(replace(PRESETS["exact"], order="tile")) < 0.2
 
 
 def test_opaque_gaussian_hides_what_is_behind() -> None:

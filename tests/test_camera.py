@@ -1,0 +1,77 @@
+"""Cameras against OpenCV's own functions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsplat.camera import Camera
+from mitsplat.colmap import camera_model
+from mitsplat.errors import InputError
+from mitsplat.render import describe_sensor, ensure_variant
+
+PINHOLE = Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), width=640, height=480, fov_x=60)
+BENT = (0.02, -0.01, 0.004, -0.001)
+FISHEYE = replace(PINHOLE, fx=300.0, fy=290.0, cx=330.0, cy=235.0, distortion=BENT, lens="fisheye")
+
+
+def test_fisheye_is_that_of_opencv() -> None:
+    angle, turn = np.meshgrid(np.linspace(0, 1.3, 14), np.linspace(0, 2 * np.pi, 9))
+    slope = np.tan(angle.ravel())
+    points = np.stack([slope * np.cos(turn.ravel()), slope * np.sin(turn.ravel()), np.ones_like(slope)], axis=1)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), FISHEYE.intrinsics, np.array(FISHEYE.distortion)
+    )
+    pixels, depth = FISHEYE.project(points)
+    np.testing.assert_allclose(pixels, expected.reshape(-1, 2), atol=1e-9)
+    np.testing.assert_allclose(depth, 1.0)
+
+
+@pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), BENT])
+def test_rays_of_a_fisheye_come_back_to_their_pixels(distortion: tuple[float, ...]) -> None:
+    camera = replace(FISHEYE, distortion=distortion)
+    x, y = np.meshgrid(np.linspace(0, 640, 9), np.linspace(0, 480, 7))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    slopes = camera.ray_slopes(pixels)
+    back, _ = camera.project(np.column_stack([slopes, np.ones(len(slopes))]))
+    np.testing.assert_allclose(back, pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"distortion": (0.1, 0.0)}, "takes 4 coefficients"),
+        ({"fx": 200.0}, "at most 85 degrees"),
+        ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, "in growing distance"),
+    ],
+)
+def test_fisheye_that_cannot_be_is_refused(changes: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        replace(FISHEYE, **changes)
+
+
+def test_sensor_plugin_sends_the_same_rays() -> None:
+    ensure_variant()
+    from mitsplat.plugins.splat_proxy import view_of
+
+    x, y = np.meshgrid(np.linspace(1, 639, 9), np.linspace(1, 479, 7))
+    u, v = view_of(mi.load_dict(describe_sensor(FISHEYE))).slopes(mi.Float(x.ravel()), mi.Float(y.ravel()))
+    expected = FISHEYE.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+    np.testing.assert_allclose(np.stack([u, v], axis=1), expected, rtol=2e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [{"distortion": "0.1"}, {"lens": "mirror"}, {"lens": "fisheye"}])
+def test_sensor_plugin_refuses_what_is_no_lens(wrong: dict[str, str]) -> None:
+    ensure_variant()
+    with pytest.raises((InputError, RuntimeError), match=r"opencv_camera.*(coefficients|lens)"):
+        mi.load_dict({**describe_sensor(PINHOLE), **wrong})
+
+
+def test_colmap_names_the_fisheye() -> None:
+    assert camera_model(FISHEYE).split() == (
+        ["OPENCV_FISHEYE", "640", "480", "300.0", "290.0", "330.0", "235.0", "0.02", "-0.01", "0.004", "-0.001"]
+    )

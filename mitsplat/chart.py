@@ -190,6 +190,8 @@ def _scene_shooter(path: Path, quality: Quality, frames: int, overrides: dict[st
     from mitsplat.trace import encode_srgb
 
     scene = load_scene(path, overrides=overrides)
+    drawn = scene.spec.rendering
+    quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples)
     indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
 
     def shoot(i: int) -> Shot:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,7 +19,7 @@ from mitsplat.cad import emitter_dict
 from mitsplat.camera import Camera
 from mitsplat.composite import develop, light_image
 from mitsplat.label import LabelRules, Labels, Truth, label_instances
-from mitsplat.quality import Quality
+from mitsplat.quality import Quality, resolve_quality
 from mitsplat.render import (
     Layers,
     ensure_variant,
@@ -90,7 +90,8 @@ def render_frame(
     Args:
         scene: A scene of :func:`mitsplat.load_scene`.
         index: Frame index, below ``scene.num_frames``.
-        quality: Preset or values of the splat renderer; the scene file's by default.
+        quality: Preset of the splat renderer, which the scene file's ``rendering`` refines, or all its values; the scene
+            file's preset by default.
         layout: The frame's settled layout; settled here when not given.
 
     Raises:
@@ -98,7 +99,9 @@ def render_frame(
     """
     seconds: dict[str, float] = {}
     plan = plan_frame(scene, index)
-    stage = _Studio.of(scene, quality or scene.spec.quality)
+    if not isinstance(quality, Quality):
+        quality = replace(resolve_quality(quality or scene.spec.quality), **scene.spec.rendering.model_dump())
+    stage = _Studio.of(scene, quality)
     if layout is None:
         with _timed(seconds, "settle"):
             layout = stage.settle(layout_of(scene, index))
@@ -166,7 +169,7 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 class _Studio:
     """What the frames of one scene share: the integrator with its uploads, and the shapes of the current layout."""
 
-    def __init__(self, scene: Scene, quality: str | Quality) -> None:
+    def __init__(self, scene: Scene, quality: Quality) -> None:
         ensure_variant()
         self.scene = scene
         self.integrator = make_integrator(
@@ -182,7 +185,7 @@ class _Studio:
 
     @staticmethod
     @lru_cache(maxsize=2)
-    def of(scene: Scene, quality: str | Quality) -> _Studio:
+    def of(scene: Scene, quality: Quality) -> _Studio:
         """The studio of a scene, kept for the next frame."""
         return _Studio(scene, quality)
 

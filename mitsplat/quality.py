@@ -70,7 +70,7 @@ class Quality:
             raise InputError(f"quality: transmittance_min must be in [0, 1) (got {self.transmittance_min})")
         if self.sh_degree not in (0, 1, 2, 3):
             raise InputError(f"quality: sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
-        if not 1 <= self.samples <= 8:
+        if type(self.samples) is not int or not 1 <= self.samples <= 8:
             raise InputError(f"quality: samples must be from 1 to 8 (got {self.samples})")
 
 

@@ -448,6 +448,20 @@ class Output(StrictModel):
     )
 
 
+class Rendering(StrictModel):
+    """How splats are drawn, whatever the preset; see :class:`mitsplat.quality.Quality`."""
+
+    response: Literal["perspective", "ewa"] = Field(
+        "perspective",
+        description="Every ray's exact perspective, or parallel rays within a Gaussian, as trainers have.",
+    )
+    kernel: Literal["exact", "mip", "3dgs", "gsplat"] = Field(
+        "exact",
+        description="The Gaussian itself, widened by a pixel so that nothing sparkles, or as those trainers dilate it.",
+    )
+    samples: int = Field(1, ge=1, le=8, description="Rays per pixel along each axis: 2 smooths silhouettes.")
+
+
 class Labelling(StrictModel):
     """What is labelled, see :mod:`mitsplat.label`."""
 
@@ -486,6 +500,7 @@ class SceneSpec(StrictModel):
     labels: Labelling = Field(Labelling(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     quality: Literal["fast", "balanced", "exact"] = Field("balanced", description="Rendering preset.")
+    rendering: Rendering = Field(Rendering(), description="How splats are drawn.")
     seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
 
     @model_validator(mode="after")

@@ -51,6 +51,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         "integrator": {
             "type": "splat_proxy",
             "quality": scene.spec.quality,
+            **scene.spec.rendering.model_dump(),
             "shadow": "none" if scene.spec.composite.shadow == "none" else "traced",
             "reference": list(reference_point(scene)),
             "white": white_irradiance(scene) or 0.0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -77,6 +77,20 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - |string|
        - Preset of the splat renderer: ``fast``, ``balanced`` or ``exact``. (Default: ``balanced``)
 
+     * - response
+       - |string|
+       - ``perspective``, or ``ewa`` for rays that are parallel within a Gaussian's footprint. (Default:
+         ``perspective``)
+
+     * - kernel
+       - |string|
+       - Footprint of a Gaussian: ``exact``, ``mip`` (widened by a pixel), or as the trainers ``3dgs`` and ``gsplat``
+         dilate it. (Default: ``exact``)
+
+     * - samples
+       - |int|
+       - Rays per pixel along each axis, 1 to 8. (Default: 1)
+
      * - shadow
        - |string|
        - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured.
@@ -121,7 +135,12 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.quality = resolve_quality(_text(props, "quality", "balanced"))
+        refined: dict[str, Any] = {
+            "response": _text(props, "response", "perspective"),
+            "kernel": _text(props, "kernel", "exact"),
+            "samples": props.get("samples", 1),
+        }
+        self.quality = replace(resolve_quality(_text(props, "quality", "balanced")), **refined)
         self.shadow = _text(props, "shadow", "traced")
         if self.shadow not in ("traced", "none"):
             raise InputError(f"integrator 'splat_proxy': 'shadow' must be 'traced' or 'none' (got {self.shadow!r})")

@@ -15,6 +15,7 @@ from pydantic import TypeAdapter
 import mitsplat as ms
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.quality import PRESETS
 from mitsplat.scene import FramePlan, LightSpec
 from mitsplat.writers import Catalogue, write_frame
 from mitsplat.xml_scene import export_xml, render_xml
@@ -147,9 +148,31 @@ def test_shadow_modes_differ_from_traced(
     np.testing.assert_array_equal(traced.instance, changed.instance)
 
 
+@pytest.fixture
+def refined(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
+    return ms.load_scene(write_scene({**scene_data, "rendering": {"kernel": "mip", "samples": 2}}, "refined.yaml"))
+
+
+def test_rendering_refines_the_preset(scene: ms.Scene, refined: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    whole = replace(PRESETS["balanced"], kernel="mip", samples=2)
+    images = [
+        ms.render_frame(refined, 0, layout=layout, quality=quality).image for quality in (None, "balanced", whole)
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[0], images[2])
+    assert not np.array_equal(images[0], ms.render_frame(scene, 0, layout=layout).image)
+
+
+@pytest.mark.parametrize("name", ["scene", "refined"])
 def test_exported_xml_renders_the_same_picture(
-    scene: ms.Scene, settled: dict[str, Any], tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    request: pytest.FixtureRequest,
+    settled: dict[str, Any],
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    scene = request.getfixturevalue(name)
     layout = layout_of_small_scene(scene, settled)
     monkeypatch.setattr("mitsplat.xml_scene.settle_layout", lambda *_: layout)
     export_xml(scene, 1, tmp_path / "one.xml")

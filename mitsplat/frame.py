@@ -90,8 +90,8 @@ def render_frame(
     Args:
         scene: A scene of :func:`mitsplat.load_scene`.
         index: Frame index, below ``scene.num_frames``.
-        quality: Preset of the splat renderer, which the scene file's ``rendering`` refines, or all its values; the scene
-            file's preset by default.
+        quality: Preset of the splat renderer, which the scene file's ``rendering`` refines, or all its values; the
+            preset of the scene file by default.
         layout: The frame's settled layout; settled here when not given.
 
     Raises:

@@ -453,7 +453,7 @@ class Rendering(StrictModel):
 
     response: Literal["perspective", "ewa"] = Field(
         "perspective",
-        description="Every ray's exact perspective, or parallel rays within a Gaussian, as trainers have.",
+        description="Every ray's exact perspective, or parallel rays within a Gaussian as in trainers.",
     )
     kernel: Literal["exact", "mip", "3dgs", "gsplat"] = Field(
         "exact",

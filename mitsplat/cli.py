@@ -1,6 +1,7 @@
 """The command ``mitsplat``: arguments to calls, and errors in one sentence instead of a traceback.
 
-Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 130 interrupted.
+Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 3 something is missing on the machine,
+4 a result was written that misses a threshold, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from mitsplat import __version__
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -44,6 +45,8 @@ def main(args: Sequence[str] | None = None) -> None:
         _fail(str(error))
     except MissingResourceError as error:
         _fail(str(error), status=3)
+    except PartialResultError as error:
+        _fail(str(error), status=4)
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
 

@@ -9,3 +9,7 @@ class InputError(ValueError):
 
 class MissingResourceError(RuntimeError):
     """Something that mitsplat needs of the machine is missing; the sentence says what to do. Exit status 3."""
+
+
+class PartialResultError(RuntimeError):
+    """A result was written, but it misses a threshold; the sentence says which, and what would help. Exit status 4."""

@@ -21,7 +21,7 @@ from mitsplat import bake, chart, dataset, frame, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.scene import Scene
 from mitsplat.settle import Layout
 
@@ -291,6 +291,17 @@ def test_input_and_file_errors_are_one_sentence(
     write_dataset.error = error
     assert run("render", scene_path) == 2
     assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(MissingResourceError("no GPU"), 3), (PartialResultError("too dark"), 4)]
+)
+def test_other_errors_have_a_status_of_their_own(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: Exception, status: int
+) -> None:
+    write_dataset.error = error
+    assert run("render", scene_path) == status
+    assert f"mitsplat: {error}\n" in capsys.readouterr().err
 
 
 def test_our_own_bugs_keep_their_traceback(scene_path: Path, write_dataset: Calls) -> None:

@@ -20,7 +20,7 @@ import mitsuba as mi
 
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.plugins.march import Lanes, march
-from mitsplat.plugins.rays import View
+from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
 from mitsplat.quality import KERNELS, Quality
 
@@ -106,11 +106,12 @@ class _March(dr.CustomOp):
 
 def march_backward(lists: TileLists, view: View, quality: Quality, image: Any, gradient: list[Any]) -> Any:
     """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha."""
+    if lists.pairs == 0:
+        return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
     lanes = Lanes(lists, view)
     us, vs = lanes.slopes(0.5, 0.5)
-    result = dr.zeros(mi.Float, RECORD * max(1, lists.visible))
-    if lists.pairs == 0:
-        return result
+    column = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * TILE) % TILE
+    shares = dr.zeros(mi.Float, RECORD * TILE * lists.pairs)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end, near = dr.opaque(mi.Float, quality.transmittance_min), view.near_plane
 
@@ -119,46 +120,77 @@ def march_backward(lists: TileLists, view: View, quality: Quality, image: Any, g
 
     d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
     whole = list(zip(*(load(c) for c in image.rgb), strict=True))
-    total = [sum(c * d for c, d in zip(cs, ds, strict=True)) for cs, ds in zip(whole, d_colour, strict=True)]
-    d_end = [(1 - a) * d for a, d in zip(load(image.alpha), load(gradient[3]), strict=True)]
+    # What lies behind, weighted with the gradient, less the gradient that reaches alpha through the end of the ray.
+    behind = [
+        sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
+        for cs, ds, a, d_alpha in zip(whole, d_colour, load(image.alpha), load(gradient[3]), strict=True)
+    ]
 
-    def body(i: Any, light: list[Any], seen: list[Any]) -> tuple[Any, list[Any], list[Any]]:
+    def body(i: Any, light: list[Any], rest: list[Any]) -> tuple[Any, list[Any], list[Any]]:
         number = dr.gather(mi.UInt32, lists.entries, i)
         record = dr.gather(mi.ArrayXf, lists.records, number, shape=(RECORD, dr.width(i)))
         u0, v0, a, b2, c, log_opacity, red, green, blue, depth, e, f, g, h, k, _ = record
         sums = [mi.Float(0) for _ in range(RECORD)]
-        new_light, new_seen = [], []
-        for u, v, t, s, ds, behind, d_alpha_end in zip(us, vs, light, seen, d_colour, total, d_end, strict=True):
+        new_light, new_rest = [], []
+        for u, v, t, r, ds in zip(us, vs, light, rest, d_colour, strict=True):
             du, dv = u - u0, v - v0
             inverse = dr.rcp(1 + du * (e + g * du + h * dv) + dv * (f + k * dv))
             q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
             z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
             hit = (log_opacity - q > cut) & (z > near) & (t > end) & (a >= 0)
+            # A response that overflows beyond the cut-off has no gradient, not an undefined one.
+            inverse, q = dr.select(hit, inverse, 0), dr.select(hit, q, 0)
             alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)
             weight = t * alpha
             d_own = red * ds[0] + green * ds[1] + blue * ds[2]
-            s = s + weight * d_own
-            d_alpha = t * d_own - (behind - s - d_alpha_end) / dr.maximum(1 - alpha, 1e-5)
-            d_log = dr.select(hit, d_alpha * alpha * LN_2, 0)
+            r = r - weight * d_own
+            d_alpha = t * d_own - r / dr.maximum(1 - alpha, 1e-5)
+            d_log = d_alpha * alpha * LN_2
             d_top, d_bottom = -d_log * inverse, d_log * q * inverse
             d_du = d_top * (2 * a * du + b2 * dv) + d_bottom * (e + 2 * g * du + h * dv)
             d_dv = d_top * (2 * c * dv + b2 * du) + d_bottom * (f + 2 * k * dv + h * du)
             parts = [-d_du, -d_dv, d_top * du * du, d_top * du * dv, d_top * dv * dv, d_log]
             parts += [weight * d for d in ds]
             parts += [0, d_bottom * du, d_bottom * dv, d_bottom * du * du, d_bottom * du * dv, d_bottom * dv * dv, 0]
-            sums = [total_part + part for total_part, part in zip(sums, parts, strict=True)]
+            sums = [total + part for total, part in zip(sums, parts, strict=True)]
             new_light.append(t - weight)
-            new_seen.append(s)
-        dr.scatter_reduce(dr.ReduceOp.Add, result, mi.ArrayXf(sums), number, mode=dr.ReduceMode.Local)
-        return i + 1, new_light, new_seen
+            new_rest.append(r)
+        dr.scatter(shares, mi.ArrayXf(sums), dr.gather(mi.UInt32, lists.slots, i) * TILE + column)
+        return i + 1, new_light, new_rest
 
-    def alive(i: Any, light: list[Any], seen: list[Any]) -> Any:
+    def alive(i: Any, light: list[Any], rest: list[Any]) -> Any:
         brightest = light[0]
         for t in light[1:]:
             brightest = dr.maximum(brightest, t)
         return (i < lanes.stop) & (brightest > end)
 
-    state = lanes.start, [mi.Float(1) for _ in us], [mi.Float(0) for _ in us]
+    state = lanes.start, [mi.Float(1) for _ in us], behind
     dr.while_loop(state, alive, body, label="march backward")
+    dr.eval(shares)
+    return _sum_shares(shares, lists)
+
+
+def _sum_shares(shares: Any, lists: TileLists) -> Any:
+    """Sum of the gradients that each record has from the columns of its tiles.
+
+    They are added in a fixed order, so that every run gives the same bits, which additions by atomics do not.
+    """
+    number = dr.empty(mi.UInt32, lists.pairs)
+    dr.scatter(number, lists.entries, lists.slots, mode=dr.ReduceMode.Permute)
+    slot, last = dr.arange(mi.UInt32, lists.pairs), dr.opaque(mi.UInt32, lists.pairs - 1)
+    start, stop = dr.zeros(mi.UInt32, lists.visible), dr.zeros(mi.UInt32, lists.visible)
+    begins = (slot == 0) | (number != dr.gather(mi.UInt32, number, dr.maximum(slot, 1) - 1))
+    ends = (slot == last) | (number != dr.gather(mi.UInt32, number, dr.minimum(slot + 1, last)))
+    dr.scatter(start, slot * TILE, number, begins)
+    dr.scatter(stop, (slot + 1) * TILE, number, ends)
+
+    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        share = dr.gather(mi.ArrayXf, shares, i, shape=(RECORD, dr.width(i)))
+        return i + 1, [total + own for total, own in zip(sums, share, strict=True)]
+
+    zeros = [mi.Float(0) for _ in range(RECORD)]
+    _, sums = dr.while_loop((start, zeros), lambda i, sums: i < stop, add, label="sum shares")
+    result = dr.empty(mi.Float, RECORD * lists.visible)
+    dr.scatter(result, mi.ArrayXf(sums), dr.arange(mi.UInt32, lists.visible))
     dr.eval(result)
     return result

@@ -107,6 +107,7 @@ class TileLists:
         near: Coefficients of :func:`mitsplat.plugins.gaussian.general_response`, 16 floats each, of the Gaussians that
             reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
         entries: Record numbers, tile after tile.
+        slots: Place of every entry if they were sorted by record number instead.
         nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
         visible, pairs: Number of records and of entries.
@@ -115,6 +116,7 @@ class TileLists:
     records: Any
     near: Any | None
     entries: Any
+    slots: Any
     nearest: Any
     start: Any
     stop: Any
@@ -148,16 +150,17 @@ def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View,
     # As floats, because a sum of integers would wrap.
     if dr.sum(mi.Float(candidates))[0] > CANDIDATES_MAX:
         raise CrowdedError
-    entries, nearest, start, stop = _pair(dr.detach(records), bounds, box, candidates, view, tiles, quality.order)
-    return TileLists(records, near, entries, nearest, start, stop, count, dr.width(entries))
+    entries, slots, nearest, start, stop = _pair(
+        dr.detach(records), bounds, box, candidates, view, tiles, quality.order
+    )
+    return TileLists(records, near, entries, slots, nearest, start, stop, count, dr.width(entries))
 
 
 def _empty(tiles: int) -> TileLists:
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
-    return TileLists(
-        dr.zeros(mi.Float, RECORD), None, dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1), zeros, zeros, 0, 0
-    )
+    entry = dr.zeros(mi.UInt32, 1)
+    return TileLists(dr.zeros(mi.Float, RECORD), None, entry, entry, dr.zeros(mi.Float, 1), zeros, zeros, 0, 0)
 
 
 def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
@@ -354,8 +357,8 @@ class _Source:
 
 def _pair(
     records: Any, bounds: Any, box: Any, candidates: Any, view: View, tiles: int, order: str
-) -> tuple[Any, Any, Any, Any]:
-    """Sorted (tile, Gaussian) pairs: record number and least depth per entry, and each tile's range."""
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Sorted (tile, Gaussian) pairs: record number, slot and least depth per entry, and each tile's range."""
     count = dr.width(candidates)
     offset = dr.prefix_sum(candidates)
     total = int((dr.gather(mi.UInt32, offset, count - 1) + dr.gather(mi.UInt32, candidates, count - 1))[0])
@@ -376,7 +379,8 @@ def _pair(
     start, stop = dr.zeros(mi.UInt32, tiles), dr.zeros(mi.UInt32, tiles)
     if pairs == 0:
         dr.eval(start, stop)
-        return dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1), start, stop
+        entry = dr.zeros(mi.UInt32, 1)
+        return entry, entry, dr.zeros(mi.Float, 1), start, stop
     tile, rank = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, rank, kept)
     record = dr.gather(mi.ArrayXf, records, rank, shape=(RECORD, pairs))
     if order == "ray":
@@ -398,7 +402,7 @@ def _pair(
     dr.scatter(start, i, tile, first_of_tile)
     dr.scatter(stop, i + 1, tile, last_of_tile)
     dr.eval(start, stop)
-    return entries, depth, start, stop
+    return entries, sorted_pairs, depth, start, stop
 
 
 def _depth_near_centre(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:

@@ -23,9 +23,10 @@ from mitsplat.assets import Asset
 from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.fit import FitSettings, Picture, fit_splats
 from mitsplat.mesh import convex_pieces
+from mitsplat.metrics import psnr_of
 from mitsplat.plugins.proxies import Occluder, Proxies
+from mitsplat.refine import Picture, RefineSettings, refine_splats
 from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
@@ -166,7 +167,7 @@ def bake_asset(
     if settings.fit_steps:
         fit_cameras = fit_cameras or _orbit(surface, settings.fit_views, turn=0.0)
         pictures = [_picture(scene, camera, settings, view) for view, camera in enumerate(fit_cameras)]
-        splats = fit_splats(splats, pictures, FitSettings(iterations=settings.fit_steps, seed=settings.seed))
+        splats = refine_splats(splats, pictures, RefineSettings(iterations=settings.fit_steps, seed=settings.seed))
     proxy = _proxy_mesh(parts, settings.proxy_faces)
     area = np.array([part.mesh.area for part in parts])
     asset = Asset(
@@ -380,8 +381,4 @@ def _compare(scene: mi.Scene, splats: Splats, cameras: Sequence[Camera], setting
         error = (np.clip(encode_srgb(layers.rgb), 0, 1) - np.clip(encode_srgb(truth), 0, 1)) ** 2
         errors.append(error.mean())
         on_object.append(error[cover > 0].mean() if cover.any() else np.nan)
-    return _psnr(float(np.mean(errors))), _psnr(float(np.nanmean(on_object)))
-
-
-def _psnr(error: float) -> float:
-    return float(-10.0 * np.log10(max(error, 1e-12)))
+    return psnr_of(float(np.mean(errors))), psnr_of(float(np.nanmean(on_object)))

@@ -1,143 +1,430 @@
-"""Fit splats to pictures by gradient descent through the renderer."""
+"""Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
+
+Gaussians start at the capture's points and are densified by MCMC (:mod:`mitsplat.densify`). A fit lives in a folder:
+``checkpoint.npz`` to go on from, ``splats.ply``, ``fit.json`` (:class:`FitResult` and the settings), and for every
+held-out photo ``held_out/NAME.png``: photo | render | difference.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+import hashlib
+import json
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.camera import Camera
+from mitsplat.capture import Capture, Photo
+from mitsplat.densify import grow, jitter, relocate, seed_splats
+from mitsplat.errors import InputError
+from mitsplat.files import write_file, write_text
+from mitsplat.metrics import psnr_of
+from mitsplat.optimise import Adam, Model
 from mitsplat.quality import Quality
-from mitsplat.render import ensure_variant, make_sensor
+from mitsplat.render import ensure_variant
+from mitsplat.seeds import seed_points
+from mitsplat.sight import HeldOut, Sight
 from mitsplat.splats import Splats
 
 FloatArray = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What a camera saw.
+@dataclass(frozen=True)
+class FitSettings:
+    """How a capture is fitted. Rates are those published for 3DGS, regularisation is that of its MCMC densification.
 
     Attributes:
-        camera: From where; its distortion is followed by the rays.
-        rgb: Display-encoded colour times alpha, (H, W, 3).
-        alpha: Share of the pixel that the subject covers, (H, W).
+        gaussians: Most Gaussians; their number grows to this by the middle of the fit.
+        iterations: Optimiser steps; each takes one photo, all photos in turn.
+        budget: Time [s] in which the schedule of the iterations runs off even if it must leave some out; then the
+            result depends on the machine.
+        target_psnr: Mean PSNR of held-out photos [dB] at which the fit ends early.
+        size: Longest edge of the pictures [px]; photos are made smaller, never larger.
+        sh_degree: Degree of the spherical harmonics, 0 to 3; a degree more every fifth of the fit.
+        masks: ``alpha``: only what masks show is fitted, and they supervise alpha; ``ignore``: what they leave out may
+            look like anything; ``off``: they are not read.
+        background: Behind splats and mask: a random colour in every step, or black.
+        ssim_share: Weight of D-SSIM against L1.
+        alpha_weight: Weight of the difference between alpha and mask.
+        depth_weight: Weight of the difference between inverse depths of the splats and of the points a photo sees,
+            relative to the inverse of the fit's length unit; 0 leaves depths out.
+        opacity_weight: Weight of the mean opacity.
+        scale_weight: Weight of the mean scale in units of the cameras' extent.
+        exposure: Whether every photo has an affine colour correction of its own (3 x 4).
+        coarse: Share of the fit that sees pictures of half the size.
+        refine_every: Steps between moves of dead Gaussians and additions of new ones.
+        rate_means: Learning rate at the start in units of the cameras' extent; falls to a hundredth exponentially.
+        rate_quats: Learning rate of the quaternions' components.
+        rate_scales: Learning rate of the logarithms of the scales.
+        rate_opacities: Learning rate of the logits of the opacities.
+        rate_sh: Learning rate of the constant SH coefficients; the others have a twentieth.
+        rate_exposure: Learning rate of the colour corrections at the start; falls to a tenth exponentially.
+        seed: Decides every random number.
     """
 
-    camera: Camera
-    rgb: FloatArray
-    alpha: FloatArray
+    gaussians: int = 30_000
+    iterations: int = 3000
+    budget: float | None = None
+    target_psnr: float | None = None
+    size: int = 800
+    sh_degree: int = 3
+    masks: Literal["alpha", "ignore", "off"] = "alpha"
+    background: Literal["random", "black"] = "random"
+    ssim_share: float = 0.2
+    alpha_weight: float = 0.1
+    depth_weight: float = 0.0
+    opacity_weight: float = 0.01
+    scale_weight: float = 0.01
+    exposure: bool = False
+    coarse: float = 0.25
+    refine_every: int = 100
+    rate_means: float = 1.6e-4
+    rate_quats: float = 1e-3
+    rate_scales: float = 5e-3
+    rate_opacities: float = 5e-2
+    rate_sh: float = 2.5e-3
+    rate_exposure: float = 1e-2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("gaussians", 2), ("iterations", 1), ("size", 16), ("refine_every", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
+        if self.budget is not None and not self.budget > 0:
+            raise InputError(f"budget must be > 0 s (got {self.budget})")
+        for name in ("ssim_share", "coarse"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} must be in [0, 1] (got {getattr(self, name)})")
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What a fit came to.
+
+    Attributes:
+        splats: The Gaussians, in the capture's frame and units.
+        iterations: Steps made.
+        seconds: Time that they took, over all runs.
+        held_out: Photos that were not fitted.
+        inputs: SHA-256 of photos, masks, cameras, points and settings.
+    """
+
+    splats: Splats
+    iterations: int
+    seconds: float
+    held_out: tuple[HeldOut, ...]
+    inputs: str
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR of the held-out photos [dB]."""
+        return float(np.mean([h.psnr for h in self.held_out]))
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM of the held-out photos."""
+        return float(np.mean([h.ssim for h in self.held_out]))
 
 
 @dataclass(frozen=True)
-class FitSettings:
-    """Steps and learning rates of the fit; rates fall exponentially to ``final_rate`` times their start.
+class FitProgress:
+    """Where a fit stands.
 
     Attributes:
-        iterations: Optimiser steps; each takes one picture, all pictures in turn.
-        rate_means: Per step, as a share of the splats' own mean size.
-        rate_quats: Of the quaternions' components.
-        rate_scales: Of the logarithms of the scales.
-        rate_opacities: Of the logits of the opacities.
-        rate_sh: Of the constant SH coefficient; higher bands take ``rest_rate`` of it.
-        rest_rate: Share of ``rate_sh`` for higher bands, which few pictures determine.
-        final_rate: Factor on all rates at the end.
-        seed: Decides the order of the pictures and the backgrounds.
+        step: Steps made.
+        fraction: Share of the schedule that has run off.
+        psnr: Of the photos of the last steps [dB].
+        held_out: Mean over the held-out photos when they were last looked at [dB], if they were.
+        gaussians: Number of Gaussians.
     """
 
-    iterations: int = 300
-    rate_means: float = 0.02
-    rate_quats: float = 0.004
-    rate_scales: float = 0.01
-    rate_opacities: float = 0.05
-    rate_sh: float = 0.01
-    rest_rate: float = 0.2
-    final_rate: float = 0.1
-    seed: int = 0
+    step: int
+    fraction: float
+    psnr: float
+    held_out: float | None
+    gaussians: int
 
 
 QUALITY = Quality(transmittance_min=1e-3)
+_EVERY = 25
+"""Steps between reports: reading a loss waits for the device."""
+_EXTENT = 1.1
+_REFINED = (0.02, 0.8)
+_GROWTH = 1.05
+_CHECKPOINT_SECONDS = 60.0
 
 
-def fit_splats(
-    splats: Splats,
-    pictures: Sequence[Picture],
+def fit_capture(
+    capture: Capture,
+    out: str | Path,
     settings: FitSettings = FitSettings(),
     *,
-    progress: Callable[[int, float], None] | None = None,
-) -> Splats:
-    """Splats that look more like the pictures, by Adam on the mean squared error of encoded colours.
+    overwrite: bool = False,
+    progress: Callable[[FitProgress], None] | None = None,
+) -> FitResult:
+    """Fit splats to the training photos of a capture, or go on with a fit that was interrupted.
 
-    The error is taken over a random grey background, the same behind both, so that it also measures alpha. The number
-    of Gaussians stays as it is.
+    Runs of the same inputs give the same splats on the same device, resumed or not, unless ``settings.budget`` is set.
 
     Args:
-        splats: Where to start.
-        pictures: What to come close to.
-        settings: Steps and rates.
-        progress: Told after every step its number and its PSNR [dB].
+        capture: Photos, cameras, points.
+        out: Folder of the fit.
+        settings: How to fit.
+        overwrite: Whether a fit of other inputs in the folder is replaced.
+        progress: Told every few steps where the fit stands.
 
     Raises:
-        ValueError: If there are no pictures, or no splats.
+        InputError: If there are fewer than two photos, a photo cannot be read, or the folder holds another fit.
     """
-    if not pictures or not len(splats):
-        raise ValueError(f"a fit needs pictures and splats (got {len(pictures)} and {len(splats)})")
+    training, held_out = _usable(capture.training, settings), _usable(capture.held_out, settings)
+    if not (training and held_out):
+        raise InputError(
+            "a fit needs a photo to learn from and a held-out one, with masks if any has one "
+            f"(got {len(training)} of {len(capture.training)} and {len(held_out)} of {len(capture.held_out)})"
+        )
     ensure_variant()
-    from mitsplat.plugins.backward import pack_cloud, render_differentiable
-    from mitsplat.plugins.splat_proxy import view_of
+    out = Path(out)
+    inputs = _digest(capture, settings)
+    done = None if overwrite else _finished(out, inputs)
+    if done is not None:
+        return done
+    fit = _Fit(capture, training, held_out, settings)
+    checkpoint = out / "checkpoint.npz"
+    if checkpoint.exists() and not overwrite:
+        fit.load(checkpoint, inputs)
+    out.mkdir(parents=True, exist_ok=True)
+    saved = time.monotonic()
+    while fit.fraction < 1:
+        fit.step()
+        if fit.steps % _EVERY == 0 or fit.fraction >= 1:
+            state = fit.report()
+            if progress is not None:
+                progress(state)
+            if settings.target_psnr is not None and (state.held_out or 0) >= settings.target_psnr:
+                break
+            if time.monotonic() - saved > _CHECKPOINT_SECONDS:
+                fit.save(checkpoint, inputs)
+                saved = time.monotonic()
+    seconds = fit.elapsed
+    result = FitResult(fit.model.splats(), fit.steps, seconds, fit.check(out / "held_out"), inputs)
+    result.splats.save(out / "splats.ply")
+    record = {name: getattr(result, name) for name in ("inputs", "iterations", "seconds", "psnr", "ssim")}
+    record |= {"gaussians": len(result.splats), "units": capture.units, "variant": mi.variant()}
+    record |= {"held_out": [asdict(photo) for photo in result.held_out], "settings": asdict(settings)}
+    write_text(out / "fit.json", json.dumps(record, indent=1) + "\n")
+    checkpoint.unlink(missing_ok=True)
+    return result
 
-    bands = splats.sh.shape[1]
-    unit = float(np.mean(splats.scales))
-    band_rate = np.broadcast_to(np.r_[1.0, np.full(bands - 1, settings.rest_rate)][None, :, None], splats.sh.shape)
-    band_weight = mi.Float(band_rate.astype(np.float32).ravel())
-    opacities = np.clip(splats.opacities.astype(np.float64), 1e-4, 1 - 1e-4)
-    start = {
-        "means": splats.means / unit,
-        "quats": splats.quats,
-        "scales": np.log(splats.scales),
-        "opacities": np.log(opacities / (1 - opacities)),
-        "sh": splats.sh / band_rate,
-    }
-    optimiser = mi.ad.Adam(lr=1.0, params={k: mi.Float(np.ravel(v).astype(np.float32)) for k, v in start.items()})
-    rates = {name: getattr(settings, f"rate_{name}") for name in start}
 
-    def activated() -> list[Any]:
-        p = optimiser
-        opacity = 1 / (1 + dr.exp(-p["opacities"]))
-        return [p["means"] * unit, p["quats"], dr.exp(p["scales"]), opacity, p["sh"] * band_weight]
+class _Fit:
+    """A fit between two steps."""
 
-    views = [view_of(make_sensor(picture.camera)) for picture in pictures]
-    targets = [
-        ([mi.Float(np.ravel(p.rgb[..., c]).astype(np.float32)) for c in range(3)], mi.Float(np.ravel(p.alpha)))
-        for p in pictures
-    ]
-    rng = np.random.default_rng(settings.seed)
-    order: list[int] = []
-    for step in range(settings.iterations):
-        order = order or list(rng.permutation(len(pictures)))
-        picture = order.pop()
-        decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
-        optimiser.set_learning_rate({name: rate * decay for name, rate in rates.items()})
-        rgb, alpha = render_differentiable(pack_cloud(*activated(), bands), views[picture], QUALITY)
-        seen, cover = targets[picture]
-        grey = dr.opaque(mi.Float, float(rng.random()))
-        loss = mi.Float(0)
-        for channel, target in zip(rgb, seen, strict=True):
-            loss += dr.mean(dr.square(channel - target + grey * (cover - alpha)))
+    def __init__(
+        self, capture: Capture, training: tuple[Photo, ...], held_out: tuple[Photo, ...], settings: FitSettings
+    ) -> None:
+        self.settings = settings
+        self.photos = [_sight(photo, settings) for photo in training]
+        self.held_out = [_sight(photo, settings) for photo in held_out]
+        centres = np.array([photo.camera.centre for photo in training])
+        self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
+        rng = np.random.default_rng([settings.seed, 0])
+        subject = settings.masks == "alpha" and any(photo.masked for photo in self.photos)
+        masks = [photo.mask for photo in self.photos] if subject else None
+        cameras = [photo.camera for photo in self.photos]
+        seen = [photo.seen for photo in training]
+        points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
+        self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
+        self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
+        self.start = self.model.count
+        self.exposure = Adam({"exposure": np.tile(np.eye(3, 4), (len(self.photos), 1, 1))})
+        self.steps, self.seconds = 0, 0.0
+        self.errors: list[Any] = []
+        self.held_out_psnr: float | None = None
+        self.began = time.monotonic()
+        self.looked = 0.0
+
+    @property
+    def elapsed(self) -> float:
+        """Time [s] spent, over all runs."""
+        return self.seconds + time.monotonic() - self.began
+
+    @property
+    def fraction(self) -> float:
+        """Share of the schedule that has run off."""
+        s = self.settings
+        spent = self.elapsed / s.budget if s.budget else 0.0
+        return min(1.0, max(self.steps / s.iterations, spent))
+
+    def step(self) -> None:
+        s, fraction = self.settings, self.fraction
+        epoch, turn = divmod(self.steps, len(self.photos))
+        number = int(np.random.default_rng([s.seed, 1, epoch]).permutation(len(self.photos))[turn])
+        rng = np.random.default_rng([s.seed, 2, self.steps])
+        sight = self.photos[number].half if fraction < s.coarse else self.photos[number]
+        degree = min(s.sh_degree, int(5 * fraction))
+        self.model.track()
+        loss, error = self._loss(sight, number, replace(QUALITY, sh_degree=degree), rng)
         dr.backward(loss)
-        optimiser.step()
-        if progress is not None:
-            progress(step, float(-10 * np.log10(max(loss.numpy()[0] / 3, 1e-12))))
-    means, quats, scales, opacity, sh = (np.array(dr.detach(value)) for value in activated())
-    return Splats(
-        means=means.reshape(-1, 3),
-        quats=quats.reshape(-1, 4),
-        scales=scales.reshape(-1, 3),
-        opacities=opacity,
-        sh=sh.reshape(splats.sh.shape),
-    )
+        rate = s.rate_means * 0.01**fraction
+        self.model.update(
+            {
+                "means": rate,
+                "quats": s.rate_quats,
+                "scales": s.rate_scales,
+                "opacities": s.rate_opacities,
+                "sh": self.model.sh_rates(s.rate_sh, s.rate_sh / 20),
+            }
+        )
+        if s.exposure:
+            self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
+        self.steps += 1
+        refined = _REFINED[0] <= fraction < _REFINED[1]
+        if refined and self.steps % s.refine_every == 0:
+            relocate(self.model, rng)
+            grow(self.model, self._wanted(fraction), rng)
+        jitter(self.model, rate, (s.seed, self.steps))
+        self.errors.append(error)
+
+    def _wanted(self, fraction: float) -> int:
+        """Number of Gaussians by now: 5 % more each time as published, or more if the fit is short."""
+        share = min(1.0, (fraction - _REFINED[0]) / (0.5 - _REFINED[0]))
+        planned = self.start * (self.settings.gaussians / self.start) ** share
+        return min(self.settings.gaussians, int(max(planned, _GROWTH * self.model.count)))
+
+    def _loss(self, sight: Sight, number: int, quality: Quality, rng: np.random.Generator) -> tuple[Any, Any]:
+        """The loss, and the mean squared error alone."""
+        from mitsplat.plugins.backward import render_differentiable
+        from mitsplat.plugins.photometric import photometric_loss
+
+        s = self.settings
+        rgb, alpha = render_differentiable(self.model.cloud(), sight.view, quality)
+        target, mask = sight.pixels()
+        if s.exposure:
+            self.exposure.track()
+            rgb = _exposed(rgb, alpha, self.exposure.values["exposure"], number)
+        if s.masks == "ignore":
+            rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
+        if s.background == "random":
+            behind = [dr.opaque(mi.Float, float(value)) for value in rng.random(3)]
+            rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
+            target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
+        camera = sight.camera
+        loss = photometric_loss(rgb, target, camera.width, camera.height, s.ssim_share)
+        if s.masks == "alpha" and sight.masked:
+            loss += s.alpha_weight * dr.mean(dr.abs(alpha - mask))
+        _, _, scales, opacities, _ = self.model.activated()
+        loss += s.opacity_weight * dr.mean(opacities)
+        loss += s.scale_weight * dr.mean(scales) / dr.opaque(mi.Float, self.extent)
+        error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
+        dr.schedule(error)
+        return loss, error
+
+    def report(self) -> FitProgress:
+        """Where the fit stands; looks at the held-out photos now and then if their PSNR decides."""
+        error = float(np.mean([e.numpy()[0] for e in self.errors]))
+        self.errors = []
+        fraction = self.fraction
+        if self.settings.target_psnr is not None and fraction >= self.looked + 0.05:
+            self.looked = fraction
+            self.held_out_psnr = float(np.mean([photo.psnr for photo in self.check(None)]))
+        return FitProgress(self.steps, fraction, psnr_of(error), self.held_out_psnr, self.model.count)
+
+    def check(self, folder: Path | None) -> tuple[HeldOut, ...]:
+        """The held-out photos, with a picture of each in the folder."""
+        quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
+        found = []
+        for sight in self.held_out:
+            seen, _ = sight.render(self.model, quality)
+            if self.settings.masks == "ignore":
+                seen = seen * sight.mask[..., None]
+            found.append(sight.compare(seen, folder))
+        return tuple(found)
+
+    def save(self, path: Path, inputs: str) -> None:
+        """Write a checkpoint."""
+        arrays: dict[str, Any] = {"inputs": inputs, "steps": self.steps, "seconds": self.elapsed}
+        arrays |= {f"model.{k}": v for k, v in self.model.state().items()}
+        arrays |= {f"exposure.{k}": v for k, v in self.exposure.state().items()}
+
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as file:
+                np.savez(file, **arrays)
+
+        write_file(path, write)
+
+    def load(self, path: Path, inputs: str) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            InputError: If it cannot be read, or is of other inputs.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                state = dict(stored)
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path}: not a checkpoint of a fit ({error})") from error
+        if str(state["inputs"]) != inputs:
+            raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
+        self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
+        self.model.restore({k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")})
+        self.exposure.restore({k.removeprefix("exposure."): v for k, v in state.items() if k.startswith("exposure.")})
+
+
+def _exposed(rgb: list[Any], alpha: Any, table: Any, number: int) -> list[Any]:
+    """Premultiplied colours after the affine correction of a photo."""
+    base = dr.opaque(mi.UInt32, 12 * number)
+    m = [dr.gather(mi.Float, table, base + i) for i in range(12)]
+    return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
+
+
+def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:
+    """The photos, but none without mask where others have one: it shows what is not to be fitted."""
+    masked = tuple(photo for photo in photos if photo.mask is not None)
+    return photos if settings.masks == "off" or not masked else masked
+
+
+def _sight(photo: Photo, settings: FitSettings) -> Sight:
+    scale = min(1.0, settings.size / max(photo.camera.width, photo.camera.height))
+    return Sight(photo, scale, masked=settings.masks != "off")
+
+
+def _digest(capture: Capture, settings: FitSettings) -> str:
+    """SHA-256 of everything that decides a fit."""
+    digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
+    for photo in capture.photos:
+        camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
+        digest.update(json.dumps([photo.name, camera]).encode())
+        digest.update(np.ascontiguousarray(photo.seen).tobytes())
+        for file in (photo.file, photo.mask):
+            digest.update(b"-" if file is None else file.read_bytes())
+    digest.update(capture.points.tobytes() + capture.colours.tobytes())
+    return digest.hexdigest()
+
+
+def _finished(out: Path, inputs: str) -> FitResult | None:
+    """The fit of these inputs that the folder holds, if any.
+
+    Raises:
+        InputError: If it holds another one.
+    """
+    path = out / "fit.json"
+    if not path.exists():
+        return None
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        held_out = tuple(HeldOut(**photo) for photo in record["held_out"])
+        found, iterations, seconds = record["inputs"], int(record["iterations"]), float(record["seconds"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the record of a fit ({error})") from error
+    if found != inputs:
+        raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
+    return FitResult(Splats.load(out / "splats.ply"), iterations, seconds, held_out, inputs)

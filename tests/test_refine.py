@@ -1,4 +1,4 @@
-"""The fit recovers what it is shown."""
+"""Refining recovers what it is shown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from test_render import make_splats
 
 from mitsplat.camera import Camera
-from mitsplat.fit import QUALITY, FitSettings, Picture, fit_splats
+from mitsplat.refine import QUALITY, Picture, RefineSettings, refine_splats
 from mitsplat.render import render_splats
 from mitsplat.splats import Splats
 
@@ -46,7 +46,7 @@ def test_fit_comes_back_to_disturbed_splats_and_generalises() -> None:
     )
     shown = [picture(truth, camera) for camera in cameras(8)]
     steps: list[float] = []
-    fitted = fit_splats(start, shown, FitSettings(iterations=160), progress=lambda step, psnr: steps.append(psnr))
+    fitted = refine_splats(start, shown, RefineSettings(iterations=160), progress=lambda step, psnr: steps.append(psnr))
     unseen = Camera.look_at((1.5, 1.6, 0.5), (0, 0, 0), width=48, height=40, fov_x=45)
     assert len(steps) == 160
     assert error(fitted, truth, unseen) < 0.15 * error(start, truth, unseen)
@@ -54,4 +54,4 @@ def test_fit_comes_back_to_disturbed_splats_and_generalises() -> None:
 
 def test_fit_without_pictures_is_refused() -> None:
     with pytest.raises(ValueError, match="pictures"):
-        fit_splats(make_splats(2), [])
+        refine_splats(make_splats(2), [])

@@ -1,0 +1,140 @@
+"""The loss that 3DGS trains with, L1 + D-SSIM, on the device and with its gradient.
+
+SSIM is that of Wang et al. 2004 with an 11 x 11 Gaussian window of 1.5 px, zero beyond the borders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+RADIUS, SIGMA = 5, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+
+_taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
+_WEIGHTS = tuple(float(w) for w in _taps / _taps.sum())
+
+
+def photometric_loss(seen: list[Any], target: list[Any], width: int, height: int, ssim_share: float) -> Any:
+    """``(1 - s) L1 + s (1 - SSIM)`` of two pictures (Kerbl et al. 2023, eq. 7), with gradients to the first.
+
+    Args:
+        seen: Flat row-major arrays of red, green and blue.
+        target: The same of what should be seen.
+        width: Width of the pictures [px].
+        height: Their height [px].
+        ssim_share: s, in [0, 1].
+    """
+    loss = mi.Float(0)
+    for a, b in zip(seen, target, strict=True):
+        loss += (1 - ssim_share) / 3 * dr.mean(dr.abs(a - b))
+    if ssim_share == 0:
+        return loss
+    targets = [dr.detach(b) for b in target]
+    # A function hides what needs no gradient from Dr.Jit.
+    return loss + ssim_share * (1 - dr.custom(_Ssim, seen, lambda: (targets, width, height)))
+
+
+class _Ssim(dr.CustomOp):
+    """Mean SSIM of one picture against a fixed one."""
+
+    def eval(self, seen: list[Any], context: Callable[[], tuple[list[Any], int, int]]) -> Any:
+        target, self.width, self.height = context()
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        self.pictures = _pack([*(dr.detach(x) for x in seen), *target, 0, 0], pixel)
+        value, self.slopes = dr.empty(mi.Float, dr.width(pixel)), dr.empty(mi.Float, 12 * dr.width(pixel))
+
+        def moments(index: Any, inside: Any) -> list[Any]:
+            p = dr.gather(mi.ArrayXf, self.pictures, index, inside, shape=(8, dr.width(index)))
+            x, y = [p[0], p[1], p[2]], [p[3], p[4], p[5]]
+            pairs = list(zip(x, y, strict=True))
+            return [*x, *y, *(a * a for a in x), *(b * b for b in y), *(a * b for a, b in pairs)]
+
+        def finish(index: Any, means: list[Any]) -> None:
+            values, slopes = zip(*(_ssim_of(*means[c::3]) for c in range(3)), strict=True)
+            dr.scatter(value, sum(values) / 3, index, mode=dr.ReduceMode.Permute)
+            by_kind = [slope for kind in zip(*slopes, strict=True) for slope in kind]
+            dr.scatter(self.slopes, mi.ArrayXf([*by_kind, 0, 0, 0]), index)
+
+        _blur(moments, finish, self.width, self.height)
+        return dr.mean(value)
+
+    def backward(self) -> None:
+        size = self.width * self.height
+        gain = self.grad_out() / (3 * size)
+        gradient = [dr.empty(mi.Float, size) for _ in range(3)]
+
+        def slopes(index: Any, inside: Any) -> list[Any]:
+            return list(dr.gather(mi.ArrayXf, self.slopes, index, inside, shape=(12, dr.width(index))))[:9]
+
+        def finish(index: Any, means: list[Any]) -> None:
+            p = dr.gather(mi.ArrayXf, self.pictures, index, shape=(8, dr.width(index)))
+            for c, (by_mean, by_square, by_product) in enumerate(zip(means[:3], means[3:6], means[6:], strict=True)):
+                slope = gain * (by_mean + 2 * p[c] * by_square + p[3 + c] * by_product)
+                dr.scatter(gradient[c], slope, index, mode=dr.ReduceMode.Permute)
+
+        _blur(slopes, finish, self.width, self.height)
+        self.set_grad_in("seen", gradient)
+
+    def name(self) -> str:
+        return "ssim"
+
+
+def _ssim_of(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple[Any, list[Any]]:
+    """SSIM from a window's means of x, y, x^2, y^2 and xy, and its derivatives by those of x, x^2 and xy."""
+    a1, a2 = 2 * mx * my + _C1, 2 * (xy - mx * my) + _C2
+    b1, b2 = mx * mx + my * my + _C1, xx - mx * mx + yy - my * my + _C2
+    scale = dr.rcp(b1 * b2)
+    value = a1 * a2 * scale
+    by_square, by_product = -value / b2, 2 * a1 * scale
+    by_mean = 2 * my * a2 * scale - 2 * mx * value / b1 - 2 * mx * by_square - my * by_product
+    return value, [by_mean, by_square, by_product]
+
+
+def _pack(planes: list[Any], pixel: Any) -> Any:
+    """Planes side by side per pixel: one fetch brings all of them."""
+    packed = dr.empty(mi.Float, len(planes) * dr.width(pixel))
+    dr.scatter(packed, mi.ArrayXf(planes), pixel)
+    dr.eval(packed)
+    return packed
+
+
+_Read = Callable[[Any, Any], list[Any]]
+_Write = Callable[[Any, list[Any]], None]
+
+
+def _blur(read: _Read, write: _Write, width: int, height: int) -> None:
+    """Means in Gaussian windows, zero beyond the borders, of several values per pixel.
+
+    Args:
+        read: The values of pixels, from their numbers and whether they are inside.
+        write: Takes numbers of pixels and the means there.
+        width: Width of the picture [px].
+        height: Its height [px].
+    """
+    pixel = dr.arange(mi.UInt32, width * height)
+    y = pixel // width
+    x = pixel - y * width
+    along_x = _window(read, pixel, x, 1, width)
+    count = -(-len(along_x) // 4) * 4
+    rows = _pack([*along_x, *[0] * (count - len(along_x))], pixel)
+
+    def load(index: Any, inside: Any) -> list[Any]:
+        return list(dr.gather(mi.ArrayXf, rows, index, inside, shape=(count, dr.width(index))))
+
+    write(pixel, _window(load, pixel, y, width, height)[: len(along_x)])
+    dr.eval()
+
+
+def _window(read: _Read, pixel: Any, place: Any, step: int, length: int) -> list[Any]:
+    """Weighted means of the pixels around each one along an axis, where it has this place of ``length``."""
+    sums: list[Any] = []
+    for offset, weight in zip(range(-RADIUS, RADIUS + 1), _WEIGHTS, strict=True):
+        inside = (mi.Int32(place) + offset >= 0) & (mi.Int32(place) + offset < length)
+        values = read(mi.UInt32(mi.Int32(pixel) + offset * step), inside)
+        sums = [dr.fma(weight, v, s) for v, s in zip(values, sums or [0.0] * len(values), strict=True)]
+    return sums

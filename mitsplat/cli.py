@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -308,6 +308,71 @@ def bake(
 
 
 @app.command()
+def fit(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    gaussians: Annotated[int, typer.Option(help="Most Gaussians.")] = 30000,
+    iterations: Annotated[int, typer.Option(help="Optimiser steps, one photo each.")] = 3000,
+    budget: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Shorten the fit to this time, such as 90s, 10min or 1h.")
+    ] = None,
+    target_psnr: Annotated[float | None, typer.Option(help="End early at this PSNR of held-out photos [dB].")] = None,
+    edge: Annotated[int, typer.Option(help="Longest edge of the photos in the fit [px].")] = 800,
+    sh_degree: Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")] = 3,
+    masks: Annotated[
+        Literal["alpha", "ignore", "off"],
+        typer.Option(help="Fit only what masks show, ignore what they leave out, or do not read them."),
+    ] = "alpha",
+    background: Annotated[Literal["random", "black"], typer.Option(help="Colour behind the splats.")] = "random",
+    depth: Annotated[float, typer.Option(help="Weight of the depths of the capture's points.")] = 0.0,
+    exposure: Annotated[
+        bool, typer.Option("--exposure/--no-exposure", help="Give each photo a colour correction of its own.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Decides everything that is random.")] = 0,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite/--resume", help="Replace a fit in the folder, or go on with it.")
+    ] = False,
+) -> None:
+    """Fit Gaussians to the photos of CAPTURE.
+
+    Every eighth photo is held out to check the result.
+    """
+    from mitsplat.capture import Capture
+    from mitsplat.fit import FitProgress, FitSettings, fit_capture
+
+    settings = FitSettings(
+        gaussians=gaussians,
+        iterations=iterations,
+        budget=None if budget is None else _seconds(budget),
+        target_psnr=target_psnr,
+        size=edge,
+        sh_degree=sh_degree,
+        masks=masks,
+        background=background,
+        depth_weight=depth,
+        exposure=exposure,
+        seed=seed,
+    )
+    loaded = Capture.load(capture)
+    with _progress_bar("steps/s") as show:
+
+        def progress(now: FitProgress) -> None:
+            checked = "" if now.held_out is None else f" ({now.held_out:.1f} held out)"
+            show(int(now.fraction * iterations), iterations, f"{now.psnr:.1f} dB{checked}, {now.gaussians} Gaussians")
+
+        result = fit_capture(loaded, out, settings, overwrite=overwrite, progress=progress)
+    typer.echo(
+        f"splats: {out / 'splats.ply'} ({len(result.splats)} Gaussians; {len(result.held_out)} held-out photos: "
+        f"{result.psnr:.2f} dB, SSIM {result.ssim:.3f})"
+    )
+    if target_psnr is not None and result.psnr < target_psnr:
+        raise PartialResultError(
+            f"{out}: held-out PSNR must reach {target_psnr:.2f} dB (got {result.psnr:.2f}); more iterations or "
+            "Gaussians, or more photos with overlap and even light, would help"
+        )
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON Schema of scene files, for editors."""
     import json
@@ -373,9 +438,18 @@ def _overrides(
     return {key: value for key, value in overrides.items() if value is not None}
 
 
+def _seconds(text: str) -> float:
+    """Time [s] such as 90s, 10min or 1h."""
+    for suffix, factor in (("min", 60.0), ("h", 3600.0), ("s", 1.0)):
+        if text.endswith(suffix):
+            with suppress(ValueError):
+                return float(text.removesuffix(suffix)) * factor
+    raise InputError(f"--budget must be a time such as 90s, 10min or 1h (got {text})")
+
+
 @contextmanager
-def _progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr with images per second and the time left."""
+def _progress_bar(unit: str = "images/s") -> Iterator[Callable[[int, int, str], None]]:
+    """A bar on stderr with speed and the time left."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -391,7 +465,7 @@ def _progress_bar() -> Iterator[Callable[[int, int, str], None]]:
     class RateColumn(ProgressColumn):
         def render(self, task: Task) -> Text:
             speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.2f} images/s")
+            return Text("" if speed is None else f"{speed:.2f} {unit}")
 
     columns = (BarColumn(), MofNCompleteColumn(), RateColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=300) as bar:

@@ -231,7 +231,7 @@ class _Fit:
     def __init__(
         self, capture: Capture, training: tuple[Photo, ...], held_out: tuple[Photo, ...], settings: FitSettings
     ) -> None:
-        self.settings = settings
+        self.settings, self.points = settings, capture.points
         self.photos = [_sight(photo, settings) for photo in training]
         self.held_out = [_sight(photo, settings) for photo in held_out]
         centres = np.array([photo.camera.centre for photo in training])
@@ -302,11 +302,18 @@ class _Fit:
 
     def _loss(self, sight: Sight, number: int, quality: Quality, rng: np.random.Generator) -> tuple[Any, Any]:
         """The loss, and the mean squared error alone."""
-        from mitsplat.plugins.backward import render_differentiable
+        from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
         from mitsplat.plugins.photometric import photometric_loss
 
         s = self.settings
-        rgb, alpha = render_differentiable(self.model.cloud(), sight.view, quality)
+        loss = mi.Float(0)
+        if s.depth_weight > 0:
+            rgb, alpha, moment = render_depth_differentiable(self.model.cloud(), sight.view, quality)
+            loss += dr.opaque(mi.Float, s.depth_weight * self.extent) * _depth_error(
+                alpha, moment, *sight.depths(self.points)
+            )
+        else:
+            rgb, alpha = render_differentiable(self.model.cloud(), sight.view, quality)
         target, mask = sight.pixels()
         if s.exposure:
             self.exposure.track()
@@ -318,12 +325,13 @@ class _Fit:
             rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
             target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
         camera = sight.camera
-        loss = photometric_loss(rgb, target, camera.width, camera.height, s.ssim_share)
+        loss += photometric_loss(rgb, target, camera.width, camera.height, s.ssim_share)
         if s.masks == "alpha" and sight.masked:
             loss += s.alpha_weight * dr.mean(dr.abs(alpha - mask))
         _, _, scales, opacities, _ = self.model.activated()
-        loss += s.opacity_weight * dr.mean(opacities)
-        loss += s.scale_weight * dr.mean(scales) / dr.opaque(mi.Float, self.extent)
+        # Means by opaque counts: a literal one would compile the kernels anew whenever Gaussians are added.
+        loss += dr.sum(opacities) * dr.opaque(mi.Float, s.opacity_weight / self.model.count)
+        loss += dr.sum(scales) * dr.opaque(mi.Float, s.scale_weight / (3 * self.model.count * self.extent))
         error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
         dr.schedule(error)
         return loss, error
@@ -377,6 +385,17 @@ class _Fit:
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
         self.model.restore({k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")})
         self.exposure.restore({k.removeprefix("exposure."): v for k, v in state.items() if k.startswith("exposure.")})
+
+
+def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:
+    """Mean difference between inverse depths [1/m] at pixels, as splats have them and as they should be."""
+    count = dr.width(pixel)
+    if count == 0:
+        return mi.Float(0)
+    cover, depth = dr.gather(mi.Float, alpha, pixel), dr.gather(mi.Float, moment, pixel)
+    seen = (cover > 0.1) & (depth > 0)
+    found = dr.select(seen, cover / dr.select(seen, depth, 1), inverse)
+    return dr.sum(dr.abs(found - inverse)) * dr.opaque(mi.Float, 1 / count)
 
 
 def _exposed(rgb: list[Any], alpha: Any, table: Any, number: int) -> list[Any]:

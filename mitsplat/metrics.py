@@ -22,8 +22,5 @@ def ssim(seen: npt.NDArray[np.floating], truth: npt.NDArray[np.floating]) -> flo
 
     The window is that of Wang et al. 2004.
     """
-    return float(
-        structural_similarity(
-            seen, truth, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
-        )
-    )
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(structural_similarity(seen, truth, data_range=1.0, channel_axis=2, **window))  # type: ignore[no-untyped-call]

@@ -67,6 +67,7 @@ class Sight:
         # Four bytes per pixel, so that hundreds of photos fit in memory; made to floats in the kernels.
         self._packed = pixels.view(np.uint32).ravel()
         self._photo, self._scale, self._mask_used = photo, scale, masked
+        self._depths: tuple[Any, Any] | None = None
 
     @cached_property
     def half(self) -> Sight:
@@ -95,6 +96,19 @@ class Sight:
         packed = mi.UInt32(self._packed)
         red, green, blue, mask = (mi.Float((packed >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24))
         return [red * mask, green * mask, blue * mask], mask
+
+    def depths(self, points: npt.NDArray[np.float64]) -> tuple[Any, Any]:
+        """Pixels and inverse depths [1/m] of those of the points (N, 3) that the photo sees, on the device."""
+        if self._depths is None:
+            pixels, depth = self.camera.project(points[self._photo.seen])
+            inside = (
+                (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [self.camera.width, self.camera.height]).all(axis=1)
+            )
+            column, row = pixels[inside].astype(np.uint32).T
+            shown = self.mask[row, column] > 0.5
+            number = (row * self.camera.width + column)[shown]
+            self._depths = mi.UInt32(number), mi.Float((1 / depth[inside][shown]).astype(np.float32))
+        return self._depths
 
     def render(self, model: Model, quality: Quality) -> tuple[FloatArray, FloatArray]:
         """Display-encoded colour times alpha, (H, W, 3), and alpha, (H, W), as the splats look from here."""

@@ -40,16 +40,39 @@ def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[l
     Raises:
         ValueError: If the quality asks for another order, several samples or a kernel that limits opacity.
     """
+    lists = _bin_cloud(cloud, view, quality)
+    rgb, alpha = _march(lists.records, lists, view, quality)
+    return rgb, alpha
+
+
+def render_depth_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[list[Any], Any, Any]:
+    """As :func:`render_differentiable`, and the sum of the centres' depths [m] by their weights in alpha.
+
+    That takes a second march in which depth is a colour.
+    """
+    lists = _bin_cloud(cloud, view, quality)
+    rgb, alpha = _march(lists.records, lists, view, quality)
+    row = dr.arange(mi.UInt32, max(1, lists.visible)) * RECORD
+    tinted = dr.copy(lists.records)
+    dr.scatter(tinted, dr.gather(mi.Float, lists.records, row + 9), row + 6)
+    (moment, _, _), _ = _march(tinted, lists, view, quality)
+    return rgb, alpha, moment
+
+
+def _march(records: Any, lists: TileLists, view: View, quality: Quality) -> tuple[list[Any], Any]:
+    # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
+    *rgb, alpha = dr.custom(_March, records, lambda: (lists, view, quality))
+    return rgb, alpha
+
+
+def _bin_cloud(cloud: Cloud, view: View, quality: Quality) -> TileLists:
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
         raise ValueError("gradients need quality.order 'tile' and one sample per pixel")
     if KERNELS[quality.kernel].alpha_max < 1:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
     clouds = CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
     eye = Placement(0, _IDENTITY, 1)
-    lists = bin_gaussians(clouds, [eye], view, quality)
-    # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
-    *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
-    return rgb, alpha
+    return bin_gaussians(clouds, [eye], view, quality)
 
 
 _IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

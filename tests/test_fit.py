@@ -1,0 +1,249 @@
+"""Fits to captures whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from test_refine import encode
+
+from mitsplat import fit
+from mitsplat.camera import Camera
+from mitsplat.capture import Capture, Photo
+from mitsplat.errors import InputError
+from mitsplat.fit import FitProgress, FitSettings, fit_capture
+from mitsplat.render import render_splats
+from mitsplat.seeds import seed_points
+from mitsplat.splats import SH_C0, Splats
+
+WIDTH, HEIGHT, VIEWS = 64, 48, 20
+SMALL = FitSettings(gaussians=700, iterations=60, sh_degree=1, refine_every=10, coarse=0.0)
+
+
+def ball() -> Splats:
+    """A coloured ball of flat Gaussians."""
+    rng = np.random.default_rng(3)
+    index = np.arange(500) + 0.5
+    z, azimuth = 1 - index / 250, index * np.pi * (1 + np.sqrt(5))
+    normals = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    turns, _ = zip(*(Rotation.align_vectors([n], [[0, 0, 1]]) for n in normals), strict=True)
+    colour = 0.5 + 0.4 * np.sin(normals * (4, 5, 6) + rng.random(3))
+    return Splats(
+        means=0.4 * normals,
+        quats=np.array([turn.as_quat() for turn in turns]),
+        scales=np.tile([0.035, 0.035, 0.005], (500, 1)),
+        opacities=np.full(500, 0.95),
+        sh=((colour - 0.5) / SH_C0)[:, None],
+    )
+
+
+def look(direction: np.ndarray) -> Camera:
+    return Camera.look_at(1.5 * direction / np.linalg.norm(direction), (0, 0, 0), width=WIDTH, height=HEIGHT, fov_x=45)
+
+
+def photograph(folder: Path, *, gains: np.ndarray | None = None) -> Capture:
+    """Pictures of the ball from all around, in front of a busy wall, with masks."""
+    rng, truth = np.random.default_rng(5), ball()
+    photos = []
+    for number in range(VIEWS):
+        camera = look(rng.normal(size=3) * (1, 1, 0.5))
+        layers = render_splats(truth, camera, quality=fit.QUALITY)
+        colour = encode(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
+        colour += rng.random((HEIGHT, WIDTH, 3)) * (1 - layers.alpha[..., None])
+        if gains is not None:
+            colour *= gains[number]
+        files = folder / f"{number:02}.png", folder / f"mask_{number:02}.png"
+        for file, values in zip(files, (colour, layers.alpha), strict=True):
+            Image.fromarray(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).save(file)
+        photos.append(Photo(files[0].name, files[0], camera, files[1]))
+    # Points on the ball, and some on the wall, that a fit of the ball alone must do without.
+    points = np.concatenate([truth.means[::2] + rng.normal(0, 0.005, (250, 3)), rng.normal((0, 0, 9), 1, (100, 3))])
+    return Capture(tuple(photos), points, rng.integers(0, 255, points.shape).astype(np.uint8), "metre", "z")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return photograph(tmp_path_factory.mktemp("photos"))
+
+
+@pytest.fixture(scope="module")
+def fitted(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fit")
+    fit_capture(capture, folder, SMALL)
+    return folder
+
+
+def test_fit_shows_photos_that_it_has_not_seen(capture: Capture, tmp_path: Path) -> None:
+    states: list[FitProgress] = []
+    settings = FitSettings(gaussians=1200, iterations=500, sh_degree=1, refine_every=20)
+    result = fit_capture(capture, tmp_path, settings, progress=states.append)
+    assert result.psnr > 29 and result.ssim > 0.93
+    assert min(photo.psnr_object for photo in result.held_out) > 22
+    assert [photo.name for photo in result.held_out] == ["00.png", "08.png", "16.png"]
+    assert states[-1].gaussians == len(result.splats) == 1200
+    assert states[-1].fraction == 1 and states[-1].psnr > states[0].psnr + 3
+    # Masks supervise alpha: nothing is left of the wall, and the ball is opaque from a new side.
+    layers = render_splats(result.splats, look(np.array([0.3, 1, 0.2])))
+    truth = render_splats(ball(), look(np.array([0.3, 1, 0.2])))
+    inside, outside = truth.alpha > 0.99, truth.alpha < 0.01
+    assert layers.alpha[inside].mean() > 0.97 and layers.alpha[outside].mean() < 0.02
+
+
+def test_folder_holds_splats_record_and_comparisons(fitted: Path, capture: Capture) -> None:
+    record = json.loads((fitted / "fit.json").read_text())
+    assert record["gaussians"] == len(Splats.load(fitted / "splats.ply")) and record["iterations"] == 60
+    assert record["units"] == "metre" and record["settings"]["masks"] == "alpha"
+    for photo in record["held_out"]:
+        sheet = np.asarray(Image.open(fitted / "held_out" / photo["name"]))
+        assert sheet.shape == (HEIGHT, 3 * WIDTH, 3)
+        seen, truth = sheet[:, WIDTH : 2 * WIDTH] / 255, sheet[:, :WIDTH] / 255
+        assert photo["psnr"] == pytest.approx(-10 * np.log10(np.mean((seen - truth) ** 2)), abs=0.05)
+    assert not (fitted / "checkpoint.npz").exists()
+
+
+def test_finished_fit_is_read_and_not_made_again(fitted: Path, capture: Capture) -> None:
+    before = (fitted / "splats.ply").stat().st_mtime_ns
+    again = fit_capture(capture, fitted, SMALL)
+    assert (fitted / "splats.ply").stat().st_mtime_ns == before
+    assert again.iterations == 60 and again.psnr == json.loads((fitted / "fit.json").read_text())["psnr"]
+
+
+def test_interrupted_fit_goes_on_to_the_same_bytes(
+    fitted: Path, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
+    steps: list[int] = []
+
+    def interrupt(state: FitProgress) -> None:
+        steps.append(state.step)
+        if len(steps) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_capture(capture, tmp_path, SMALL, progress=interrupt)
+    fit_capture(capture, tmp_path, SMALL, progress=lambda state: steps.append(state.step))
+    assert steps == [25, 50, 50, 60]  # the first checkpoint is behind the first report
+    assert (tmp_path / "splats.ply").read_bytes() == (fitted / "splats.ply").read_bytes()
+
+
+def test_another_seed_gives_other_splats(fitted: Path, capture: Capture, tmp_path: Path) -> None:
+    fit_capture(capture, tmp_path, replace(SMALL, seed=1))
+    assert (tmp_path / "splats.ply").read_bytes() != (fitted / "splats.ply").read_bytes()
+
+
+def test_folder_of_another_fit_is_refused_unless_overwritten(fitted: Path, capture: Capture, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"fit\.json: belongs to a fit of other photos or settings"):
+        fit_capture(capture, fitted, replace(SMALL, seed=2))
+    (tmp_path / "checkpoint.npz").write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"checkpoint\.npz: not a checkpoint"):
+        fit_capture(capture, tmp_path, SMALL)
+    fit_capture(capture, tmp_path, replace(SMALL, iterations=5), overwrite=True)
+    assert json.loads((tmp_path / "fit.json").read_text())["iterations"] == 5
+
+
+def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) -> None:
+    seen: list[set[int]] = []
+    counts: list[int] = []
+
+    def keep(state: FitProgress) -> None:
+        seen.append({entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])})
+        counts.append(state.gaussians)
+
+    settings = replace(SMALL, iterations=150, sh_degree=0, refine_every=5, gaussians=900)
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        fit_capture(capture, tmp_path, settings, progress=keep)
+    known = set.union(*seen[:2])
+    assert counts[1] < counts[2] and set.union(*seen[2:4]) <= known
+
+
+def test_photos_with_exposures_of_their_own_are_brought_together(tmp_path: Path) -> None:
+    gains = np.random.default_rng(1).uniform(0.6, 1.0, (VIEWS, 1))
+    varied = photograph(tmp_path, gains=gains)
+    settings = replace(SMALL, iterations=250, gaussians=900, sh_degree=0, refine_every=20)
+    plain = fit_capture(varied, tmp_path / "plain", settings)
+    own = fit_capture(varied, tmp_path / "own", replace(settings, exposure=True))
+    corrected = [np.mean([photo.psnr_corrected for photo in result.held_out]) for result in (plain, own)]
+    assert corrected[1] > corrected[0] + 1
+
+
+def test_fit_keeps_to_its_time_and_ends_at_its_target(capture: Capture, tmp_path: Path) -> None:
+    short = fit_capture(capture, tmp_path / "short", replace(SMALL, iterations=10**6, budget=3.0))
+    assert 3 <= short.seconds < 15 and short.iterations < 10**4
+    early = fit_capture(capture, tmp_path / "early", replace(SMALL, iterations=1000, target_psnr=15.0))
+    assert early.iterations < 200 and early.psnr >= 15
+
+
+def test_ignored_pixels_may_look_like_anything(capture: Capture, tmp_path: Path) -> None:
+    result = fit_capture(capture, tmp_path, replace(SMALL, masks="ignore", iterations=150))
+    whole = fit_capture(capture, tmp_path / "off", replace(SMALL, masks="off", iterations=150))
+    object_psnr = [np.mean([photo.psnr_object for photo in r.held_out]) for r in (result, whole)]
+    assert object_psnr[0] > 20
+    assert whole.psnr < 15  # the wall is another one in every photo
+
+
+def test_depths_of_points_hold_the_splats_in_place(capture: Capture, tmp_path: Path) -> None:
+    """With the pictures' weight taken away, depths alone move Gaussians onto the points."""
+    truth = ball()
+    cameras = [photo.camera for photo in capture.photos]
+    seen = []
+    for camera in cameras:
+        facing = ((camera.centre - truth.means) * truth.means).sum(axis=1) > 0.1
+        seen.append(np.flatnonzero(facing).astype(np.int32))
+    photos = tuple(replace(photo, seen=own) for photo, own in zip(capture.photos, seen, strict=True))
+    points = truth.means.astype(np.float64)
+    exact = Capture(photos, points, np.full(points.shape, 128, np.uint8))
+    errors = []
+    for weight in (0.0, 1.0):
+        settings = replace(SMALL, iterations=200, sh_degree=0, depth_weight=weight)
+        result = fit_capture(exact, tmp_path / str(weight), settings)
+        solid = result.splats.opacities > 0.5
+        errors.append(np.median(np.abs(np.linalg.norm(result.splats.means[solid], axis=1) - 0.4)))
+    assert errors[1] < errors[0]
+
+
+def test_too_few_photos_are_refused(capture: Capture, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a fit needs a photo to learn from and a held-out one"):
+        fit_capture(replace(capture, photos=capture.photos[:1]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"gaussians": 1}, "gaussians"),
+        ({"sh_degree": 4}, "sh_degree"),
+        ({"budget": 0.0}, "budget"),
+        ({"coarse": 2}, "coarse"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change: dict[str, float], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        FitSettings(**change)  # type: ignore[arg-type]
+
+
+def seeds(capture: Capture, points: np.ndarray, *, masked: bool = True) -> np.ndarray:
+    cameras = [photo.camera for photo in capture.training]
+    masks = [photo.picture()[1] for photo in capture.training] if masked else None
+    colours = np.zeros(points.shape, np.uint8)
+    nothing = [np.zeros(0, np.int32)] * len(cameras)
+    return seed_points(points, colours, cameras, nothing, masks, np.random.default_rng(0), 10_000)[0]
+
+
+def test_seeds_are_the_points_inside_the_masks(capture: Capture) -> None:
+    inside = np.random.default_rng(1).normal(size=(600, 3))
+    inside *= 0.35 / np.linalg.norm(inside, axis=1, keepdims=True)
+    outside = inside + np.array([0, 0, 0.9])
+    np.testing.assert_array_equal(seeds(capture, np.concatenate([inside, outside])), inside)
+
+
+def test_without_points_the_hull_of_the_masks_is_filled(capture: Capture) -> None:
+    radius = np.linalg.norm(seeds(capture, np.zeros((0, 3))), axis=1)
+    assert len(radius) > 1000 and np.percentile(radius, 95) < 0.6
+    free = seeds(capture, np.zeros((0, 3)), masked=False)
+    assert len(free) == 3000 and np.linalg.norm(free, axis=1).max() > 1

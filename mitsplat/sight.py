@@ -87,6 +87,11 @@ class Sight:
         return np.asarray(self._bytes[..., 3] / np.float32(255), dtype=np.float32)
 
     @property
+    def picture(self) -> FloatArray:
+        """Display-encoded colour times mask, (H, W, 3)."""
+        return np.asarray(self._bytes[..., :3] / np.float32(255) * self.mask[..., None], dtype=np.float32)
+
+    @property
     def _bytes(self) -> npt.NDArray[np.uint8]:
         pixels: npt.NDArray[np.uint8] = self._packed.view(np.uint8)
         return pixels.reshape(self.camera.height, self.camera.width, 4)
@@ -122,7 +127,7 @@ class Sight:
         """A render (H, W, 3) against the photo; writes them and their difference, 4 times as bright, side by side."""
         cover = self.mask
         seen = np.clip(seen, 0, 1)
-        truth = self._bytes[..., :3] / np.float32(255) * cover[..., None]
+        truth = self.picture
         shown = cover > 0.5 if (cover > 0.5).any() else np.ones_like(cover, dtype=bool)
         design = np.column_stack([seen[shown], np.ones(shown.sum())])
         corrected = np.clip(design @ np.linalg.lstsq(design, truth[shown], rcond=None)[0], 0, 1)

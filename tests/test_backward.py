@@ -92,3 +92,23 @@ def test_image_is_that_of_the_plain_march() -> None:
     plain = render_splats(splats, CAMERA, quality=QUALITY)
     np.testing.assert_allclose(np.array(alpha).reshape(24, 32), plain.alpha, atol=2e-5)
     assert np.array(rgb[0]).max() > 0.1
+
+
+def test_depth_of_an_opaque_gaussian_is_that_of_its_centre() -> None:
+    """Moving the camera's only Gaussian away by dz moves depth by dz, whatever its alpha."""
+    ensure_variant()
+    from mitsplat.plugins.splat_proxy import view_of
+
+    splats = make_splats(1, 3, spread=0.05, scales=(0.2, 0.3))
+    inputs: dict[str, Any] = {name: mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS}
+    dr.enable_grad(inputs["means"])
+    cloud = backward.pack_cloud(*inputs.values(), 16)
+    rgb, alpha, moment = backward.render_depth_differentiable(cloud, view_of(make_sensor(CAMERA)), QUALITY)
+    plain, _ = backward.render_differentiable(cloud, view_of(make_sensor(CAMERA)), QUALITY)
+    np.testing.assert_array_equal(np.array(rgb[0]), np.array(plain[0]))
+    _, depth = CAMERA.project(splats.means)
+    middle = int(np.argmax(np.array(alpha)))
+    mean_depth = dr.gather(mi.Float, moment / alpha, mi.UInt32([middle]))
+    assert mean_depth.numpy()[0] == pytest.approx(depth[0], rel=1e-5)
+    dr.backward(mean_depth)
+    np.testing.assert_allclose(np.array(dr.grad(inputs["means"])), CAMERA.world_from_camera[:3, 2], atol=1e-4)

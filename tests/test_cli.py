@@ -19,11 +19,14 @@ from PIL import Image, ImageSequence
 
 from mitsplat import bake, chart, dataset, frame, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
+from mitsplat.capture import Capture
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from mitsplat.fit import FitProgress, FitResult, FitSettings
 from mitsplat.scene import Scene
 from mitsplat.settle import Layout
+from mitsplat.sight import HeldOut
 
 
 def run(*args: object) -> int:
@@ -163,6 +166,51 @@ def test_export(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     monkeypatch.setattr(xml_scene, "export_xml", calls)
     assert run("export", scene_path, "--frame", 2, "-o", tmp_path / "a.xml") == 0
     assert calls.args[1:] == (2, tmp_path / "a.xml")
+
+
+@pytest.fixture
+def fit_capture(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    seen = HeldOut(name="a.jpg", psnr=28.0, ssim=0.9, psnr_object=25.0, psnr_corrected=26.0)
+    calls = Calls(FitResult(box_asset("nut").splats, 70, 3.5, (seen,), "inputs"))
+    monkeypatch.setattr(fit, "fit_capture", calls)
+    monkeypatch.setattr(Capture, "load", lambda folder: folder)
+    return calls
+
+
+def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    status = run(
+        "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--iterations", 80, "--budget", "1.5min", "--target-psnr", 27,
+        "--edge", 90, "--sh-degree", 2, "--masks", "ignore", "--background", "black", "--depth", 0.5, "--exposure",
+        "--seed", 4, "--overwrite",
+    )  # fmt: skip
+    assert status == 0
+    assert fit_capture.args[:2] == (Path("photos"), tmp_path) and fit_capture.kwargs["overwrite"]
+    assert fit_capture.args[2] == FitSettings(
+        gaussians=70, iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2, masks="ignore",
+        background="black", depth_weight=0.5, exposure=True, seed=4,
+    )  # fmt: skip
+    assert "(12 Gaussians; 1 held-out photos: 28.00 dB, SSIM 0.900)" in capsys.readouterr().out
+    fit_capture.kwargs["progress"](FitProgress(40, 0.5, 24.5, 23.0, 60))
+
+
+def test_fit_defaults_are_those_of_the_settings(fit_capture: Calls, tmp_path: Path) -> None:
+    assert run("fit", "photos", "-o", tmp_path) == 0
+    assert fit_capture.args[2] == FitSettings() and not fit_capture.kwargs["overwrite"]
+
+
+def test_fit_below_its_target_exits_with_4(
+    fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run("fit", "photos", "-o", tmp_path, "--target-psnr", 30) == 4
+    assert "held-out PSNR must reach 30.00 dB (got 28.00)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("budget", ["10", "ten min", "1d"])
+def test_fit_wants_a_budget_with_a_unit(
+    fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path, budget: str
+) -> None:
+    assert run("fit", "photos", "-o", tmp_path, "--budget", budget) == 2
+    assert "--budget must be a time such as 90s" in capsys.readouterr().err
 
 
 def test_bake_passes_every_option_on(

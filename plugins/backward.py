@@ -91,8 +91,9 @@ def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, ban
     """
     count = dr.width(opacities)
     i = dr.arange(mi.UInt32, count)
-    mean, sigma = dr.gather(mi.Vector3f, means, i), dr.gather(mi.Vector3f, scales, i)
-    quat = dr.normalize(mi.Vector4f(*dr.gather(mi.Array4f, quats, i)))
+    own = dr.ReduceMode.NoConflicts
+    mean, sigma = dr.gather(mi.Vector3f, means, i, mode=own), dr.gather(mi.Vector3f, scales, i, mode=own)
+    quat = dr.normalize(mi.Vector4f(*dr.gather(mi.Array4f, quats, i, mode=own)))
     sigma = dr.maximum(sigma, SCALE_RATIO_MIN * dr.max(dr.detach(sigma)))
     stride = -(-3 * bands // 4) * 4
     geometry, padded = dr.zeros(mi.Float, 8 * count), dr.zeros(mi.Float, 4 * count)

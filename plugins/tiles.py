@@ -90,6 +90,10 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     return CloudSet(counts, first, geometry, scales, sh, max(c.sh_count for c in clouds), stride)
 
 
+_ADJOINT = dr.ReduceMode.NoConflicts
+"""How gradients are added to a cloud: they are asked for where it is placed once, so each Gaussian has but one sum. The
+default would write the number of Gaussians into the kernels, and compile them anew whenever it changes."""
+
 CANDIDATES_MAX = 1 << 26
 """Most pairs of a Gaussian and a tile in its box that are held at once, about 40 bytes each."""
 
@@ -209,8 +213,8 @@ class _Source:
 
     def load(self, owner: Any, local: Any) -> dict[str, Any]:
         row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PLACEMENT, dr.width(owner)))
-        packet = dr.gather(mi.ArrayXf, self.clouds.geometry, local, shape=(8, dr.width(local)))
-        sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, shape=(4, dr.width(local)))
+        packet = dr.gather(mi.ArrayXf, self.clouds.geometry, local, mode=_ADJOINT, shape=(8, dr.width(local)))
+        sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, mode=_ADJOINT, shape=(4, dr.width(local)))
         mean = mi.Vector3f(*[packet[i] - row[12 + i] - row[16 + i] for i in range(3)])
         return {
             "mean": mean,
@@ -345,7 +349,7 @@ class _Source:
         bands = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
         floats = -(-3 * bands // 4) * 4
         base = local * (clouds.sh_stride // 4)
-        packets = [dr.gather(mi.Array4f, clouds.sh, base + j) for j in range(floats // 4)]
+        packets = [dr.gather(mi.Array4f, clouds.sh, base + j, mode=_ADJOINT) for j in range(floats // 4)]
 
         def coefficient(k: int) -> list[Any]:
             return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]

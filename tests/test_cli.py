@@ -17,7 +17,7 @@ import typer.main
 from conftest import WriteScene, box_asset
 from PIL import Image, ImageSequence
 
-from mitsplat import bake, chart, dataset, frame, settle, xml_scene
+from mitsplat import bake, chart, dataset, fit, frame, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.capture import Capture
 from mitsplat.cli import app, main
@@ -179,9 +179,9 @@ def fit_capture(monkeypatch: pytest.MonkeyPatch) -> Calls:
 
 def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     status = run(
-        "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--iterations", 80, "--budget", "1.5min", "--target-psnr", 27,
-        "--edge", 90, "--sh-degree", 2, "--masks", "ignore", "--background", "black", "--depth", 0.5, "--exposure",
-        "--seed", 4, "--overwrite",
+        "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--iterations", 80, "--budget", "1.5min",
+        "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--masks", "ignore", "--background", "black",
+        "--depth", 0.5, "--exposure", "--seed", 4, "--overwrite",
     )  # fmt: skip
     assert status == 0
     assert fit_capture.args[:2] == (Path("photos"), tmp_path) and fit_capture.kwargs["overwrite"]

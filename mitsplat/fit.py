@@ -94,7 +94,7 @@ class FitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("gaussians", 2), ("iterations", 1), ("size", 16), ("refine_every", 1), ("seed", 0)):
+        for name, least in (("gaussians", 2), ("iterations", 1), ("size", 64), ("refine_every", 1), ("seed", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
         if not 0 <= self.sh_degree <= 3:

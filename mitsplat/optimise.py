@@ -44,6 +44,8 @@ class Adam:
         unbias = np.sqrt(1 - _BETA_2**self.steps) / (1 - _BETA_1**self.steps)
         for name, value in self.values.items():
             gradient = dr.grad(value)
+            # Exactly in the camera's plane a derivative is undefined, and would stay in the moments for ever.
+            gradient = dr.select(dr.isfinite(gradient), gradient, 0)
             rate = rates[name]
             rate = dr.opaque(mi.Float, rate * unbias) if isinstance(rate, float) else rate * dr.opaque(mi.Float, unbias)
             first = dr.lerp(gradient, self.first[name], _BETA_1)

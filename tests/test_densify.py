@@ -12,7 +12,8 @@ from test_render import CAMERA, make_splats
 
 from mitsplat.densify import grow, jitter, relocate, seed_splats, shared
 from mitsplat.optimise import Model
-from mitsplat.render import ensure_variant, render_splats
+from mitsplat.refine import QUALITY
+from mitsplat.render import ensure_variant, make_sensor, render_splats
 
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 20])
@@ -92,3 +93,21 @@ def test_gradients_and_rates_move_parameters_as_adam_does() -> None:
     own.update(dict.fromkeys(own.values, 0.001))
     # The first step of Adam has the size of the rate, whatever the gradient's.
     np.testing.assert_allclose(np.array(own.values["means"]), before - 1e-3 * np.sign(weight), atol=1e-6)
+
+
+def test_gaussians_at_the_camera_stay_finite_and_where_they_are() -> None:
+    ensure_variant()
+    from mitsplat.plugins.backward import render_differentiable
+    from mitsplat.plugins.splat_proxy import view_of
+
+    splats = make_splats(20, 3, bands=4)
+    means = splats.means.copy()
+    means[0], means[1] = CAMERA.centre, CAMERA.centre + 0.1 * CAMERA.world_from_camera[:3, 0]
+    own = Model(replace(splats, means=means), 1.0)
+    own.track()
+    rgb, alpha = render_differentiable(own.cloud(), view_of(make_sensor(CAMERA)), QUALITY)
+    dr.backward(dr.sum(rgb[0] + alpha))
+    own.update(dict.fromkeys(own.values, 1e-3))
+    after = own.splats()  # refuses what is not finite
+    np.testing.assert_array_equal(after.means[:2], means[:2])
+    assert (after.means[2:] != means[2:]).any()

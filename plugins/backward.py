@@ -35,7 +35,7 @@ def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[l
         view: Camera; one sample per pixel.
         quality: Cut-offs and SH degree; the order must be ``tile``.
 
-    Gaussians that reach the camera's plane are rendered but get no gradient.
+    Gaussians that reach the camera's plane would have no gradient, and are left out: a fit cannot mend them.
 
     Raises:
         ValueError: If the quality asks for another order, several samples or a kernel that limits opacity.
@@ -72,7 +72,7 @@ def _bin_cloud(cloud: Cloud, view: View, quality: Quality) -> TileLists:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
     clouds = CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
     eye = Placement(0, _IDENTITY, 1)
-    return bin_gaussians(clouds, [eye], view, quality)
+    return bin_gaussians(clouds, [eye], view, quality, at_camera=False)
 
 
 _IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -161,7 +161,7 @@ def march_backward(lists: TileLists, view: View, quality: Quality, image: Any, g
             inverse = dr.rcp(1 + du * (e + g * du + h * dv) + dv * (f + k * dv))
             q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
             z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
-            hit = (log_opacity - q > cut) & (z > near) & (t > end) & (a >= 0)
+            hit = (log_opacity - q > cut) & (z > near) & (t > end)
             # A response that overflows beyond the cut-off has no gradient, not an undefined one.
             inverse, q = dr.select(hit, inverse, 0), dr.select(hit, q, 0)
             alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)

@@ -128,8 +128,17 @@ class TileLists:
     pairs: int
 
 
-def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality) -> TileLists:
+def bin_gaussians(
+    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, *, at_camera: bool = True
+) -> TileLists:
     """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
+
+    Args:
+        clouds: Gaussians on the device.
+        placements: Where they are.
+        view: The camera.
+        quality: Order, cut-offs and kernel.
+        at_camera: Whether Gaussians that reach the camera's plane are seen.
 
     Raises:
         CrowdedError: If the view has too many pairs to hold.
@@ -139,7 +148,7 @@ def bin_gaussians(clouds: CloudSet, placements: Sequence[Placement], view: View,
     total = dr.width(local)
     if total == 0:
         return _empty(tiles)
-    source = _Source(clouds, table, view, quality)
+    source = _Source(clouds, table, view, quality, at_camera)
 
     depth, visible = source.cull(owner, local)
     index = dr.compress(visible)
@@ -207,8 +216,8 @@ def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vi
 class _Source:
     """Gaussians of placements as the projection kernels read them."""
 
-    def __init__(self, clouds: CloudSet, table: Any, view: View, quality: Quality) -> None:
-        self.clouds, self.table, self.view, self.quality = clouds, table, view, quality
+    def __init__(self, clouds: CloudSet, table: Any, view: View, quality: Quality, at_camera: bool) -> None:
+        self.clouds, self.table, self.view, self.quality, self.at_camera = clouds, table, view, quality, at_camera
         self.cut = dr.opaque(mi.Float, quality.alpha_min)
 
     def load(self, owner: Any, local: Any) -> dict[str, Any]:
@@ -271,6 +280,8 @@ class _Source:
             dr.select(near, near_v1, response.v0 + dv1),
         )
         visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
+        if not self.at_camera:
+            visible &= ~near
         return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
     def cull(self, owner: Any, local: Any) -> tuple[Any, Any]:

@@ -216,9 +216,8 @@ class Capture:
         photos = []
         try:
             for photo in self.photos:
-                stem = Path(photo.name).with_suffix("").as_posix().replace("/", "_")
-                file = _kept(photo.file, folder / "images" / f"{stem}{photo.file.suffix}")
-                mask = None if photo.mask is None else _kept(photo.mask, folder / "masks" / f"{stem}.png")
+                file = _kept(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
+                mask = None if photo.mask is None else _kept(photo.mask, folder / "masks" / mask_name(photo.name))
                 photos.append(replace(photo, file=file, mask=mask))
             files = {path for photo in photos for path in (photo.file, photo.mask) if path is not None}
             if len(files) < sum(1 + (photo.mask is not None) for photo in photos):
@@ -284,6 +283,17 @@ class Capture:
             return cls(tuple(photos), points, colours, spec.units, spec.up, spec.rejected, spec.scale_error)
         except ValueError as error:
             raise InputError(f"{folder}: {error}") from error
+
+
+def stored_name(name: str, suffix: str) -> str:
+    """File name of a photo's image of some format: the photo's own, without folder marks, where its suffix agrees."""
+    flat = name.replace("/", "__")
+    return flat if Path(flat).suffix.lower() == suffix.lower() else flat + suffix
+
+
+def mask_name(name: str) -> str:
+    """File name of a photo's mask, as COLMAP has it."""
+    return f"{name.replace('/', '__')}.png"
 
 
 def _kept(source: Path, target: Path) -> Path:

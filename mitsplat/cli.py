@@ -10,12 +10,15 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from mitsplat import __version__
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+
+if TYPE_CHECKING:
+    from mitsplat.board import Board
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -373,6 +376,89 @@ def fit(
 
 
 @app.command()
+def capture(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the capture to write.")],
+    kind: Annotated[
+        Literal["object", "environment"], typer.Option(help="Whether the subject is cut out by masks.")
+    ] = "object",
+    max_size: Annotated[int, typer.Option(help="Longest edge at which photos are used [px].")] = 1600,
+    squares: Annotated[str, typer.Option(metavar="CxR", help="Squares of the ChArUco board to look for.")] = "7x5",
+    square: Annotated[float, typer.Option(help="Edge of its squares as measured on the print [m].")] = 0.035,
+    tag: Annotated[float | None, typer.Option(help="Edge of AprilTags (36h11) as printed, black border [m].")] = None,
+    scale_from: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(
+            metavar="A B METRES", help="Distance of two places: PHOTO is its camera, PHOTO:X,Y what it sees at a pixel."
+        ),
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Folder of a COLMAP model, or NeRF's transforms.json, to take cameras from.")
+    ] = None,
+    metric: Annotated[bool, typer.Option("--metric", help="The given poses are in metres with z up.")] = False,
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks, PHOTO.png, white = object.")] = None,
+    mask_model: Annotated[
+        Path | None, typer.Option(help="Segmentation network (.onnx) that makes the masks, by rembg.")
+    ] = None,
+    undistort: Annotated[
+        bool, typer.Option("--undistort", help="Resample the photos to cameras without lens distortion.")
+    ] = False,
+) -> None:
+    """Find cameras, scale, gravity and masks of PHOTOS.
+
+    Runs again where it stopped. If too many photos are of no use, the exit status is 4.
+    """
+    from mitsplat.take import CaptureSettings, capture_photos
+
+    settings = CaptureSettings(
+        kind=kind,
+        max_size=max_size,
+        board=_board(squares, square),
+        tag=tag,
+        scale_from=scale_from,
+        poses=poses,
+        metric=metric,
+        masks=masks,
+        mask_model=mask_model,
+        undistorted=undistort,
+    )
+    with _progress_bar("steps/s") as progress:
+        result = capture_photos(photos, out, settings, progress=progress)
+    found = result.capture
+    for name, reason in sorted(found.rejected.items()):
+        typer.echo(f"rejected: {name}: {reason}")
+    if result.weak:
+        typer.echo(f"weakly held, more overlap would help: {', '.join(result.weak)}")
+    typer.echo(
+        f"capture: {out} ({len(found.photos)} of {result.given} photos, {len(found.points)} points, "
+        f"{result.reprojection_error:.2f} px)"
+    )
+    scale = "in metres" if found.units == "metre" else "in unknown units"
+    error = "" if found.scale_error is None else f" ± {found.scale_error:.2%}"
+    typer.echo(f"frame: {scale}{error}, {'z up' if found.up == 'z' else 'up unknown'}, by {result.source}")
+    typer.echo(f"picture: {out / 'capture.png'}")
+    if result.shortcoming is not None:
+        raise PartialResultError(f"{out}: {result.shortcoming}")
+
+
+@app.command()
+def board(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Sheet to write (.pdf).")] = Path("board.pdf"),
+    paper: Annotated[Literal["a4", "letter", "a3"], typer.Option(help="Paper, in landscape.")] = "a4",
+    squares: Annotated[str, typer.Option(metavar="CxR", help="Squares across and down.")] = "7x5",
+    square: Annotated[float, typer.Option(help="Edge of a square [m].")] = 0.035,
+) -> None:
+    """Write a ChArUco board to print.
+
+    In photographs of what stands on or beside it, it gives `mitsplat capture` metres and the vertical.
+    """
+    if out.suffix.lower() != ".pdf":
+        raise InputError(f"--out must end in .pdf (got {out})")
+    _board(squares, square).write_pdf(out, paper)
+    typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON Schema of scene files, for editors."""
     import json
@@ -412,6 +498,15 @@ def _common(
     ] = False,
 ) -> None:
     pass
+
+
+def _board(squares: str, square: float) -> Board:
+    from mitsplat.board import Board
+
+    columns, _, rows = squares.lower().partition("x")
+    if not (columns.isdecimal() and rows.isdecimal()):
+        raise InputError(f"--squares must be COLUMNSxROWS, such as 7x5 (got {squares})")
+    return Board(int(columns), int(rows), square)
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -472,7 +567,8 @@ def _progress_bar(unit: str = "images/s") -> Iterator[Callable[[int, int, str], 
         task = bar.add_task("", total=None)
 
         def update(done: int, total: int, doing: str) -> None:
-            if bar.tasks[0].total is None:  # frames of an earlier run must not count as this run's speed
+            # Frames of an earlier run, or the steps of an earlier stage, must not count as this one's speed.
+            if bar.tasks[0].total != total or done < bar.tasks[0].completed:
                 bar.reset(task, total=total, completed=done)
             bar.update(task, completed=done, description=doing)
 

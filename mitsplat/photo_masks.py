@@ -1,0 +1,274 @@
+"""Which pixels of a photograph are the object: masks given by the user, from a segmentation model, or from geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import ExifTags, Image, ImageOps
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mitsplat.camera import Camera
+from mitsplat.capture import Capture, FloatArray, Photo, mask_name
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.files import write_file
+from mitsplat.masks import BoolArray
+from mitsplat.photos import Prepared, Progress
+
+ByteImage = npt.NDArray[np.uint8]
+MaskMaker = Callable[[Photo], BoolArray]
+"""Makes the mask of a photo, shape (H, W)."""
+
+MIN_SHARE = 0.02
+"""Share of a photo that its object must cover; models that find nothing mark less than that."""
+
+MIN_AGREEMENT = 0.7
+"""Share of the object's points in a photo that its mask must cover."""
+
+_WORK_EDGE = 480
+"""Longer edge at which GrabCut works [px]."""
+
+_ROUNDS = 3
+_EXTENSIONS = 4
+_RING = 0.1
+"""Width of what is in question around the object, as a share of its size."""
+
+_ABOVE = 0.01
+"""Height over the table from which a point belongs to the object, as a share of the cameras' distance."""
+
+
+def add_masks(
+    capture: Capture,
+    make: MaskMaker,
+    folder: Path,
+    *,
+    progress: Progress | None = None,
+    points: FloatArray | None = None,
+) -> Capture:
+    """The capture with a mask for each photo; photos whose mask is unusable are rejected.
+
+    Args:
+        capture: Its photos' files must exist.
+        make: Makes one mask.
+        folder: Where the masks are written.
+        progress: Told the photos done.
+        points: Points known to be of the object, shape (N, 3), that masks must cover.
+    """
+    photos, rejected = [], dict(capture.rejected)
+    for done, photo in enumerate(capture.photos, start=1):
+        mask = make(photo)
+        reason = _fault(mask, photo.camera, points)
+        if reason is None:
+            file = folder / mask_name(photo.name)
+            write_file(file, partial(_save, mask))
+            photos.append(replace(photo, mask=file))
+        else:
+            rejected[photo.name] = reason
+        if progress is not None:
+            progress(done, len(capture.photos), "cutting out")
+    return replace(capture, photos=tuple(photos), rejected=rejected)
+
+
+def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
+    """Masks of the user: ``<photo>.png`` with or without the photo's own suffix, in the size of the photo.
+
+    White, or what is opaque in a picture with transparency, marks the object. A mask lies as viewers show the photo;
+    one that lies on its side, as the camera held by EXIF's account, is turned.
+
+    Raises:
+        InputError: If the folder does not exist; the maker, if a mask is missing or of another shape.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of masks")
+
+    def make(photo: Photo) -> BoolArray:
+        name = Path(photo.name)
+        candidates = [folder / f"{photo.name}.png", folder / name.with_suffix(".png"), folder / photo.name]
+        path = next((path for path in candidates if path.is_file()), None)
+        if path is None:
+            raise InputError(f"{folder}: there must be a mask for every photo (got none named {candidates[1].name})")
+        try:
+            with Image.open(path) as image:
+                upright = ImageOps.exif_transpose(image)
+                mask = upright.getchannel("A") if "A" in upright.getbands() else upright.convert("L")
+        except (OSError, SyntaxError) as error:
+            raise InputError(f"{path}: not a readable image ({error})") from error
+        size = (photo.camera.width, photo.camera.height)
+        if _differ(mask.size, size) and not _differ(mask.size[::-1], size):
+            mask.getexif()[ExifTags.Base.Orientation] = prepared[photo.name].orientation
+            mask = ImageOps.exif_transpose(mask)
+        if _differ(mask.size, size):
+            raise InputError(
+                f"{path}: must have the shape of its photo, {size[0]}x{size[1]} px (got {mask.width}x{mask.height})"
+            )
+        return np.asarray(mask.resize(size, Image.Resampling.BOX)) >= 128
+
+    return make
+
+
+def model_masks(model: Path) -> MaskMaker:
+    """Masks by a segmentation network through rembg: any ONNX file of the kind of IS-Net (dichotomous segmentation).
+
+    Raises:
+        InputError: If the file does not exist or is no such network.
+        MissingResourceError: If rembg is not installed.
+    """
+    if not model.is_file():
+        raise InputError(f"{model}: no such file")
+    try:
+        import rembg
+    except ImportError as error:
+        raise MissingResourceError(f"masks by a model need rembg: pip install 'mitsplat[masks]' ({error})") from error
+    try:
+        session: Any = rembg.new_session("dis_custom", model_path=str(model.resolve()))
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"{model}: not a segmentation network in ONNX ({' '.join(str(error).split())})") from error
+
+    def make(photo: Photo) -> BoolArray:
+        with Image.open(photo.file) as image:
+            cut = rembg.remove(image.convert("RGB"), session=session, only_mask=True, post_process_mask=False)
+        return _largest_part(np.asarray(cut.convert("L")) >= 128)
+
+    return make
+
+
+def geometric_masks(points: FloatArray) -> MaskMaker:
+    """Masks by GrabCut (Rother et al. 2004), begun from the hull of points on the object.
+
+    Args:
+        points: Of the object, in the capture's frame, shape (N, 3); see :func:`object_points`.
+    """
+
+    def make(photo: Photo) -> BoolArray:
+        camera = photo.camera
+        scale = min(1.0, _WORK_EDGE / max(camera.width, camera.height))
+        rgb, _ = photo.picture(scale)
+        small = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
+        height, width = small.shape[:2]
+        pixels, _ = camera.resized(width, height).project(points)
+        inside = _grab(small, pixels[np.isfinite(pixels).all(axis=1)])
+        soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 1.0)
+        whole = cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+        return np.asarray(whole >= 0.5)
+
+    return make
+
+
+def object_points(capture: Capture) -> FloatArray:
+    """Points (N, 3) of what stands on the table (z = 0) where the cameras look: the nearest large cluster.
+
+    Points as low as the table cannot be told from it, so the feet of the lowest are added; of all, if none is low.
+
+    Raises:
+        InputError: If there is no such cluster.
+    """
+    centres = np.array([photo.camera.centre for photo in capture.photos])
+    distance = float(np.median(np.linalg.norm(centres, axis=1)))
+    counts = np.zeros(len(capture.points), dtype=np.int64)
+    for photo in capture.photos:
+        counts[photo.seen] += 1
+    points = capture.points[counts >= 3]
+    points = points[(points[:, 2] > _ABOVE * distance) & (np.linalg.norm(points, axis=1) < 0.9 * distance)]
+    if len(points) < 20:
+        raise InputError(
+            f"no object stands out of the table in the photos ({len(points)} points above it): give masks, or take "
+            "photos of one object on a textured table"
+        )
+    tree = cKDTree(points)
+    reach = float(np.clip(4 * np.median(tree.query(points, k=6)[0][:, -1]), 0.05 * distance, 0.1 * distance))
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    sizes = np.bincount(label)
+    offset = np.array([np.linalg.norm(points[label == k, :2].mean(axis=0)) for k in range(len(sizes))])
+    chosen = int(np.argmax(sizes / (0.1 + offset / distance)))
+    cluster = points[label == chosen]
+    low = cluster[cluster[:, 2] < 0.15 * cluster[:, 2].max()]
+    return np.concatenate([cluster, (low if len(low) >= 5 else cluster) * (1, 1, 0)])
+
+
+def _grab(image: ByteImage, pixels: FloatArray) -> BoolArray:
+    """GrabCut of a BGR image (H, W, 3) from where points of the object are in it, shape (N, 2).
+
+    Sides without points lie outside of the hull. So the region in question begins at it and follows what was found.
+    """
+    height, width = image.shape[:2]
+    nothing = np.zeros((height, width), dtype=bool)
+    if len(pixels) < 3:
+        return nothing
+    filled = np.zeros((height, width), dtype=np.uint8)
+    cv2.fillConvexPoly(filled, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
+    if not filled.any():
+        return nothing
+    dots = np.zeros_like(filled)
+    x, y = pixels[((pixels >= 0) & (pixels < (width, height))).all(axis=1)].astype(np.intp).T
+    dots[y, x] = 1
+    size = float(np.sqrt(filled.sum()))
+    core = _grown(dots, 0.02 * size) & ~_grown(filled == 0, 0.03 * size)
+    inside = filled > 0
+    for _ in range(_EXTENSIONS):
+        near = _grown(inside | (filled > 0), _RING * size)
+        trimap = np.full((height, width), cv2.GC_BGD, dtype=np.uint8)
+        trimap[near] = cv2.GC_PR_BGD
+        trimap[inside] = cv2.GC_PR_FGD
+        trimap[core] = cv2.GC_FGD
+        # The background that is learnt from is what surrounds the object, and the cost is that of its box.
+        edge = round(_RING * size) + 4
+        y, x = np.nonzero(near)
+        box = np.s_[max(0, y.min() - edge) : y.max() + edge + 1, max(0, x.min() - edge) : x.max() + edge + 1]
+        part = np.ascontiguousarray(trimap[box])
+        if (part == cv2.GC_PR_BGD).sum() + (part == cv2.GC_BGD).sum() == 0:
+            return inside  # it fills the photo
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+        before, inside = inside, nothing.copy()
+        inside[box] = _largest_part((part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD))
+        if np.count_nonzero(inside & ~before) < 0.01 * np.count_nonzero(inside):
+            break
+    return inside
+
+
+def _grown(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
+    """The mask dilated by a disc of at least one pixel."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(radius)) + 1,) * 2)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
+
+
+def _differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two image sizes are of different shape, up to the rounding of a reduced copy."""
+    return abs(one[0] * other[1] - one[1] * other[0]) > max(*one, *other)
+
+
+def _largest_part(mask: BoolArray) -> BoolArray:
+    """The largest connected part of a mask."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask
+
+
+def _fault(mask: BoolArray, camera: Camera, points: FloatArray | None) -> str | None:
+    share = float(mask.mean())
+    if share < MIN_SHARE:
+        return f"its mask covers only {share:.1%} of it"
+    if share > 0.98:
+        return f"its mask covers {share:.1%} of it"
+    if points is not None:
+        pixels, _ = camera.project(points)
+        pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
+        x, y = pixels.astype(np.intp).T
+        agreement = float(mask[y, x].mean()) if len(x) else 0.0
+        if agreement < MIN_AGREEMENT:
+            return f"its mask covers only {agreement:.0%} of the object's points"
+    return None
+
+
+def _save(mask: BoolArray, part: Path) -> None:
+    Image.fromarray(np.uint8(255) * mask.astype(np.uint8)).save(part, "PNG")

@@ -1,0 +1,219 @@
+"""Structure from motion by pycolmap, in a process of its own: ``python -m mitsplat.sfm_child JOB``.
+
+pycolmap can end the process it runs in, and breaks zlib where that was not used before. So nothing else imports it;
+:mod:`mitsplat.sfm` starts this module, follows its progress and reads what it leaves in the job's folder.
+
+JOB is a JSON file, see :func:`run`; ``model.npz`` next to it is the result, ``status`` what is being done.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+zlib.compress(b"before pycolmap")
+
+import numpy as np  # noqa: E402
+import pycolmap  # noqa: E402
+
+SEED = 1
+SEQUENTIAL_OVERLAP = 10
+BLOCK = 12
+"""Images in a block of exhaustive matching: results are stored, and so progress seen, per pair of blocks."""
+
+
+def main(job_file: Path) -> None:
+    """Do the job; whatever goes wrong is left as one line in ``error``."""
+    folder = job_file.parent
+    try:
+        run(json.loads(job_file.read_text()), folder)
+    except (ValueError, RuntimeError, OSError, KeyError, IndexError) as error:
+        (folder / "error").write_text(" ".join(str(error).split()) or type(error).__name__)
+        sys.exit(1)
+
+
+def run(job: dict[str, Any], folder: Path) -> None:
+    """Find or read a model and store it.
+
+    Args:
+        job: ``task``: "read" a COLMAP model from ``model``; or "reconstruct" from ``groups`` (names of the photos in
+            ``images`` by shared intrinsics), with ``features``, ``first_octave``, ``matching`` ("exhaustive" or
+            "sequential") and ``enough``, the number of photos below which the global mapper is tried as well; or
+            "triangulate", the same with known ``cameras`` (see :func:`known_model`).
+        folder: Where the database and the results are.
+    """
+    if job["task"] == "read":
+        store(folder, [pycolmap.Reconstruction(job["model"])])
+        return
+    images, database = Path(job["images"]), folder / "database.db"
+    extract(job, images, database, folder)
+    match(job, database, folder)
+    if job["task"] == "triangulate":
+        say(folder, "triangulating")
+        known = known_model(job["cameras"], database)
+        (folder / "known").mkdir(exist_ok=True)
+        store(folder, [pycolmap.triangulate_points(known, database, images, folder / "known")])
+    else:
+        store(folder, reconstruct(images, database, folder, job["enough"]))
+
+
+def say(folder: Path, doing: str) -> None:
+    """Leave word of the stage reached."""
+    (folder / "status").write_text(doing)
+
+
+def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
+    """SIFT features of the photos that have none yet; photos of a group share a camera."""
+    say(folder, "finding features")
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = job["features"]
+    options.sift.first_octave = job["first_octave"]
+    for names in job["groups"]:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = job["camera_model"]
+        if database.exists():
+            with pycolmap.Database.open(database) as opened:
+                known = {image.name: image.camera_id for image in opened.read_all_images()}
+            reader.existing_camera_id = next((known[name] for name in names if name in known), -1)
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def match(job: dict[str, Any], database: Path, folder: Path) -> None:
+    """Verified matches of the pairs that have none yet."""
+    say(folder, "matching")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    if job["matching"] == "sequential":
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = SEQUENTIAL_OVERLAP
+        pycolmap.match_sequential(
+            database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+        )
+    else:
+        blocks = pycolmap.ExhaustivePairingOptions()
+        blocks.block_size = BLOCK
+        pycolmap.match_exhaustive(
+            database, pairing_options=blocks, verification_options=verification, device=pycolmap.Device.cpu
+        )
+
+
+def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list[pycolmap.Reconstruction]:
+    """All models found, the largest first: by the incremental mapper, or the global one where that registers more."""
+    say(folder, "finding cameras")
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.min_model_size = 3
+    registered = 0
+
+    def count() -> None:
+        nonlocal registered
+        registered += 1
+        say(folder, f"finding cameras {registered}")
+
+    output = folder / "models"
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    found = pycolmap.incremental_mapping(database, images, output, options, next_image_callback=count)
+    models = largest_first(found)
+    if models and models[0].num_reg_images() >= enough:
+        return models
+    say(folder, "finding cameras at once")
+    copy = folder / "global.db"
+    shutil.copyfile(database, copy)  # calibration rewrites the two-view geometries
+    pycolmap.calibrate_view_graph(copy)
+    at_once = pycolmap.GlobalPipelineOptions()
+    at_once.random_seed = SEED
+    (output / "global").mkdir()
+    others = largest_first(pycolmap.global_mapping(copy, images, output / "global", at_once))
+    copy.unlink()
+    if others and (not models or others[0].num_reg_images() > models[0].num_reg_images()):
+        for model in others:
+            model.extract_colors_for_all_images(images)
+        return others
+    return models
+
+
+def largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """The models by the number of registered photos."""
+    return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.Reconstruction:
+    """A model without points.
+
+    Args:
+        cameras: Per photo ``width``, ``height``, ``params`` of a FULL_OPENCV camera, ``camera_from_world`` (3, 4).
+        database: Whose ids it takes.
+    """
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        images = opened.read_all_images()
+    for image in images:
+        if image.name not in cameras:
+            continue
+        known = cameras[image.name]
+        camera = pycolmap.Camera(
+            model="FULL_OPENCV",
+            width=known["width"],
+            height=known["height"],
+            params=known["params"],
+            camera_id=image.image_id,
+        )
+        model.add_camera_with_trivial_rig(camera)
+        placed = pycolmap.Image(name=image.name, camera_id=image.image_id, image_id=image.image_id)
+        pose = np.array(known["camera_from_world"])
+        model.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(pose))
+    return model
+
+
+def store(folder: Path, models: list[pycolmap.Reconstruction]) -> None:
+    """Write the first model, and which photos the others hold, as ``model.npz``."""
+    arrays: dict[str, Any] = {"elsewhere": sorted(names_of(models[1:]) - names_of(models[:1]))}
+    if models:
+        arrays |= model_arrays(models[0])
+    np.savez(folder / "model.npz", **arrays)
+
+
+def names_of(models: list[pycolmap.Reconstruction]) -> set[str]:
+    """Registered photos."""
+    return {model.image(index).name for model in models for index in model.reg_image_ids()}
+
+
+def model_arrays(model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """The model in arrays: photos sorted by name, parameters padded with NaN."""
+    ids = sorted(model.points3D)
+    row = {point: index for index, point in enumerate(ids)}
+    images = sorted((model.image(index) for index in model.reg_image_ids()), key=lambda image: image.name)
+    cameras = [model.camera(image.camera_id) for image in images]
+    seen = [sorted({row[point.point3D_id] for point in image.points2D if point.has_point3D()}) for image in images]
+    params = np.full((len(images), 32), np.nan)
+    for values, camera in zip(params, cameras, strict=True):
+        values[: len(camera.params)] = camera.params
+    return {
+        "names": [image.name for image in images],
+        "models": [camera.model_name for camera in cameras],
+        "sizes": np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2),
+        "params": params,
+        "poses": np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        "points": np.array([model.point3D(point).xyz for point in ids]).reshape(-1, 3),
+        "colours": np.array([model.point3D(point).color for point in ids], dtype=np.uint8).reshape(-1, 3),
+        "seen": np.array([index for indices in seen for index in indices], dtype=np.int32),
+        "seen_counts": np.array([len(indices) for indices in seen], dtype=np.int64),
+        "reprojection_error": model.compute_mean_reprojection_error() if ids else np.nan,
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

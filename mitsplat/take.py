@@ -1,0 +1,294 @@
+"""From a folder of photographs to a :class:`~mitsplat.capture.Capture`: the stage behind ``mitsplat capture``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mitsplat.board import Board
+from mitsplat.capture import Capture, Photo
+from mitsplat.capture_sheet import capture_sheet
+from mitsplat.errors import InputError
+from mitsplat.files import write_file, write_text
+from mitsplat.photo_masks import MaskMaker, add_masks, geometric_masks, given_masks, model_masks, object_points
+from mitsplat.photos import Prepared, Progress, find_photos, prepare_photos, undistort
+from mitsplat.anchor import DEFAULT_BOARD, Anchor, find_anchor
+from mitsplat.poses import read_poses
+from mitsplat.sfm import MIN_POINTS, Model, find_cameras
+
+MIN_PHOTOS = 3
+MIN_REGISTERED = 0.75
+"""Share of the photos given from which a capture counts as a success."""
+
+FEW_POINTS = 3 * MIN_POINTS
+"""A camera that observes fewer points is worth a warning."""
+
+_INPUTS = "inputs.json"
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What decides a capture beside its photographs.
+
+    Attributes:
+        kind: An object is cut out by masks; an environment is not.
+        max_size: Longest edge at which photos are used [px].
+        board: ChArUco board to look for.
+        tag: Edge of AprilTags as printed [m]; unknown if None.
+        scale_from: Two places and their distance [m], as in :func:`mitsplat.anchor.spot`.
+        poses: COLMAP model or ``transforms.json`` to take cameras from.
+        metric: Whether ``poses`` are in metres with z up, and stay as they are.
+        masks: Folder of masks.
+        mask_model: ONNX file of a segmentation network.
+        undistorted: Whether photos are resampled to pinhole cameras.
+    """
+
+    kind: Literal["object", "environment"] = "object"
+    max_size: int = 1600
+    board: Board = DEFAULT_BOARD
+    tag: float | None = None
+    scale_from: tuple[str, str, float] | None = None
+    poses: Path | None = None
+    metric: bool = False
+    masks: Path | None = None
+    mask_model: Path | None = None
+    undistorted: bool = False
+
+    def __post_init__(self) -> None:
+        rules = (
+            (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
+            (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
+            (self.metric and self.poses is None, "poses must be given to be taken as metric"),
+            (self.masks is not None and self.mask_model is not None, "give a folder of masks or a model, not both"),
+        )
+        for broken, rule in rules:
+            if broken:
+                raise InputError(rule)
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureResult:
+    """A capture and what there is to say about it.
+
+    Attributes:
+        capture: As in its folder.
+        given: Number of photographs given.
+        source: Where scale and gravity come from, a clause.
+        reprojection_error: Mean over all observations [px].
+    """
+
+    capture: Capture
+    given: int
+    source: str
+    reprojection_error: float
+
+    @property
+    def registered(self) -> float:
+        """Share of the photos given that are in the capture."""
+        return len(self.capture.photos) / self.given
+
+    @property
+    def weak(self) -> dict[str, int]:
+        """Photos that observe few points, and how many."""
+        counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
+        return {name: count for name, count in counts.items() if count < FEW_POINTS}
+
+    @property
+    def shortcoming(self) -> str | None:
+        """The threshold that was missed and what would help, or None."""
+        if self.registered >= MIN_REGISTERED:
+            return None
+        return (
+            f"only {len(self.capture.photos)} of {self.given} photos ({self.registered:.0%}) could be used, "
+            f"{MIN_REGISTERED:.0%} are wanted: take sharp photos of one thing at steps of about ten degrees, with "
+            "texture under it and even light"
+        )
+
+
+def capture_photos(
+    photos: Path, out: Path, settings: CaptureSettings = CaptureSettings(), *, progress: Progress | None = None
+) -> CaptureResult:
+    """Find cameras, scale, gravity and masks of photographs; what an interrupted or finished run left is used.
+
+    Args:
+        photos: Folder of photographs of one object or place.
+        out: Folder of the capture; ``sfm/`` in it keeps what a repeated run can use.
+        settings: What else decides the result.
+        progress: Told steps done, of how many, and what is being done.
+
+    Raises:
+        InputError: If there are fewer than three usable photographs, or no cameras can be found from them.
+        MissingResourceError: If COLMAP or the masks' model fails to run.
+    """
+    files = find_photos(photos)
+    if len(files) < MIN_PHOTOS:
+        raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
+    inputs = _inputs(photos, files, settings)
+    if (done := _finished(out, inputs)) is not None:
+        return done
+    work = out / "sfm"
+    (out / _INPUTS).unlink(missing_ok=True)
+    _forget_other_photos(out, inputs)
+    prepared, rejected = prepare_photos(
+        photos, out / "images", max_size=settings.max_size, upright=settings.poses is None, progress=progress
+    )
+    if len(prepared) < MIN_PHOTOS:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
+        raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
+    if settings.poses is not None:
+        model = read_poses(settings.poses, prepared, work, progress)
+        weak: dict[str, int] = {}
+    else:
+        model, weak = find_cameras(prepared, work, progress).without_weak()
+    if len(model.cameras) < MIN_PHOTOS:
+        raise InputError(
+            f"{photos}: cameras of only {len(model.cameras)} of {len(prepared)} photos could be found, {MIN_PHOTOS} "
+            "are needed; take them closer together, and with texture on or under the object"
+        )
+    by_file = {photo.file.name: photo for photo in prepared}
+    rejected |= _unregistered(by_file, model, weak)
+    anchor = _anchored(model, by_file, settings)
+    capture = Capture(
+        photos=tuple(
+            Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
+            for file, camera in model.cameras.items()
+        ),
+        points=model.points,
+        colours=model.colours,
+        units=anchor.units,
+        up=anchor.up,
+        rejected=rejected,
+        scale_error=anchor.scale_error,
+    ).transformed(anchor.matrix)
+    # What is near depends on what the units are; poses carry none.
+    capture = replace(capture, photos=tuple(replace(p, camera=replace(p.camera, near=0.01)) for p in capture.photos))
+    if settings.undistorted:
+        capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
+    if settings.kind == "object":
+        capture = _masked(capture, anchor, settings, prepared, out, progress)
+        if len(capture.photos) < MIN_PHOTOS:
+            name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
+            raise InputError(
+                f"{photos}: only {len(capture.photos)} photos can be cut out ({name}: {reason}); give masks"
+            )
+    capture = capture.save(out)
+    used = {photo.file.name for photo in capture.photos}
+    for path in (out / "images").iterdir():
+        if path.name not in used:
+            path.unlink()
+    write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
+    result = CaptureResult(capture, len(files), anchor.source, model.reprojection_error)
+    record = {"inputs": inputs, "source": result.source, "reprojection_error": result.reprojection_error}
+    write_text(out / _INPUTS, json.dumps(record, indent=1))
+    return result
+
+
+def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
+    """What decides a capture, in JSON."""
+
+    def digest(path: Path) -> str:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    given = [path for path in (settings.poses, settings.masks, settings.mask_model) if path is not None]
+    others = [path for place in given for path in (sorted(place.rglob("*")) if place.is_dir() else [place])]
+    return {
+        "photos": {path.relative_to(photos).as_posix(): digest(path) for path in files},
+        "settings": json.loads(json.dumps(asdict(settings), default=str)),
+        "files": {str(path): digest(path) for path in others if path.is_file()},
+    }
+
+
+def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
+    """The result that ``out`` holds already, if it is of the same inputs."""
+    try:
+        record = json.loads((out / _INPUTS).read_text())
+        if record["inputs"] != inputs:
+            return None
+        capture = Capture.load(out)
+        return CaptureResult(capture, len(record["inputs"]["photos"]), record["source"], record["reprojection_error"])
+    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
+        return None
+
+
+def _forget_other_photos(out: Path, inputs: dict[str, object]) -> None:
+    """Drop copies and matches that were made of other photographs or at another size."""
+    settings = inputs["settings"]
+    marker = json.dumps([inputs["photos"], settings], sort_keys=True) if isinstance(settings, dict) else ""
+    file = out / "sfm" / "photos.json"
+    if not (file.exists() and file.read_text() == marker):
+        for folder in ("sfm", "images", "masks"):
+            shutil.rmtree(out / folder, ignore_errors=True)
+        write_text(file, marker)
+
+
+def _unregistered(by_file: dict[str, Prepared], model: Model, weak: dict[str, int]) -> dict[str, str]:
+    """Why photos are not in the model."""
+    reasons = {}
+    for file, photo in by_file.items():
+        if file in weak:
+            reasons[photo.name] = f"only {weak[file]} points could be matched in it, {MIN_POINTS} are needed"
+        elif file in model.elsewhere:
+            reasons[photo.name] = "it only fits a smaller group of photos, as of another object or side"
+        elif file not in model.cameras:
+            reasons[photo.name] = "it shares too few points with the other photos"
+    return reasons
+
+
+def _anchored(model: Model, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
+    if settings.metric:
+        return Anchor(np.eye(4), "metre", "z", table=True, source="the poses given")
+    return find_anchor(
+        model,
+        {file: by_file[file].file for file in model.cameras},
+        board=settings.board,
+        tag=settings.tag,
+        scale_from=_spots(settings.scale_from, by_file),
+        centred=settings.kind == "object",
+    )
+
+
+def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepared]) -> tuple[str, str, float] | None:
+    """``scale_from`` with the copies' names instead of the photos'."""
+    if scale_from is None:
+        return None
+    files = {photo.name: file for file, photo in by_file.items()}
+
+    def stored(spot: str) -> str:
+        name, colon, pixel = spot.rpartition(":")
+        return f"{files.get(name, name)}{colon}{pixel}" if colon else files.get(spot, spot)
+
+    one, other, metres = scale_from
+    return stored(one), stored(other), metres
+
+
+def _masked(
+    capture: Capture,
+    anchor: Anchor,
+    settings: CaptureSettings,
+    prepared: Sequence[Prepared],
+    out: Path,
+    progress: Progress | None,
+) -> Capture:
+    points = None
+    make: MaskMaker
+    if settings.masks is not None:
+        make = given_masks(settings.masks, {photo.name: photo for photo in prepared})
+    elif settings.mask_model is not None:
+        make = model_masks(settings.mask_model)
+    elif not anchor.table:
+        raise InputError(
+            "no table was found under the object to cut it out by: give masks (--masks or --mask-model), put it on "
+            "something with texture, or capture it as an environment (--kind environment)"
+        )
+    else:
+        points = object_points(capture)
+        make = geometric_masks(points)
+    return add_masks(capture, make, out / "masks", progress=progress, points=points)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +24,11 @@ DEFAULT_BOARD = Board()
 MAX_ERROR = 3.0
 """Reprojection error from which an observation of a target's corner is an outlier [px]."""
 
+MAX_CONTRADICTION = 0.01
+"""Reprojection error of the fitted board from which a camera is wrong, as a share of its image's width."""
+
+_Views = dict[int, dict[str, tuple[Camera, FloatArray]]]
+
 _TILT = np.cos(np.radians(30))
 """A plane that leans more against the vertical that the cameras suggest is no table."""
 
@@ -39,6 +44,7 @@ class Anchor:
         table: Whether z = 0 is a plane that things stand on.
         source: What decided, a clause for the user.
         scale_error: Estimated relative standard error of the scale, if metric.
+        wrong: Images whose cameras the board contradicts, and by how many pixels.
     """
 
     matrix: FloatArray
@@ -47,6 +53,7 @@ class Anchor:
     table: bool
     source: str
     scale_error: float | None = None
+    wrong: Mapping[str, float] = field(default_factory=dict)
 
 
 def find_anchor(
@@ -74,13 +81,17 @@ def find_anchor(
     Raises:
         InputError: If ``scale_from`` names places that do not exist.
     """
-    corners, tags = _find_targets(model, images, board)
+    views, tag_views = _find_targets(model, images, board)
+    corners = {index: point for index, seen in views.items() if (point := triangulate(list(seen.values()))) is not None}
+    tags = _triangulate_tags(tag_views)
+    wrong: dict[str, float] = {}
     scale: tuple[float, float | None] | None = None
     plane: tuple[FloatArray, FloatArray] | None = None
     source = ""
     axes: FloatArray | None = None
     if fitted := _fit_board(corners, board):
         pose, factor, error = fitted
+        wrong = _contradicted(views, board.corners / factor @ pose[:3, :3].T + pose[:3, 3])
         scale, plane, axes = (factor, error), (pose[:3, 2], pose[:3, 3]), pose[:3, :3]
         source = f"a ChArUco board ({len(corners)} corners)"
     elif tags and tag is not None:
@@ -125,6 +136,7 @@ def find_anchor(
         table=plane is not None,
         source=source,
         scale_error=scale[1] if scale else None,
+        wrong=wrong,
     )
 
 
@@ -302,29 +314,46 @@ def _upright(normal: FloatArray, heading: FloatArray) -> FloatArray:
     return np.stack([x, np.cross(normal, x), normal])
 
 
-def _find_targets(
-    model: Model, images: Mapping[str, Path], board: Board
-) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
-    """Places in the model of the board's corners (3,) by index, and of the AprilTags' corners (4, 3) by id."""
-    board_views: dict[int, list[tuple[Camera, FloatArray]]] = {}
-    tag_views: dict[int, list[tuple[Camera, FloatArray]]] = {}
+def _find_targets(model: Model, images: Mapping[str, Path], board: Board) -> tuple[_Views, _Views]:
+    """Where images see the board's corners, (2,) by index and image, and AprilTags, (4, 2) by id and image."""
+    corners: _Views = {}
+    tags: _Views = {}
     for name, camera in model.cameras.items():
         grey = cv2.imread(str(images[name]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
         if grey is None:
             raise InputError(f"{images[name]}: not a readable image")
         pixels = np.asarray(grey, dtype=np.uint8)
-        for index, pixel in board.find(pixels).items():
-            board_views.setdefault(index, []).append((camera, pixel))
-        for number, quad in find_tags(pixels).items():
-            tag_views.setdefault(number, []).append((camera, quad))
-    corners = {index: point for index, views in board_views.items() if (point := triangulate(views)) is not None}
+        for found, views in ((board.find(pixels), corners), (find_tags(pixels), tags)):
+            for index, places in found.items():
+                views.setdefault(index, {})[name] = (camera, places)
+    return corners, tags
+
+
+def _triangulate_tags(views: _Views) -> dict[int, FloatArray]:
+    """Corners (4, 3) in the model of the tags that enough images show, by id."""
     tags = {}
-    for number, views in tag_views.items():
-        points = (triangulate([(camera, pixels[corner]) for camera, pixels in views]) for corner in range(4))
+    for number, seen in views.items():
+        points = (triangulate([(camera, quad[corner]) for camera, quad in seen.values()]) for corner in range(4))
         found = [point for point in points if point is not None]
         if len(found) == 4:
             tags[number] = np.array(found)
-    return corners, tags
+    return tags
+
+
+def _contradicted(views: _Views, corners: FloatArray) -> dict[str, float]:
+    """Images that see at least six corners of the board elsewhere than their cameras do, and how far off [px].
+
+    Cameras that few or repetitive points hold can be far off at small reprojection errors.
+    """
+    errors: dict[str, list[float]] = {}
+    widths = {}
+    for index, seen in views.items():
+        for name, (camera, pixel) in seen.items():
+            error = np.linalg.norm(camera.project(corners[index])[0][0] - pixel)
+            errors.setdefault(name, []).append(float(np.nan_to_num(error, nan=np.inf)))
+            widths[name] = camera.width
+    medians = {name: float(np.median(values)) for name, values in errors.items() if len(values) >= 6}
+    return {name: error for name, error in medians.items() if error > MAX_CONTRADICTION * widths[name]}
 
 
 def _fit_board(corners: Mapping[int, FloatArray], board: Board) -> tuple[FloatArray, float, float] | None:

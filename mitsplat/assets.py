@@ -69,8 +69,8 @@ class AssetSpec(BaseModel):
     splats: str = Field(description="Splat file.")
     mesh: str | None = Field(None, description="Mesh file, or 'hull': the convex hull of the opaque splats.")
     pieces: str | None = Field(None, description="Mesh file whose connected parts are convex pieces of the mesh.")
-    units: Positive | None = Field(
-        None, description="Metres per unit of the files; 1 if neither this nor size is given."
+    units: Positive | Literal["unknown"] | None = Field(
+        None, description="Metres per unit of the files, 1 if neither this nor size is given; or unknown."
     )
     size: Positive | None = Field(None, description="Longest extent [m], instead of units.")
     up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field("z", description="Axis of the files that points up.")
@@ -89,7 +89,7 @@ class AssetSpec(BaseModel):
 
     @model_validator(mode="after")
     def _check(self) -> AssetSpec:
-        if self.units is not None and self.size is not None:
+        if isinstance(self.units, float) and self.size is not None:
             raise FieldError("size", "must not be given together with units")
         if self.mass is not None and self.density is not None:
             raise FieldError("mass", "must not be given together with density")
@@ -119,6 +119,7 @@ class Asset:
         keypoints: Named points in the asset's frame [m], for pose labels.
         white: Irradiance [W/m^2] of the scene's lights under which a white surface has the colour 1 in an environment's
             splats: pi where it was baked. None where the exposure is unknown, as in photographs.
+        units: Whether lengths are metres; if not, the size is arbitrary and a scene must give one.
         folder: Where it was read from, or None.
     """
 
@@ -136,6 +137,7 @@ class Asset:
     capture_light: Literal["uniform", "scene"] = "uniform"
     keypoints: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     white: float | None = None
+    units: Literal["metre", "unknown"] = "metre"
     folder: Path | None = field(default=None, repr=False)
 
     @classmethod
@@ -169,6 +171,7 @@ class Asset:
             capture_light=spec.capture_light,
             keypoints=spec.keypoints or {},
             white=spec.white,
+            units="unknown" if spec.units == "unknown" and spec.size is None else "metre",
             folder=folder,
         )
         metres_from_file = np.eye(4)
@@ -186,7 +189,7 @@ class Asset:
             InputError: If a value breaks a rule of :class:`AssetSpec` or the folder cannot be written.
         """
         folder = Path(folder)
-        units = _SPZ_UNITS if splats.lower().endswith(".spz") else 1.0
+        units = _SPZ_UNITS if splats.lower().endswith(".spz") and self.units == "metre" else 1.0
         stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
         try:
             spec = AssetSpec(
@@ -196,7 +199,7 @@ class Asset:
                 splats=splats,
                 mesh=None if self.mesh is None else "mesh.ply",
                 pieces="pieces.ply" if self.pieces else None,
-                units=units,
+                units=units if self.units == "metre" else "unknown",
                 density=self.density if self.mass is None else None,
                 mass=self.mass,
                 friction=self.friction,
@@ -259,6 +262,31 @@ class Asset:
         larger = self.transformed(np.diag([factor, factor, factor, 1.0]))
         return larger if self.mass is None else replace(larger, mass=self.mass * factor**3)
 
+    def factor_to(self, size: float) -> float:
+        """What to scale by for a longest extent [m] of the mesh, or of the opaque splats where there is none.
+
+        Raises:
+            InputError: If it has no extent.
+        """
+        points = _opaque_core(self.splats) if self.mesh is None else self.mesh.vertices
+        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+        if not extent > 0:
+            raise InputError(
+                f"{self.folder}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent (got 0)"
+            )
+        return size / extent
+
+    def resized(self, size: float) -> Asset:
+        """An asset of unknown units in metres, by its longest extent [m]; a given mass stays.
+
+        Raises:
+            InputError: If it is in metres already, or has no extent.
+        """
+        if self.units == "metre":
+            raise InputError(f"asset {self.name!r} is in metres: it takes a scale, not a size")
+        factor = self.factor_to(size)
+        return replace(self.transformed(np.diag([factor, factor, factor, 1.0])), units="metre")
+
     def check(self) -> tuple[str, ...]:
         """What is questionable about the asset, a sentence each; nothing of it prevents its use."""
         if self.mesh is None:
@@ -318,15 +346,9 @@ def _file_inside(folder: Path, key: str, name: str) -> Path:
 
 def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:
     """Scale of an asset that is still in the units of its files."""
-    if spec.size is None:
-        return 1.0 if spec.units is None else spec.units
-    points = _opaque_core(asset.splats) if asset.mesh is None else asset.mesh.vertices
-    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if not extent > 0:
-        raise InputError(
-            f"{asset.folder}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent (got 0)"
-        )
-    return spec.size / extent
+    if spec.size is not None:
+        return asset.factor_to(spec.size)
+    return spec.units if isinstance(spec.units, float) else 1.0
 
 
 def _opaque_core(splats: Splats) -> FloatArray:

@@ -171,7 +171,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
     environment = None
     if spec.environment is not None:
         with _blaming(path, "environment"):
-            environment = Asset.load(folder / spec.environment)
+            environment = _metric(Asset.load(folder / spec.environment))
     assets = _load_objects(spec, path)
     shape_meshes = []
     for position, shape in enumerate(spec.shapes):
@@ -255,17 +255,27 @@ def _blaming(path: Path, *keys: str | int) -> Iterator[None]:
 
 def _load_objects(spec: SceneSpec, path: Path) -> tuple[Asset, ...]:
     """Asset of each entry; entries that differ in nothing but count and class share its arrays."""
-    loaded: dict[tuple[str, float], Asset] = {}
+    loaded: dict[tuple[str, float | None, float], Asset] = {}
     assets = []
     for position, entry in enumerate(spec.objects):
-        key = (entry.asset, entry.scale)
+        key = (entry.asset, entry.size, entry.scale)
         if key not in loaded:
             with _blaming(path, "objects", position, "asset"):
                 asset = Asset.load(path.parent / entry.asset)
+                asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
                 loaded[key] = asset if entry.scale == 1.0 else asset.scaled(entry.scale)
                 _check_fit(loaded[key], spec.region)
         assets.append(replace(loaded[key], class_name=entry.class_name or loaded[key].class_name))
     return tuple(assets)
+
+
+def _metric(asset: Asset) -> Asset:
+    """The asset, unless nothing says how large it is."""
+    if asset.units == "unknown":
+        raise InputError(
+            f"asset {asset.name!r} is of unknown units: give its longest extent [m] as size, here or in asset.yaml"
+        )
+    return asset
 
 
 def _check_fit(asset: Asset, region: Region) -> None:

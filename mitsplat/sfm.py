@@ -9,7 +9,7 @@ import json
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,13 +70,18 @@ class Model:
         weak = {name: count for name, count in counts.items() if count < min_points}
         if not weak:
             return self, {}
-        kept = [name for name in self.cameras if name not in weak]
+        rest, weaker = self.without(weak).without_weak(min_points)
+        return rest, weak | weaker
+
+    def without(self, names: Collection[str]) -> Model:
+        """The model without some images, and without the points that fewer than two others see."""
+        kept = [name for name in self.cameras if name not in names]
         observers = np.zeros(len(self.points), dtype=np.int64)
         for name in kept:
             observers[self.seen[name]] += 1
         stays = observers >= 2
         place = np.cumsum(stays) - 1
-        rest = Model(
+        return Model(
             {name: self.cameras[name] for name in kept},
             self.points[stays],
             self.colours[stays],
@@ -84,8 +89,6 @@ class Model:
             self.elsewhere,
             self.reprojection_error,
         )
-        rest, weaker = rest.without_weak(min_points)
-        return rest, weak | weaker
 
 
 def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> Model:

@@ -142,6 +142,7 @@ class ObjectSpec(StrictModel):
 
     asset: str = Field(description="Asset folder, relative to the scene file.")
     count: CountRange = Field((1, 1), description="How many in each layout: a number or an inclusive range.")
+    size: Positive | None = Field(None, description="Longest extent [m], for an asset of unknown units only.")
     scale: Positive = Field(1.0, description="Uniform scale applied to the asset.")
     class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
     poses: tuple[ObjectPose, ...] = Field(

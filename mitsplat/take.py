@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from mitsplat.anchor import DEFAULT_BOARD, Anchor, find_anchor
 from mitsplat.board import Board
 from mitsplat.capture import Capture, Photo
 from mitsplat.capture_sheet import capture_sheet
@@ -19,7 +20,6 @@ from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.photo_masks import MaskMaker, add_masks, geometric_masks, given_masks, model_masks, object_points
 from mitsplat.photos import Prepared, Progress, find_photos, prepare_photos, undistort
-from mitsplat.anchor import DEFAULT_BOARD, Anchor, find_anchor
 from mitsplat.poses import read_poses
 from mitsplat.sfm import MIN_POINTS, Model, find_cameras
 
@@ -155,6 +155,13 @@ def capture_photos(
     by_file = {photo.file.name: photo for photo in prepared}
     rejected |= _unregistered(by_file, model, weak)
     anchor = _anchored(model, by_file, settings)
+    if anchor.wrong:
+        rejected |= {
+            by_file[file].name: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
+            for file, error in anchor.wrong.items()
+        }
+        model = model.without(anchor.wrong)
+        anchor = _anchored(model, by_file, settings)
     capture = Capture(
         photos=tuple(
             Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])

@@ -78,7 +78,7 @@ def _scene() -> dict[str, Any]:
         "table": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([0, 0, -0.0005]).scale([0.5, 0.5, 1]),
-            "bsdf": _paint(np.full((2, 2, 3), 0.4)),
+            "bsdf": _paint(_noise(rng, 90, (0.5, 0.45, 0.4))),
         },
         "box": {
             "type": "cube",

@@ -102,6 +102,21 @@ class TestUnitsAndAxes:
         triple = np.linalg.det(asset.splats.means[8:11]), np.linalg.det(loaded.splats.means[8:11])
         assert triple[0] == pytest.approx(triple[1], rel=1e-3)
 
+    def test_unknown_units_stay_unknown_until_a_size_is_given(self, asset, tmp_path):
+        replace(asset, units="unknown").save(tmp_path, splats="splats.spz")
+        loaded = Asset.load(tmp_path)
+        assert loaded.units == "unknown"
+        np.testing.assert_allclose(loaded.mesh.extents, asset.mesh.extents, rtol=1e-6)
+        sized = loaded.resized(0.3)
+        assert sized.units == "metre"
+        assert sized.mesh.extents.max() == pytest.approx(0.3)
+        assert sized.mass == asset.mass
+        with pytest.raises(InputError, match="is in metres: it takes a scale, not a size"):
+            sized.resized(0.3)
+        write(tmp_path, (tmp_path / "asset.yaml").read_text() + "size: 0.2\n")
+        assert Asset.load(tmp_path).mesh.extents.max() == pytest.approx(0.2)
+        assert Asset.load(tmp_path).units == "metre"
+
     @pytest.mark.parametrize(("key", "factor"), [("units: 0.001", 0.001), ("size: 0.3", 0.3 / 0.06), ("", 1.0)])
     def test_units_and_size(self, asset, tmp_path, key, factor):
         asset.save(tmp_path)

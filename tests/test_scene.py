@@ -190,6 +190,26 @@ def test_errors_in_assets_name_both_files(scene_data: SceneData, write_scene: Wr
     assert str(path.parent / "assets/bolt") in message
 
 
+def test_an_asset_of_unknown_units_needs_a_size(scene_data: SceneData, write_scene: WriteScene) -> None:
+    path = write_scene(scene_data)
+    replace(box_asset("nut"), units="unknown").save(path.parent / "assets/nut")
+    with pytest.raises(
+        InputError, match=r"scene\.yaml:\d+: objects\[0\]\.asset: asset 'nut' is of unknown units: give"
+    ):
+        load_scene(path)
+    scene_data["objects"][0] |= {"size": 0.06, "scale": 2}
+    assert load_scene(write_scene(scene_data)).assets[0].mesh.extents.max() == pytest.approx(0.12)
+    scene_data["objects"][1]["size"] = 0.06
+    with pytest.raises(
+        InputError, match=r"objects\[1\]\.asset: asset 'bolt' is in metres: it takes a scale, not a size"
+    ):
+        load_scene(write_scene(scene_data))
+    scene_data["objects"][1].pop("size")
+    scene_data["environment"] = "assets/nut"
+    with pytest.raises(InputError, match="environment: asset 'nut' is of unknown units"):
+        load_scene(write_scene(scene_data))
+
+
 def test_environment_cannot_be_dropped(scene_data: SceneData, write_scene: WriteScene) -> None:
     path = write_scene(scene_data)
     replace(box_asset("room"), kind="environment", pieces=()).save(path.parent / "assets/room")

@@ -122,7 +122,7 @@ def find_tags(grey: npt.NDArray[np.uint8]) -> dict[int, FloatArray]:
     Pixel centres are at +0.5. An id that the image shows twice is left out: it is no landmark.
     """
     settings = cv2.aruco.DetectorParameters()
-    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     quads, ids, _ = cv2.aruco.ArucoDetector(family, settings).detectMarkers(grey)
     if ids is None:

@@ -127,7 +127,7 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
             image.load()
             exif = image.getexif()
             details = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-            orientation = int(exif.pop(ExifTags.Base.Orientation, 1)) if upright else 1
+            orientation = int(exif.get(ExifTags.Base.Orientation, 1)) if upright else 1
             turned = ImageOps.exif_transpose(image) if upright else image
             lossy, kept = image.format in _LOSSY, image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
     except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:
@@ -142,7 +142,9 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
         if kept:
             write_file(file, partial(shutil.copyfile, path))
         else:
-            # EXIF goes along for the focal length, which COLMAP starts from.
+            # EXIF goes along for the focal length, which COLMAP starts from, without the orientation.
+            exif = turned.getexif()
+            exif.pop(ExifTags.Base.Orientation, None)
             options = {"quality": 95, "subsampling": 0} if lossy else {}
             write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", exif=exif, **options))
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)

@@ -17,7 +17,7 @@ BOARD = Board(7, 5, 0.03)
 BOX = np.array([0.05, 0.035, 0.06])
 """Edges of the box [m]; it stands in the middle of the board, z = 0 the board."""
 
-SIZE = (480, 360)
+SIZE = (400, 300)
 
 
 def cameras(count: int) -> list[Camera]:
@@ -28,7 +28,7 @@ def cameras(count: int) -> list[Camera]:
     return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
 
 
-def render_capture(folder: Path, count: int = 18, *, samples: int = 12) -> dict[str, Camera]:
+def render_capture(folder: Path, count: int = 16, *, samples: int = 8) -> dict[str, Camera]:
     """Render photos into a folder; returns their cameras by name, in the board's frame [m]."""
     ensure_variant()
     folder.mkdir(parents=True, exist_ok=True)
@@ -78,7 +78,7 @@ def _scene() -> dict[str, Any]:
         "table": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([0, 0, -0.0005]).scale([0.5, 0.5, 1]),
-            "bsdf": _paint(_noise(rng, 90, (0.5, 0.45, 0.4))),
+            "bsdf": _paint(_noise(rng, 60, (0.5, 0.45, 0.4))),
         },
         "box": {
             "type": "cube",

@@ -1,0 +1,309 @@
+"""From photographs to captures: a rendered one whose truth is known, cameras that are given, and hopeless folders."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rendered
+from PIL import Image
+from test_cli import run
+
+from mitsplat import sfm, take
+from mitsplat.anchor import fit_similarity
+from mitsplat.camera import Camera
+from mitsplat.capture import Capture
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.photo_masks import geometric_masks, object_points
+from mitsplat.photos import prepare_photos
+from mitsplat.poses import read_poses
+from mitsplat.sfm import Model
+from mitsplat.take import CaptureResult, CaptureSettings, capture_photos
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
+    """Rendered photos, and their true cameras."""
+    folder = tmp_path_factory.mktemp("rendered")
+    return folder, rendered.render_capture(folder)
+
+
+@pytest.fixture(scope="session")
+def captured(
+    photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path, CaptureResult]:
+    """Their capture, with one torn photo among them: photos, folder, result."""
+    given, out = tmp_path_factory.mktemp("given"), tmp_path_factory.mktemp("capture")
+    shutil.copytree(photos[0], given, dirs_exist_ok=True)
+    (given / "torn.png").write_bytes((given / "photo00.png").read_bytes()[:5000])
+    return given, out, capture_photos(given, out, CaptureSettings(board=rendered.BOARD))
+
+
+def test_a_rendered_capture_comes_back(
+    photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult]
+) -> None:
+    _, truth = photos
+    _, out, result = captured
+    capture = Capture.load(out)
+    assert (capture.units, capture.up) == ("metre", "z")
+    assert set(capture.rejected) == {"torn.png"}
+    assert capture.rejected["torn.png"].startswith("it cannot be read")
+    assert result.given == 17
+    assert result.shortcoming is None
+    assert result.reprojection_error < 1
+    assert {photo.name for photo in capture.photos} == set(truth)
+    found = np.array([photo.camera.centre for photo in capture.photos])
+    true = np.array([truth[photo.name].centre for photo in capture.photos])
+    matrix, residuals = fit_similarity(found, true)
+    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    assert abs(scale - 1) < 2e-3
+    assert np.degrees(np.arccos(matrix[2, 2] / scale)) < 0.2
+    assert np.linalg.norm(residuals, axis=1).max() < 2e-3  # of 0.26 m
+    assert abs(matrix[2, 3]) < 5e-4
+    for photo in capture.photos:
+        pixels, _ = photo.camera.project(capture.points[photo.seen])
+        assert ((pixels > -5) & (pixels < np.array(rendered.SIZE) + 5)).all()
+
+
+def test_the_rendered_object_is_cut_out(
+    photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult]
+) -> None:
+    corners = rendered.BOX * (np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [0, 1]), axis=-1).reshape(-1, 3))
+    overlaps = []
+    for photo in captured[2].capture.photos:
+        true = photos[1][photo.name]
+        hull = cv2.convexHull(true.project(corners)[0].astype(np.float32))
+        outline = np.zeros(rendered.SIZE[::-1], dtype=np.uint8)
+        cv2.fillConvexPoly(outline, np.rint((hull - 0.5) * 16).astype(np.int32), 1, shift=4)
+        alpha = photo.picture()[1]
+        assert alpha is not None
+        overlaps.append(np.sum((alpha > 0.5) & (outline > 0)) / np.sum((alpha > 0.5) | (outline > 0)))
+    assert np.median(overlaps) > 0.95
+    assert min(overlaps) > 0.85
+
+
+def test_pycolmap_stays_in_its_own_process(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+    assert "pycolmap" not in sys.modules
+    assert zlib.decompress(zlib.compress(b"a" * 10000)) == b"a" * 10000
+    Image.fromarray(np.zeros((500, 500, 3), dtype=np.uint8)).save(tmp_path / "a.png")
+    with Image.open(captured[1] / "capture.png") as sheet:
+        assert sheet.width == 1280
+
+
+def test_a_finished_capture_is_not_made_again(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given, finished, result = captured
+    out = tmp_path / "capture"
+    shutil.copytree(finished, out)
+
+    def refuse(*args: object) -> None:
+        raise AssertionError("COLMAP was run again")
+
+    monkeypatch.setattr(sfm, "_run", refuse)
+    again = capture_photos(given, out, CaptureSettings(board=rendered.BOARD))
+    np.testing.assert_array_equal(again.capture.points, result.capture.points)
+    assert (again.given, again.source) == (result.given, result.source)
+    with pytest.raises(AssertionError, match="COLMAP was run again"):
+        capture_photos(given, out, CaptureSettings(board=rendered.BOARD, max_size=300))
+
+
+def write_colmap_text(folder: Path, capture: Capture) -> None:
+    """The capture as COLMAP's text files, with points."""
+    from scipy.spatial.transform import Rotation
+
+    folder.mkdir()
+    cameras, images, tracks = [], [], [[] for _ in capture.points]
+    for number, photo in enumerate(capture.photos, start=1):
+        camera, pose = photo.camera, photo.camera.camera_from_world
+        k1, k2, p1, p2 = camera.distortion or (0.0,) * 4
+        cameras.append(
+            f"{number} OPENCV {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r} "
+            f"{k1!r} {k2!r} {p1!r} {p2!r}"
+        )
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+        images.append(" ".join(map(str, (number, w, x, y, z, *pose[:3, 3].tolist(), number, photo.name))))
+        pixels, _ = camera.project(capture.points[photo.seen])
+        images.append(" ".join(f"{u} {v} {k + 1}" for (u, v), k in zip(pixels.tolist(), photo.seen, strict=True)))
+        for place, k in enumerate(photo.seen):
+            tracks[k].append(f"{number} {place}")
+    points = [
+        " ".join(map(str, (k + 1, *point.tolist(), *colour.tolist(), 0.1, *track)))
+        for k, (point, colour, track) in enumerate(zip(capture.points, capture.colours, tracks, strict=True))
+    ]
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+    given, _, result = captured
+    write_colmap_text(tmp_path / "model", result.capture)
+    settings = CaptureSettings(kind="environment", poses=tmp_path / "model", metric=True, max_size=200)
+    capture = capture_photos(given, tmp_path / "out", settings).capture
+    assert (capture.units, capture.up) == ("metre", "z")
+    np.testing.assert_allclose(capture.points, result.capture.points, atol=1e-12)
+    for one, other in zip(capture.photos, result.capture.photos, strict=True):
+        np.testing.assert_allclose(one.camera.world_from_camera, other.camera.world_from_camera, atol=1e-9)
+        assert one.camera.fx == pytest.approx(other.camera.fx / 2)
+        np.testing.assert_array_equal(one.seen, other.seen)
+    (tmp_path / "model/images.txt").write_text("1 0.5 broken\n")
+    with pytest.raises(InputError, match="model: not a readable COLMAP model"):
+        capture_photos(given, tmp_path / "broken", settings)
+
+
+def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
+    folder, truth = tmp_path / "four", {name: photos[1][name] for name in ("photo01.png", "photo03.png", "photo05.png")}
+    folder.mkdir()
+    for name in truth:
+        shutil.copy(photos[0] / name, folder)
+    frames = [
+        {
+            "file_path": f"./images/{Path(name).stem}",
+            "transform_matrix": (c.world_from_camera * (1, -1, -1, 1)).tolist(),
+        }
+        for name, c in truth.items()
+    ]
+    camera = next(iter(truth.values()))
+    content = {"camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx), "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=400)
+    model = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+    for name, true in truth.items():
+        np.testing.assert_allclose(model.cameras[name].world_from_camera, true.world_from_camera, atol=1e-12)
+        assert model.cameras[name].fx == pytest.approx(true.fx)
+    assert len(model.points) > 30
+    assert np.median(np.abs(model.points[:, 2])) < 2e-3  # most are on the board, z = 0
+    content["frames"][1]["transform_matrix"][0][0] = 7
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"transforms\.json: frames\[1\]: world_from_camera must be a rotation"):
+        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    with pytest.raises(InputError, match=r"transforms\.json: frames: "):
+        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+
+
+def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+    given, _, result = captured
+    write_colmap_text(tmp_path / "model", result.capture)
+    (tmp_path / "masks").mkdir()
+    for photo in result.capture.photos:
+        mask = Image.new("L", rendered.SIZE)
+        mask.paste(255, (100, 80, 300, 250))
+        mask.save(tmp_path / "masks" / f"{Path(photo.name).stem}.png")
+    Image.new("L", rendered.SIZE).save(tmp_path / "masks/photo03.png")
+    settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
+    capture = capture_photos(given, tmp_path / "out", settings).capture
+    assert capture.rejected["photo03.png"] == "its mask covers only 0.0% of it"
+    assert len(capture.photos) == 15
+    alpha = capture.photos[0].picture()[1]
+    assert alpha is not None
+    assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
+    (tmp_path / "masks/photo05.png").unlink()
+    with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
+        capture_photos(given, tmp_path / "out", settings)
+    Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")
+    with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 400x300 px \(got 300x300\)"):
+        capture_photos(given, tmp_path / "out", settings)
+
+
+def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> None:
+    capture = captured[2].capture
+    with pytest.raises(InputError, match="no object stands out of the table"):
+        object_points(replace(capture, points=capture.points * (1, 1, 0)))
+    behind = geometric_masks(np.array([[0.0, 0, 50], [0.1, 0, 50], [0, 0.1, 50]]))
+    assert not behind(capture.photos[1]).any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(count):
+        Image.new("RGB", (40, 30)).save(folder / f"{number}.png")
+    assert run("capture", folder, "-o", tmp_path / "out") == 2
+    sentence = f"mitsplat: {folder}: must hold at least 3 photographs (got {count})\n"
+    assert capsys.readouterr().err.endswith(sentence)
+    assert not (tmp_path / "out").exists()
+
+
+def test_textureless_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        Image.new("RGB", (120, 90), (90, 100, 110 + number)).save(tmp_path / f"photos/{number}.png")
+    assert run("capture", tmp_path / "photos", "-o", tmp_path / "out") == 2
+    err = capsys.readouterr().err
+    assert "no two of the 3 photos share enough points to find cameras from" in err
+    assert "Traceback" not in err
+
+
+def test_a_crash_of_colmap_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        Image.new("RGB", (40, 30), (90, 100, 110 + number)).save(tmp_path / f"photos/{number}.png")
+    crash = tmp_path / "crash"
+    crash.write_text("#!/bin/sh\nkill -SEGV $$\n")
+    crash.chmod(0o755)
+    monkeypatch.setattr(sfm.sys, "executable", str(crash))
+    with pytest.raises(
+        MissingResourceError, match=r"COLMAP ended with signal 11 while starting; its messages are in .*log"
+    ):
+        capture_photos(tmp_path / "photos", tmp_path / "out")
+
+
+def test_photos_of_two_things_end_with_status_4(
+    captured: tuple[Path, Path, CaptureResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given, _, result = captured
+    capture = result.capture
+    half = capture.photos[:8]
+    model = Model(
+        {photo.file.name: photo.camera for photo in half},
+        capture.points,
+        capture.colours,
+        {photo.file.name: photo.seen for photo in half},
+        frozenset(photo.file.name for photo in capture.photos[8:14]),
+    )
+    monkeypatch.setattr(take, "find_cameras", lambda *args: model)
+    assert run("capture", given, "-o", tmp_path / "out", "--square", 0.03, "--kind", "environment") == 4
+    out, err = capsys.readouterr()
+    assert "rejected: photo08.png: it only fits a smaller group of photos, as of another object or side\n" in out
+    assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
+    assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
+    assert len(Capture.load(tmp_path / "out").photos) == 8
+
+
+def test_lenses_of_other_models_are_refused() -> None:
+    with pytest.raises(InputError, match="lens model OPENCV_FISHEYE is not supported: use one of SIMPLE_PINHOLE, "):
+        sfm.opencv_camera("OPENCV_FISHEYE", 4, 3, [1] * 8, np.eye(4)[:3])
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--squares", "7"], "--squares must be COLUMNSxROWS, such as 7x5 (got 7)"),
+        (["--tag", "0"], "the edge of tags must be > 0 m (got 0.0)"),
+        (["--metric"], "poses must be given to be taken as metric"),
+        (["--max-size", "10"], "the size of photos must be at least 64 px (got 10)"),
+        (["--masks", "a", "--mask-model", "b"], "give a folder of masks or a model, not both"),
+    ],
+)
+def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str) -> None:
+    assert run("capture", tmp_path, "-o", tmp_path / "out", *options) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_board_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("board", "-o", tmp_path / "b.pdf", "--paper", "letter", "--squares", "6x4", "--square", 0.04) == 0
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
+    assert run("board", "-o", tmp_path / "b.png") == 2
+    assert "--out must end in .pdf" in capsys.readouterr().err

@@ -14,18 +14,18 @@ from mitsplat.camera import Camera
 from mitsplat.render import ensure_variant
 
 BOARD = Board(7, 5, 0.03)
-BOX = np.array([0.05, 0.035, 0.06])
+BOX = np.array([0.07, 0.05, 0.07])
 """Edges of the box [m]; it stands in the middle of the board, z = 0 the board."""
 
-SIZE = (400, 300)
+SIZE = (480, 360)
 
 
 def cameras(count: int) -> list[Camera]:
-    """Cameras on two rings around the box."""
+    """Cameras around the box, close enough that its sides are matched."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    heights, radii = np.resize([0.14, 0.24], count), np.resize([0.24, 0.16], count)
+    heights, radii = np.resize([0.17, 0.22], count), np.resize([0.24, 0.21], count)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
-    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
+    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=42) for place in places]
 
 
 def render_capture(folder: Path, count: int = 16, *, samples: int = 8) -> dict[str, Camera]:

@@ -112,7 +112,7 @@ def test_a_finished_capture_is_not_made_again(
     np.testing.assert_array_equal(again.capture.points, result.capture.points)
     assert (again.given, again.source) == (result.given, result.source)
     with pytest.raises(AssertionError, match="COLMAP was run again"):
-        capture_photos(given, out, CaptureSettings(board=rendered.BOARD, max_size=300))
+        capture_photos(given, out, CaptureSettings(board=rendered.BOARD, max_size=400))
 
 
 def write_colmap_text(folder: Path, capture: Capture) -> None:
@@ -145,7 +145,7 @@ def write_colmap_text(folder: Path, capture: Capture) -> None:
 def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
     given, _, result = captured
     write_colmap_text(tmp_path / "model", result.capture)
-    settings = CaptureSettings(kind="environment", poses=tmp_path / "model", metric=True, max_size=200)
+    settings = CaptureSettings(kind="environment", poses=tmp_path / "model", metric=True, max_size=240)
     capture = capture_photos(given, tmp_path / "out", settings).capture
     assert (capture.units, capture.up) == ("metre", "z")
     np.testing.assert_allclose(capture.points, result.capture.points, atol=1e-12)
@@ -173,7 +173,7 @@ def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, C
     camera = next(iter(truth.values()))
     content = {"camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx), "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=400)
+    prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=480)
     model = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
     for name, true in truth.items():
         np.testing.assert_allclose(model.cameras[name].world_from_camera, true.world_from_camera, atol=1e-12)
@@ -209,7 +209,7 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
         capture_photos(given, tmp_path / "out", settings)
     Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")
-    with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 400x300 px \(got 300x300\)"):
+    with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 480x360 px \(got 300x300\)"):
         capture_photos(given, tmp_path / "out", settings)
 
 

@@ -26,6 +26,9 @@ _DOTS = 20
 _MARGIN = 0.008
 """What printers leave white at the border [m]."""
 
+_SMALL = 1000
+"""Longer edge of images below which they are enlarged to look for a board [px]."""
+
 _MARKER = 0.75
 """Edge of a marker as a share of its square."""
 
@@ -109,10 +112,13 @@ class Board:
 
     def find(self, grey: npt.NDArray[np.uint8]) -> dict[int, FloatArray]:
         """Inner corners of the board that an image shows: pixel positions, centres at +0.5, by index."""
-        found, ids, _, _ = cv2.aruco.CharucoDetector(self.aruco).detectBoard(grey)
+        # Markers of few pixels are only found enlarged.
+        factor = 2 if max(grey.shape) < _SMALL else 1
+        image = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) if factor > 1 else grey
+        found, ids, _, _ = cv2.aruco.CharucoDetector(self.aruco).detectBoard(image)
         if ids is None or found is None:
             return {}
-        pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5
+        pixels = (np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5) / factor
         return {int(index): pixel for index, pixel in zip(np.ravel(ids), pixels, strict=True)}
 
 

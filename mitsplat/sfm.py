@@ -119,7 +119,12 @@ def find_points(
         }
         for name, camera in cameras.items()
     }
-    model = _read_arrays(_run({"task": "triangulate", "cameras": known, **_job(photos)}, folder, progress), photos)
+    model = _read_arrays(
+        _run(
+            {"task": "triangulate", "cameras": known, **_job(photos), "camera_model": "FULL_OPENCV"}, folder, progress
+        ),
+        photos,
+    )
     seen = {name: model.seen.get(name, np.zeros(0, dtype=np.int32)) for name in cameras}
     return Model(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
 

@@ -25,7 +25,7 @@ def cameras(count: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     heights, radii = np.resize([0.17, 0.22], count), np.resize([0.24, 0.21], count)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
-    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=42) for place in places]
+    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=46) for place in places]
 
 
 def render_capture(folder: Path, count: int = 16, *, samples: int = 8) -> dict[str, Camera]:
@@ -78,7 +78,7 @@ def _scene() -> dict[str, Any]:
         "table": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([0, 0, -0.0005]).scale([0.5, 0.5, 1]),
-            "bsdf": _paint(_noise(rng, 60, (0.5, 0.45, 0.4))),
+            "bsdf": _paint(_noise(rng, 200, (0.5, 0.45, 0.4)), "bilinear"),
         },
         "box": {
             "type": "cube",
@@ -92,8 +92,8 @@ def _noise(rng: np.random.Generator, size: int, colour: tuple[float, float, floa
     return np.clip(np.array(colour) * rng.uniform(0.1, 1.3, (size, size, 1)), 0, 1).astype(np.float32)
 
 
-def _paint(texture: np.ndarray) -> dict[str, Any]:
-    """A matt surface with this texture, its first row above; texels keep sharp edges."""
+def _paint(texture: np.ndarray, between: str = "nearest") -> dict[str, Any]:
+    """A matt surface with this texture, its first row above."""
     bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
-    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": between}
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}

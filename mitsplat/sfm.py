@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,9 @@ from mitsplat.photos import Prepared, Progress
 
 MIN_POINTS = 30
 """Points that a photo must observe: with fewer, cameras 20 % off were measured at reprojection errors of 0.2 px."""
+
+MIN_AGREEMENT = 0.5
+"""Share of a photo's matches that its camera must explain. On photographs of a statue it was 98 % or more for each."""
 
 ENOUGH = 0.8
 """Share of registered photos below which the global mapper is tried as well."""
@@ -52,6 +55,7 @@ class Model:
         seen: Indices of the points that each image observes.
         elsewhere: Names of images that only smaller models hold.
         reprojection_error: Mean over all observations [px].
+        agreement: Share of each image's matches with the others that its camera explains; 1 where unknown.
     """
 
     cameras: Mapping[str, Camera]
@@ -60,6 +64,7 @@ class Model:
     seen: Mapping[str, IntArray]
     elsewhere: frozenset[str] = frozenset()
     reprojection_error: float = float("nan")
+    agreement: Mapping[str, float] = field(default_factory=dict)
 
     def without_weak(self, min_points: int = MIN_POINTS) -> tuple[Model, dict[str, int]]:
         """The model without images that observe fewer points, and how many those observe.
@@ -88,6 +93,7 @@ class Model:
             {name: place[self.seen[name][stays[self.seen[name]]]].astype(np.int32) for name in kept},
             self.elsewhere,
             self.reprojection_error,
+            self.agreement,
         )
 
 
@@ -277,4 +283,5 @@ def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepar
         dict(zip(names, seen, strict=True)),
         frozenset(map(str, arrays["elsewhere"])),
         float(arrays["reprojection_error"]),
+        dict(zip(names, arrays["agreement"].tolist(), strict=True)),
     )

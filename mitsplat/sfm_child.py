@@ -12,6 +12,7 @@ import json
 import shutil
 import sys
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ import pycolmap  # noqa: E402
 
 SEED = 1
 SEQUENTIAL_OVERLAP = 10
+MAX_SAMPSON = 4.0
+"""Error up to which cameras explain a match, as in COLMAP's own verification [px]."""
+
 BLOCK = 12
 """Images in a block of exhaustive matching: results are stored, and so progress seen, per pair of blocks."""
 
@@ -58,7 +62,8 @@ def run(job: dict[str, Any], folder: Path) -> None:
         (folder / "known").mkdir(exist_ok=True)
         store(folder, [pycolmap.triangulate_points(known, database, images, folder / "known")])
     else:
-        store(folder, reconstruct(images, database, folder, job["enough"]))
+        models = reconstruct(images, database, folder, job["enough"])
+        store(folder, models, agreement(models[0], database) if models else {})
 
 
 def say(folder: Path, doing: str) -> None:
@@ -178,12 +183,48 @@ def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.
     return model
 
 
-def store(folder: Path, models: list[pycolmap.Reconstruction]) -> None:
-    """Write the first model, and which photos the others hold, as ``model.npz``."""
+def store(folder: Path, models: list[pycolmap.Reconstruction], shares: Mapping[str, float] | None = None) -> None:
+    """Write the first model with its :func:`agreement`, and which photos the others hold, as ``model.npz``."""
     arrays: dict[str, Any] = {"elsewhere": sorted(names_of(models[1:]) - names_of(models[:1]))}
     if models:
         arrays |= model_arrays(models[0])
+        arrays["agreement"] = np.array([(shares or {}).get(name, 1.0) for name in arrays["names"]])
     np.savez(folder / "model.npz", **arrays)
+
+
+def agreement(model: pycolmap.Reconstruction, database: Path) -> dict[str, float]:
+    """Share of each photo's verified matches with the other photos that the model's cameras explain.
+
+    Points only tell of the matches that a camera agrees with, so a photo that stands in a wrong place on a few of them
+    has small reprojection errors; here the others speak. The Sampson error (Hartley and Zisserman, 11.4.3) counts.
+    """
+    explained: dict[int, list[int]] = {index: [0, 0] for index in model.reg_image_ids()}
+    with pycolmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+        pixels = {index: opened.read_keypoints(index)[:, :2] for index in explained}
+    cameras = {index: model.camera(model.image(index).camera_id) for index in explained}
+    rays = {index: np.asarray(cameras[index].cam_from_img(pixels[index])) for index in explained}
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        ids = pycolmap.pair_id_to_image_pair(pair)
+        matches = np.asarray(geometry.inlier_matches)
+        if not len(matches) or not all(index in explained for index in ids):
+            continue
+        one, other = (model.image(index) for index in ids)
+        pose = other.cam_from_world() * one.cam_from_world().inverse()
+        x, y, z = pose.translation
+        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose.rotation.matrix()
+        a, b = (
+            np.column_stack([rays[index][matches[:, side]], np.ones(len(matches))]) for side, index in enumerate(ids)
+        )
+        lines_b, lines_a = a @ essential.T, b @ essential
+        spread = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+        errors = np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(spread, 1e-30))
+        focal = sum(cameras[index].mean_focal_length() for index in ids) / 2
+        good = int(np.count_nonzero(errors * focal < MAX_SAMPSON))
+        for index in ids:
+            explained[index][0] += good
+            explained[index][1] += len(matches)
+    return {model.image(index).name: good / total for index, (good, total) in explained.items() if total}
 
 
 def names_of(models: list[pycolmap.Reconstruction]) -> set[str]:

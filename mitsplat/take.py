@@ -21,7 +21,7 @@ from mitsplat.files import write_file, write_text
 from mitsplat.photo_masks import MaskMaker, add_masks, geometric_masks, given_masks, model_masks, object_points
 from mitsplat.photos import Prepared, Progress, find_photos, prepare_photos, undistort
 from mitsplat.poses import read_poses
-from mitsplat.sfm import MIN_POINTS, Model, find_cameras
+from mitsplat.sfm import MIN_AGREEMENT, MIN_POINTS, Model, find_cameras
 
 MIN_PHOTOS = 3
 MIN_REGISTERED = 0.75
@@ -142,18 +142,22 @@ def capture_photos(
     if len(prepared) < MIN_PHOTOS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
+    weak: dict[str, int] = {}
+    wrong: dict[str, float] = {}
     if settings.poses is not None:
         model = read_poses(settings.poses, prepared, work, progress)
-        weak: dict[str, int] = {}
     else:
         model, weak = find_cameras(prepared, work, progress).without_weak()
+        wrong = {file: model.agreement.get(file, 1.0) for file in model.cameras}
+        wrong = {file: share for file, share in wrong.items() if share < MIN_AGREEMENT}
+        model = model.without(wrong)
     if len(model.cameras) < MIN_PHOTOS:
         raise InputError(
             f"{photos}: cameras of only {len(model.cameras)} of {len(prepared)} photos could be found, {MIN_PHOTOS} "
             "are needed; take them closer together, and with texture on or under the object"
         )
     by_file = {photo.file.name: photo for photo in prepared}
-    rejected |= _unregistered(by_file, model, weak)
+    rejected |= _unregistered(by_file, model, weak, wrong)
     anchor = _anchored(model, by_file, settings)
     if anchor.wrong:
         rejected |= {
@@ -236,12 +240,16 @@ def _forget_other_photos(out: Path, inputs: dict[str, object]) -> None:
         write_text(file, marker)
 
 
-def _unregistered(by_file: dict[str, Prepared], model: Model, weak: dict[str, int]) -> dict[str, str]:
+def _unregistered(
+    by_file: dict[str, Prepared], model: Model, weak: dict[str, int], wrong: dict[str, float]
+) -> dict[str, str]:
     """Why photos are not in the model."""
     reasons = {}
     for file, photo in by_file.items():
         if file in weak:
             reasons[photo.name] = f"only {weak[file]} points could be matched in it, {MIN_POINTS} are needed"
+        elif file in wrong:
+            reasons[photo.name] = f"its camera is wrong: it explains only {wrong[file]:.0%} of its matches"
         elif file in model.elsewhere:
             reasons[photo.name] = "it only fits a smaller group of photos, as of another object or side"
         elif file not in model.cameras:

@@ -13,7 +13,7 @@ from mitsplat.board import Board
 from mitsplat.camera import Camera
 from mitsplat.render import ensure_variant
 
-BOARD = Board(7, 5, 0.03)
+BOARD = Board(9, 7, 0.03)
 BOX = np.array([0.07, 0.05, 0.07])
 """Edges of the box [m]; it stands in the middle of the board, z = 0 the board."""
 
@@ -25,7 +25,7 @@ def cameras(count: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     heights, radii = np.resize([0.17, 0.22], count), np.resize([0.24, 0.21], count)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
-    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=46) for place in places]
+    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=50) for place in places]
 
 
 def render_capture(folder: Path, count: int = 16, *, samples: int = 8) -> dict[str, Camera]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
 import zlib
 from dataclasses import replace
@@ -70,6 +71,31 @@ def test_a_rendered_capture_comes_back(
     for photo in capture.photos:
         pixels, _ = photo.camera.project(capture.points[photo.seen])
         assert ((pixels > -5) & (pixels < np.array(rendered.SIZE) + 5)).all()
+
+
+def test_a_camera_in_a_wrong_place_contradicts_its_matches(captured: tuple[Path, Path, CaptureResult]) -> None:
+    """A camera is turned about its own axis in the model, and must be the only one that explains little."""
+    code = """
+import sys, json
+from pathlib import Path
+from mitsplat.sfm_child import agreement, largest_first, pycolmap
+import numpy as np
+folder = Path(sys.argv[1])
+models = {int(path.name): pycolmap.Reconstruction(path) for path in (folder / "models").glob("[0-9]*")}
+model = largest_first(models)[0]
+before = agreement(model, folder / "database.db")
+image = model.find_image_with_name("photo05.png")
+turn = np.eye(3, 4)
+turn[0, 3] = 0.2 * np.linalg.norm(image.cam_from_world().translation)
+image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(turn) * image.cam_from_world())
+print(json.dumps([before, agreement(model, folder / "database.db")]))
+"""
+    folder = captured[1] / "sfm"
+    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True)
+    before, after = json.loads(done.stdout.splitlines()[-1])
+    assert min(before.values()) > 0.7
+    assert after["photo05.png"] < 0.5
+    assert min(share for name, share in after.items() if name != "photo05.png") > 0.5
 
 
 def test_the_rendered_object_is_cut_out(
@@ -274,7 +300,10 @@ def test_photos_of_two_things_end_with_status_4(
         frozenset(photo.file.name for photo in capture.photos[8:14]),
     )
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
-    assert run("capture", given, "-o", tmp_path / "out", "--square", 0.03, "--kind", "environment") == 4
+    assert (
+        run("capture", given, "-o", tmp_path / "out", "--squares", "9x7", "--square", 0.03, "--kind", "environment")
+        == 4
+    )
     out, err = capsys.readouterr()
     assert "rejected: photo08.png: it only fits a smaller group of photos, as of another object or side\n" in out
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out

@@ -125,12 +125,8 @@ def find_points(
         }
         for name, camera in cameras.items()
     }
-    model = _read_arrays(
-        _run(
-            {"task": "triangulate", "cameras": known, **_job(photos), "camera_model": "FULL_OPENCV"}, folder, progress
-        ),
-        photos,
-    )
+    job = _job(photos) | {"groups": [[photo.file.name] for photo in photos], "camera_model": "FULL_OPENCV"}
+    model = _read_arrays(_run({"task": "triangulate", "cameras": known, **job}, folder, progress), photos)
     seen = {name: model.seen.get(name, np.zeros(0, dtype=np.int32)) for name in cameras}
     return Model(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
 

@@ -174,10 +174,10 @@ def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.
             width=known["width"],
             height=known["height"],
             params=known["params"],
-            camera_id=image.image_id,
+            camera_id=image.camera_id,
         )
         model.add_camera_with_trivial_rig(camera)
-        placed = pycolmap.Image(name=image.name, camera_id=image.image_id, image_id=image.image_id)
+        placed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
         pose = np.array(known["camera_from_world"])
         model.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(pose))
     return model

@@ -13,7 +13,7 @@ from mitsplat.board import Board
 from mitsplat.camera import Camera
 from mitsplat.render import ensure_variant
 
-BOARD = Board(9, 7, 0.03)
+BOARD = Board(7, 5, 0.035)
 BOX = np.array([0.07, 0.05, 0.07])
 """Edges of the box [m]; it stands in the middle of the board, z = 0 the board."""
 
@@ -25,7 +25,7 @@ def cameras(count: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     heights, radii = np.resize([0.17, 0.22], count), np.resize([0.24, 0.21], count)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
-    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=50) for place in places]
+    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
 
 
 def render_capture(folder: Path, count: int = 16, *, samples: int = 8) -> dict[str, Camera]:
@@ -78,22 +78,33 @@ def _scene() -> dict[str, Any]:
         "table": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([0, 0, -0.0005]).scale([0.5, 0.5, 1]),
-            "bsdf": _paint(_noise(rng, 200, (0.5, 0.45, 0.4)), "bilinear"),
+            "bsdf": _paint(_noise(rng, 40, (0.5, 0.45, 0.4))),
         },
-        "box": {
-            "type": "cube",
-            "to_world": mi.ScalarTransform4f().translate([0, 0, BOX[2] / 2]).scale((BOX / 2).tolist()),
-            "bsdf": _paint(_noise(rng, 12, (0.75, 0.25, 0.2))),
-        },
+        **{f"side{number}": side for number, side in enumerate(_sides(rng))},
     }
+
+
+def _sides(rng: np.random.Generator) -> list[dict[str, Any]]:
+    """The box's visible sides, each painted differently: equal ones would be matched with each other."""
+    sides = []
+    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1)):
+        normal = sign * np.eye(3)[axis]
+        across = np.eye(3)[(axis + 1) % 3]
+        pose = np.eye(4)
+        pose[:3, :3] = np.column_stack([across, np.cross(normal, across), normal])
+        pose[:3, :2] *= np.abs(BOX / 2 @ pose[:3, :2])
+        pose[:3, 3] = BOX / 2 * normal + (0, 0, BOX[2] / 2)
+        paint = _paint(_noise(rng, 10, (0.8, 0.4, 0.3)))
+        sides.append({"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": paint})
+    return sides
 
 
 def _noise(rng: np.random.Generator, size: int, colour: tuple[float, float, float]) -> np.ndarray:
     return np.clip(np.array(colour) * rng.uniform(0.1, 1.3, (size, size, 1)), 0, 1).astype(np.float32)
 
 
-def _paint(texture: np.ndarray, between: str = "nearest") -> dict[str, Any]:
+def _paint(texture: np.ndarray) -> dict[str, Any]:
     """A matt surface with this texture, its first row above."""
     bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
-    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": between}
+    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}

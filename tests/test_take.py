@@ -185,7 +185,10 @@ def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_
 
 
 def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
-    folder, truth = tmp_path / "four", {name: photos[1][name] for name in ("photo01.png", "photo03.png", "photo05.png")}
+    folder, truth = (
+        tmp_path / "four",
+        {name: photos[1][name] for name in ("photo00.png", "photo01.png", "photo02.png", "photo03.png")},
+    )
     folder.mkdir()
     for name in truth:
         shutil.copy(photos[0] / name, folder)
@@ -300,10 +303,7 @@ def test_photos_of_two_things_end_with_status_4(
         frozenset(photo.file.name for photo in capture.photos[8:14]),
     )
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
-    assert (
-        run("capture", given, "-o", tmp_path / "out", "--squares", "9x7", "--square", 0.03, "--kind", "environment")
-        == 4
-    )
+    assert run("capture", given, "-o", tmp_path / "out", "--square", 0.035, "--kind", "environment") == 4
     out, err = capsys.readouterr()
     assert "rejected: photo08.png: it only fits a smaller group of photos, as of another object or side\n" in out
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out

@@ -54,6 +54,7 @@ class CameraSpec(_Strict):
     cy: float
     distortion: tuple[float, ...] = ()
     near: float
+    lens: Literal["opencv", "fisheye"] = "opencv"
     world_from_camera: tuple[_Row, _Row, _Row, _Row]
 
 

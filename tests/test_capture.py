@@ -33,6 +33,8 @@ def capture(tmp_path: Path) -> Capture:
             rng.normal(0, 1, 3) + np.float64([0, 0, 3]), (0, 0, 0), width=40, height=30, fov_x=50.123456789
         )
         camera = replace(camera, cx=20.25, fy=1 / 3 * 100, distortion=(0.1, -1e-9, 0.0, 1 / 7), near=0.02)
+        if number == 2:
+            camera = replace(camera, distortion=(0.01, -0.002, 1e-4, 0.0), lens="fisheye")
         photos.append(Photo(file.name, file, camera, mask, np.flatnonzero(rng.random(50) < 0.3).astype(np.int32)))
     return Capture(
         photos=tuple(photos),

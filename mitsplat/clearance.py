@@ -53,6 +53,19 @@ class Surface:
         found: NDArray[np.float32] = np.array(distances.numpy())
         return found
 
+    def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The surface's points (N, 3) that are nearest to ``points`` (N, 3), unit normals (N, 3), distances (N,)."""
+        positions, normals = (wp.empty(len(points), dtype=wp.vec3, device="cpu") for _ in range(2))
+        wp.launch(
+            _nearest_points,
+            dim=len(points),
+            inputs=[self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), _FAR],
+            outputs=[positions, normals],
+            device="cpu",
+        )
+        found = positions.numpy().astype(np.float64)
+        return found, normals.numpy().astype(np.float64), np.linalg.norm(found - points, axis=1)
+
 
 class PlacedSurface:
     """A surface at a pose.
@@ -129,3 +142,14 @@ def _signed_distances(mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, 
     if query.result:
         nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
         distances[i] = query.sign * wp.length(points[i] - nearest)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _nearest_points(
+    mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, positions: wp.array[wp.vec3], normals: wp.array[wp.vec3]
+) -> None:
+    i = wp.tid()
+    query = wp.mesh_query_point_no_sign(mesh, points[i], reach)
+    if query.result:
+        positions[i] = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        normals[i] = wp.mesh_eval_face_normal(mesh, query.face)

@@ -19,6 +19,7 @@ from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.board import Board
+    from mitsplat.pipeline import Finished
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -459,6 +460,120 @@ def board(
 
 
 @app.command()
+def mesh(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with masks for an object.")],
+    splats: Annotated[Path, typer.Argument(metavar="SPLATS", help="Folder of a fit, or a splat file in its frame.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Asset folder to write.")],
+    name: Annotated[str | None, typer.Option(help="Name of the asset; the folder's if absent.")] = None,
+    class_name: Annotated[str | None, typer.Option("--class", help="Class to learn; the name if absent.")] = None,
+    kind: Annotated[Literal["object", "environment"], typer.Option(help="Whether physics moves it.")] = "object",
+    faces: Annotated[int, typer.Option(help="Most faces of the mesh.")] = 10000,
+    voxels: Annotated[int, typer.Option(help="Cells of the grid along the longest extent.")] = 192,
+    dissent: Annotated[int, typer.Option(help="Masks that may leave a point out and be overruled, 0 to 3.")] = 0,
+    size: Annotated[float | None, typer.Option(help="Longest extent [m], where the capture has no scale.")] = None,
+    take: Annotated[
+        Path | None, typer.Option("--import", metavar="MESH", help="Take this mesh instead; it is registered.")
+    ] = None,
+    normalisation: Annotated[
+        Path | None,
+        typer.Option(help="Matrix (3x4 or 4x4, text) that its tool applied to the cameras: its inverse places it."),
+    ] = None,
+    units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
+) -> None:
+    """Make an asset of SPLATS that were fitted to CAPTURE.
+
+    The object is isolated by its masks, its surface found, and both are judged by held-out photos in report.html. If a
+    threshold is missed, the exit status is 4.
+    """
+    from mitsplat.align import invert_transform
+    from mitsplat.assets import read_mesh
+    from mitsplat.pipeline import AssetJob, make_asset
+    from mitsplat.reconstruct import ImportedMesh, ReconstructSettings
+    from mitsplat.surface import SurfaceSettings
+
+    if take is None and (normalisation is not None or units is not None):
+        raise InputError("--normalisation and --units say where an imported mesh belongs: give --import as well")
+    imported = None
+    if take is not None:
+        matrix = None if normalisation is None else invert_transform(normalisation)
+        imported = ImportedMesh(read_mesh(take), matrix, units)
+    surface = SurfaceSettings(voxels=voxels, faces=faces, dissent=dissent)
+    job = AssetJob(
+        name=name or out.resolve().name,
+        class_name=class_name,
+        kind=kind,
+        settings=ReconstructSettings(surface=surface, size=size),
+        imported=imported,
+    )
+    with _progress_bar("steps") as progress:
+        done = make_asset(capture, splats, out, job, progress=progress)
+    _tell_asset(done)
+
+
+@app.command()
+def asset(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Asset folder to write.")],
+    name: Annotated[str | None, typer.Option(help="Name of the asset; the folder's if absent.")] = None,
+    class_name: Annotated[str | None, typer.Option("--class", help="Class to learn; the name if absent.")] = None,
+    kind: Annotated[Literal["object", "environment"], typer.Option(help="Whether physics moves it.")] = "object",
+    size: Annotated[float | None, typer.Option(help="Longest extent [m], where the photos give no scale.")] = None,
+    scale_from: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(metavar="A B METRES", help="Distance of two places, as in `mitsplat capture`."),
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Folder of a COLMAP model, or NeRF's transforms.json, to take cameras from.")
+    ] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks, PHOTO.png, white = object.")] = None,
+    mask_model: Annotated[
+        Path | None, typer.Option(help="Segmentation network (.onnx) that makes the masks, by rembg.")
+    ] = None,
+    gaussians: Annotated[int, typer.Option(help="Most Gaussians.")] = 30000,
+    iterations: Annotated[int, typer.Option(help="Optimiser steps of the fit, one photo each.")] = 3000,
+    budget: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Shorten the fit to this time, such as 90s, 10min or 1h.")
+    ] = None,
+    edge: Annotated[int, typer.Option(help="Longest edge of the photos in the fit [px].")] = 800,
+    faces: Annotated[int, typer.Option(help="Most faces of the mesh.")] = 10000,
+    seed: Annotated[int, typer.Option(help="Decides everything in the fit that is random.")] = 0,
+) -> None:
+    """Make an asset of PHOTOS.
+
+    Cameras, splats, isolation, mesh and verdict: `capture`, `fit` and `mesh` in one. Runs again where it stopped;
+    report.html shows what came of it. If a threshold is missed, the exit status is 4.
+    """
+    from mitsplat.fit import FitSettings
+    from mitsplat.pipeline import AssetJob, make_photo_asset
+    from mitsplat.reconstruct import ReconstructSettings
+    from mitsplat.surface import SurfaceSettings
+    from mitsplat.take import CaptureSettings
+
+    job = AssetJob(
+        name=name or out.resolve().name,
+        class_name=class_name,
+        kind=kind,
+        settings=ReconstructSettings(surface=SurfaceSettings(faces=faces), size=size),
+    )
+    with _progress_bar("steps") as progress:
+        done = make_photo_asset(
+            photos,
+            out,
+            job,
+            capture=CaptureSettings(kind=kind, scale_from=scale_from, poses=poses, masks=masks, mask_model=mask_model),
+            fit=FitSettings(
+                gaussians=gaussians,
+                iterations=iterations,
+                budget=None if budget is None else _seconds(budget),
+                size=edge,
+                seed=seed,
+            ),
+            progress=progress,
+        )
+    _tell_asset(done)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON Schema of scene files, for editors."""
     import json
@@ -507,6 +622,26 @@ def _board(squares: str, square: float) -> Board:
     if not (columns.isdecimal() and rows.isdecimal()):
         raise InputError(f"--squares must be COLUMNSxROWS, such as 7x5 (got {squares})")
     return Board(int(columns), int(rows), square)
+
+
+def _tell_asset(done: Finished) -> None:
+    """What came of an asset, and status 4 where a threshold is missed."""
+    found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
+    closed = "watertight" if found.watertight else "open"
+    typer.echo(f"asset: {done.folder}{kept}")
+    typer.echo(f"photos: {found.photos} of {found.photos + found.rejected} with a camera; units: {found.units}")
+    typer.echo(f"splats: {found.gaussians}; mesh: {found.faces} faces, {closed}")
+    figures = {
+        "held-out PSNR": None if found.psnr is None else f"{found.psnr:.2f} dB",
+        "IoU with held-out masks": None
+        if found.splat_iou is None
+        else f"splats {found.splat_iou:.3f}, mesh {found.mesh_iou or 0:.3f}",
+        "shift between mesh and splats": None if found.offset is None else f"{found.offset:.3%} of the diagonal",
+    }
+    typer.echo("; ".join(f"{name} {value}" for name, value in figures.items() if value is not None))
+    typer.echo(f"report: {done.folder / 'report.html'}")
+    if done.shortcoming is not None:
+        raise PartialResultError(f"{done.folder}: {done.shortcoming}")
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import statistics
@@ -20,6 +19,7 @@ from mitsplat.coco import image_file
 from mitsplat.files import Record, write_text
 from mitsplat.label import Labels
 from mitsplat.masks import Silhouette
+from mitsplat.page import inline_image, make_page
 from mitsplat.sheet import class_colour
 from mitsplat.stored import read_content, read_records
 
@@ -84,8 +84,7 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
         _charts(counted, _brightness(root, _spread(records, BRIGHTNESS_IMAGES)), _seconds(root)),
         _details(content),
     ]
-    page = _PAGE.replace("{{title}}", html.escape(name)).replace("{{body}}", "\n".join(parts))
-    write_text(out, page)
+    write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
     return out, audit
 
 
@@ -151,8 +150,7 @@ def _sample(root: Path, record: Record) -> str:
     small = cv2.resize(
         image, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
     )
-    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])
-    source = base64.b64encode(bytes(data)).decode("ascii")
+    source = inline_image(small)
     unit = width / 640
     marks, names = [], []
     for label in labels.instances:
@@ -176,7 +174,7 @@ def _sample(root: Path, record: Record) -> str:
     caption = f"Frame {record['index']}, {record['split']}: {classes}"
     text = html.escape(caption, quote=True)
     return (
-        f'<figure><div class="picture"><img alt="{text}" src="data:image/jpeg;base64,{source}">'
+        f'<figure><div class="picture"><img alt="{text}" src="{source}">'
         f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks + names)}</svg></div>'
         f"<figcaption>{text}</figcaption></figure>"
     )
@@ -283,61 +281,7 @@ def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()) if count) or "none"
 
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{title}}: dataset report</title>
-<style>
-:root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --line: #c8ced6; --bar: #2f6db5; --soft: #f3f5f8;
-  --good: #1a7f37; --bad: #cf222e; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e8ebef; --paper: #15181c; --line: #454c55; --bar: #6ea8ea; --soft: #1f242a;
-    --good: #56d364; --bad: #ff7b72; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1400px; padding: 1rem 1.5rem 4rem; color: var(--ink); background: var(--paper);
-  font: 16px/1.5 system-ui, sans-serif; }
-h1, h2 { line-height: 1.2; }
-h2 { margin: 2.5rem 0 .75rem; border-bottom: 1px solid var(--line); padding-bottom: .3rem; }
-table { border-collapse: collapse; }
-th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0; overflow-wrap: anywhere; }
-th { font-weight: 600; white-space: nowrap; }
-.good::before { content: "\\2713  "; color: var(--good); font-weight: 700; }
-.bad::before { content: "\\2717  "; color: var(--bad); font-weight: 700; }
-fieldset { border: 1px solid var(--line); border-radius: 6px; margin: 0 0 1rem; padding: .4rem 1rem .6rem; }
-fieldset label { display: inline-block; margin-right: 1.5rem; padding: .2rem 0; cursor: pointer; }
-figure { margin: 0; }
-figcaption { font-size: .9rem; padding: .35rem 0; }
-.samples, .charts { display: grid; gap: 1.2rem;
-  grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
-.picture { position: relative; line-height: 0; background: var(--soft); }
-.picture img { width: 100%; height: auto; }
-.picture svg { position: absolute; inset: 0; width: 100%; height: 100%; }
-.picture svg * { vector-effect: non-scaling-stroke; }
-.picture .mask { fill-rule: evenodd; fill-opacity: .45; stroke-width: 1; }
-.picture .alone { fill: none; stroke-width: 2; stroke-dasharray: 4 3; }
-.picture .box { fill: none; stroke-width: 1.5; }
-.picture .name { fill: #fff; stroke: #000; stroke-width: 3px; paint-order: stroke; font-family: system-ui, sans-serif; }
-.picture .mask, .picture .alone, .picture .box, .picture .name { display: none; }
-.show-mask .mask, .show-alone .alone, .show-box .box, .show-name .name { display: inline; }
-.charts figure { background: var(--soft); border-radius: 6px; padding: .5rem .9rem .7rem; }
-.charts figcaption { font-weight: 600; }
-.charts svg { width: 100%; height: auto; font-size: 12px; fill: var(--ink); }
-.bar { fill: var(--bar); }
-.axis { stroke: var(--line); }
-.frame { fill: none; stroke: var(--line); }
-summary { cursor: pointer; }
-pre { overflow: auto; max-height: 30rem; background: var(--soft); padding: .8rem; font-size: .85rem; }
-:focus-visible { outline: 3px solid var(--bar); outline-offset: 2px; }
-</style>
-</head>
-<body>
-<main>
-{{body}}
-</main>
-<script>
+_SCRIPT = """
 "use strict";
 const sheet = document.getElementById("sheet");
 for (const box of document.querySelectorAll("input[data-overlay]")) {
@@ -345,7 +289,4 @@ for (const box of document.querySelectorAll("input[data-overlay]")) {
   box.addEventListener("change", show);
   show();
 }
-</script>
-</body>
-</html>
 """

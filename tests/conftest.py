@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.assets import Asset
+from mitsplat.camera import Camera
+from mitsplat.capture import Capture, Photo
 from mitsplat.dataset import write_dataset
 from mitsplat.scene import load_scene
 from mitsplat.spec import FORMATS
@@ -88,3 +90,63 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(clean: Path, tmp_path: Path) -> Path:
     """A copy of the clean dataset, to be damaged."""
     return Path(shutil.copytree(clean, tmp_path / "out"))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownObject:
+    """A solid with a step and a pocket, Gaussians on its surface, and photos of these with the solid's masks."""
+
+    mesh: trimesh.Trimesh
+    splats: Splats
+    capture: Capture
+
+
+def orbit(count: int, *, radius: float = 0.35, width: int = 160, height: int = 120) -> list[Camera]:
+    """Cameras evenly all around the origin."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z**2)
+    eyes = radius * np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+    return [Camera.look_at(eye, (0, 0, 0), width=width, height=height, fov_x=28) for eye in eyes]
+
+
+@pytest.fixture(scope="session")
+def known_object(tmp_path_factory: pytest.TempPathFactory) -> KnownObject:
+    """The object in 32 photos of 160 x 120 px; to be left as it is."""
+    import mitsuba as mi
+    from PIL import Image
+
+    from mitsplat.render import make_integrator, make_splats_shape, render_layers
+    from mitsplat.surfels import place_surfels
+    from mitsplat.trace import encode_srgb
+
+    ball = trimesh.creation.icosphere(3, 0.05)
+    box = trimesh.creation.box((0.06, 0.04, 0.05))
+    box.apply_translation((0.03, 0.01, 0.0))
+    pocket = trimesh.creation.cylinder(0.018, 0.04)
+    pocket.apply_translation((-0.01, 0.0, 0.045))
+    mesh = trimesh.boolean.difference(
+        [trimesh.boolean.union([ball, box], engine="manifold"), pocket], engine="manifold"
+    )
+    rng = np.random.default_rng(0)
+    surfels = place_surfels(mesh, 1.0, 3000, rng)
+    splats = Splats(
+        means=surfels.points,
+        quats=surfels.quats,
+        scales=surfels.scales,
+        opacities=np.full(len(surfels), 0.98),
+        sh=rng.normal(0, 0.5, (len(surfels), 1, 3)),
+    )
+    folder = tmp_path_factory.mktemp("known")
+    integrator = make_integrator(shadow="none", quality="fast")
+    scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1, proxy=mesh)})
+    photos = []
+    for number, camera in enumerate(orbit(32)):
+        layers = render_layers(integrator, scene, camera)
+        file, mask = folder / f"{number:02}.png", folder / f"{number:02}_mask.png"
+        Image.fromarray(np.uint8(255 * np.clip(encode_srgb(layers.captured), 0, 1) + 0.5)).save(file)
+        Image.fromarray(np.uint8(255 * (layers.proxy_instance > 0))).save(mask)
+        photos.append(Photo(file.name, file, camera, mask))
+    points = surfels.points[::20]
+    capture = Capture(tuple(photos), points, np.full(points.shape, 128, dtype=np.uint8), units="metre", up="z")
+    return KnownObject(mesh, splats, capture.save(folder / "capture"))

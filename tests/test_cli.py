@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,16 +18,20 @@ import typer.main
 from conftest import WriteScene, box_asset
 from PIL import Image, ImageSequence
 
-from mitsplat import bake, chart, dataset, fit, frame, settle, xml_scene
+from mitsplat import bake, chart, dataset, fit, frame, pipeline, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.capture import Capture
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.fit import FitProgress, FitResult, FitSettings
+from mitsplat.pipeline import Finished
 from mitsplat.scene import Scene
 from mitsplat.settle import Layout
 from mitsplat.sight import HeldOut
+from mitsplat.surface import SurfaceSettings
+from mitsplat.take import CaptureSettings
+from mitsplat.verdict import Verdict
 
 
 def run(*args: object) -> int:
@@ -425,6 +430,65 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert run("--version") == 0
     assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
+
+
+def finished(folder: Path, **changes: Any) -> Finished:
+    figures = Verdict(
+        photos=9, rejected=1, psnr=27.0, psnr_object=26.0, splat_iou=0.97, mesh_iou=0.96, offset=0.001, spread=0.001,
+        lost=0.0, scale_error=None, units="metre", gaussians=12, faces=99, watertight=True,
+    )  # fmt: skip
+    return Finished(folder, replace(figures, **changes), kept=False)
+
+
+def test_mesh_passes_every_option_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    box_asset("nut").mesh.export(tmp_path / "cad.stl")
+    (tmp_path / "matrix.txt").write_text("2 0 0 1\n0 2 0 0\n0 0 2 0\n")
+    calls = Calls(finished(tmp_path / "nut"))
+    monkeypatch.setattr(pipeline, "make_asset", calls)
+    status = run(
+        "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", "environment",
+        "--faces", 500, "--voxels", 64, "--dissent", 1, "--size", 0.1, "--import", tmp_path / "cad.stl",
+        "--normalisation", tmp_path / "matrix.txt", "--units", 0.001,
+    )  # fmt: skip
+    assert status == 0
+    capture, fit_folder, out, job = calls.args
+    assert (capture, fit_folder, out) == (Path("capture"), Path("fit"), tmp_path / "nut")
+    assert (job.name, job.class_name, job.kind, job.settings.size) == ("m6", "nut", "environment", 0.1)
+    assert job.settings.surface == SurfaceSettings(voxels=64, faces=500, dissent=1)
+    assert job.imported.metres_per_unit == 0.001
+    np.testing.assert_allclose(job.imported.capture_from_mesh @ [1, 0, 0, 1], [0, 0, 0, 1], atol=1e-12)
+    assert "held-out PSNR 27.00 dB; IoU with held-out masks splats 0.970, mesh 0.960" in capsys.readouterr().out
+
+
+def test_a_missed_threshold_is_status_4_and_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pipeline, "make_asset", Calls(finished(tmp_path, psnr=12.0)))
+    assert run("mesh", "capture", "fit", "-o", tmp_path) == 4
+    shown = capsys.readouterr()
+    assert "held-out photos are met at only 12.0 dB (at least 24 is wanted): use even light" in shown.err
+    assert f"report: {tmp_path / 'report.html'}" in shown.out
+    assert run("mesh", "capture", "fit", "-o", tmp_path, "--units", 0.001) == 2
+
+
+def test_asset_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls = Calls(finished(tmp_path))
+    monkeypatch.setattr(pipeline, "make_photo_asset", calls)
+    status = run(
+        "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", "environment", "--size", 0.1,
+        "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--gaussians", 70,
+        "--iterations", 80, "--budget", "1.5min", "--edge", 90, "--faces", 500, "--seed", 4,
+    )  # fmt: skip
+    assert status == 0
+    photos, out, job = calls.args
+    assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
+    assert (job.kind, job.settings.size, job.settings.surface.faces) == ("environment", 0.1, 500)
+    assert calls.kwargs["capture"] == CaptureSettings(
+        kind="environment", scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
+    )
+    assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4)
 
 
 def test_readme_documents_every_command_and_option() -> None:

@@ -75,7 +75,8 @@ def test_mesh_and_splats_share_the_frame_of_the_truth(known_object: KnownObject,
 def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, Finished]) -> None:
     folder, _ = made
     scene = folder / "scene.yaml"
-    common = "name: s\nregion: {min: [-1, -1, 0], max: [1, 1, 1]}\ncamera: {kind: orbit, radius: 1, height: 1, target: [0, 0, 0]}\n"
+    camera = "camera: {kind: orbit, radius: 1, height: 1, target: [0, 0, 0]}"
+    common = f"name: s\nregion: {{min: [-1, -1, 0], max: [1, 1, 1]}}\n{camera}\n"
     scene.write_text(common + "objects: [{asset: asset}]\n")
     with pytest.raises(InputError, match=r"objects\[0\].asset: asset 'part' is of unknown units"):
         load_scene(scene)

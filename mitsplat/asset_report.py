@@ -72,7 +72,7 @@ def _verdict(result: Reconstruction) -> str:
         "Extents": f"{extents} {unit}",
         "Gaussians": f"{found.gaussians}",
         "Mesh": f"{found.faces} faces, {'watertight' if found.watertight else 'open'}, "
-        f"{len(result.asset.pieces)} convex pieces",
+        f"convex pieces: {len(result.asset.pieces)}",
     }
     if result.isolation is not None:
         removed = result.isolation

@@ -37,6 +37,8 @@ _BULK = 0.002
 """Share of the Gaussians at either end of an axis that do not decide where the grid is."""
 _MARGIN = 0.08
 """Room around the bulk of the Gaussians, as a share of its longest extent."""
+_SEEN_BY = 0.035
+"""Share of the views that look towards a cell which must see it: a few look through gaps between Gaussians."""
 _FAR = 1e6
 
 
@@ -131,7 +133,7 @@ def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
         solid = solid.simplify(tolerance)
         tolerance *= 1.3
     mesh = solid.to_mesh()
-    return trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts)
+    return trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
 
 
 def _without_debris(surface: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -152,11 +154,13 @@ class _State:
         hull: The smallest distances to silhouettes found so far [m], ascending; empty without masks.
         total: Sum of the truncated distances behind the seen surface [m].
         count: Number of views in it.
+        towards: Number of views that see a surface in the cell's direction.
     """
 
     hull: list[Any]
     total: Any
     count: Any
+    towards: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +195,7 @@ class _Grid:
     def start(self, silhouettes: int) -> _State:
         ensure_variant()
         nothing = dr.zeros(mi.Float, self.count)
-        return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], nothing, nothing)
+        return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], nothing, nothing, nothing)
 
     def fuse(self, state: _State, splats: Splats, camera: Camera, mask: npt.NDArray[np.float32] | None) -> None:
         """Add what one view says."""
@@ -222,14 +226,15 @@ class _Grid:
         valid = ahead & (low > 0) & (high - low < span) & (behind < span)
         state.total = state.total + dr.select(valid, dr.maximum(behind, -span), 0)
         state.count = state.count + dr.select(valid, 1, 0)
-        dr.eval(state.total, state.count)
+        state.towards = state.towards + dr.select(ahead & (low > 0), 1, 0)
+        dr.eval(state.total, state.count, state.towards)
 
     def combine(self, state: _State, blur: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
         """Distance to the surface of every cell [m], positive inside, and whether it is known, of shape ``shape``."""
         total, count = np.array(state.total), np.array(state.count)
         # What nobody looked at is inside the object as far as the hull reaches.
-        distance = np.where(count > 0, total / np.maximum(count, 1), self.truncation)
-        known = count > 0
+        known = count > (_SEEN_BY * np.array(state.towards) if state.hull else 0)
+        distance = np.where(known, total / np.maximum(count, 1), self.truncation)
         if state.hull:
             distance = np.minimum(distance, np.clip(np.array(state.hull[-1]), -self.truncation, self.truncation))
             known = np.ones_like(known)

@@ -88,7 +88,6 @@ class OpenCVCamera(mi.Sensor):
         ray.o = to_world @ mi.Point3f(0, 0, 0)
         ray.d = dr.normalize(to_world @ mi.Vector3f(-u, -v, 1))
         ray.time = time
-        ray.wavelengths = wavelength
         ray.maxt = dr.inf
         return ray, mi.Color3f(1)
 

@@ -64,6 +64,19 @@ def test_sensor_plugin_sends_the_same_rays() -> None:
     np.testing.assert_allclose(np.stack([u, v], axis=1), expected, rtol=2e-5, atol=1e-5)
 
 
+def test_other_integrators_see_through_the_sensor_what_mitsubas_own_sees() -> None:
+    ensure_variant()
+    camera = Camera.look_at((0.3, -3, 1), (0, 0, 0), width=32, height=24, fov_x=50)
+    ours = describe_sensor(camera)
+    theirs = {"type": "perspective", "fov": 50.0, "to_world": ours["to_world"], "film": ours["film"]}
+    pictures = []
+    for sensor in (ours, theirs):
+        scene = {"type": "scene", "sensor": sensor, "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
+        pictures.append(np.array(mi.render(mi.load_dict({**scene, "integrator": {"type": "depth"}}), spp=64))[..., 0])
+    assert 0.1 < (pictures[0] > 0).mean() < 0.9
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.02
+
+
 @pytest.mark.parametrize("wrong", [{"distortion": "0.1"}, {"lens": "mirror"}, {"lens": "fisheye"}])
 def test_sensor_plugin_refuses_what_is_no_lens(wrong: dict[str, str]) -> None:
     ensure_variant()

@@ -76,6 +76,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     welded.update_faces(welded.nondegenerate_faces())
     welded.remove_unreferenced_vertices()
+    welded.fill_holes()  # of three or four edges, such as slivers leave
     # Divergence theorem: tetrahedra from the origin to each triangle.
     volume = float(np.linalg.det(welded.triangles).sum()) / 6
     if volume < 0:

@@ -99,10 +99,16 @@ def test_a_mesh_inside_out_is_turned():
     assert prepare_mesh(box, "box").volume == pytest.approx(1e-3)
 
 
+def test_a_missing_triangle_is_put_back():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.update_faces(np.arange(len(box.faces)) != 3)
+    assert prepare_mesh(box, "box").is_volume
+
+
 def test_repairs_are_told_in_a_sentence_each(caplog):
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.invert()
-    box.update_faces(np.arange(len(box.faces)) != 3)
+    box.update_faces((box.face_normals[:, 2] < 0.5) & (box.face_normals[:, 0] < 0.5))
     prepare_mesh(box, "box")
     assert [record.message for record in caplog.records] == [
         "box: the mesh is wound inside out; physics turns its faces",

@@ -98,6 +98,10 @@ CANDIDATES_MAX = 1 << 26
 """Most pairs of a Gaussian and a tile in its box that are held at once, about 40 bytes each."""
 
 
+_OCTAVES = 20.0
+"""Depths from the near plane to a million times as far are told apart in the order per tile."""
+
+
 class CrowdedError(Exception):
     """A view has more pairs than :data:`CANDIDATES_MAX`: render a part of it."""
 
@@ -401,15 +405,19 @@ def _pair(
     if order == "ray":
         ellipsoid = dr.gather(mi.Float, bounds, rank * BOUNDS + 8)
         depth = _least_depth(record, ellipsoid, view.tile_slopes(tile))
+        dr.eval(tile, rank, depth)
+        by_depth = dr.argsort(depth)
+        by_tile = dr.argsort(dr.gather(mi.UInt32, tile, by_depth))
+        sorted_pairs = dr.gather(mi.UInt32, by_depth, by_tile)
+        nearest = dr.gather(mi.Float, depth, sorted_pairs)
     else:
         depth = _depth_near_centre(record, view.tile_slopes(tile))
-    dr.eval(tile, rank, depth)
-    by_depth = dr.argsort(depth)
-    by_tile = dr.argsort(dr.gather(mi.UInt32, tile, by_depth))
-    sorted_pairs = dr.gather(mi.UInt32, by_depth, by_tile)
+        key = _tile_key(tile, depth / view.near_plane, tiles)
+        dr.eval(tile, rank, key)
+        sorted_pairs = dr.argsort(key)
+        nearest = dr.zeros(mi.Float, 1)
     tile, entries = dr.gather(mi.UInt32, tile, sorted_pairs), dr.gather(mi.UInt32, rank, sorted_pairs)
-    depth = dr.gather(mi.Float, depth, sorted_pairs)
-    dr.eval(tile, entries, depth)
+    dr.eval(tile, entries, nearest)
     i = dr.arange(mi.UInt32, pairs)
     last = dr.opaque(mi.UInt32, pairs - 1)
     first_of_tile = (i == 0) | (tile != dr.gather(mi.UInt32, tile, dr.maximum(i, 1) - 1))
@@ -417,7 +425,19 @@ def _pair(
     dr.scatter(start, i, tile, first_of_tile)
     dr.scatter(stop, i + 1, tile, last_of_tile)
     dr.eval(start, stop)
-    return entries, sorted_pairs, depth, start, stop
+    return entries, sorted_pairs, nearest, start, stop
+
+
+def _tile_key(tile: Any, depth: Any, tiles: int) -> Any:
+    """Sort key of a tile and, in the bits that are left, the logarithm of a depth in units of the near plane's.
+
+    In 1280 x 720 pixels that tells depths apart that differ by 0.02 %; what is nearer together stays in the order of
+    the centres, because the sort is stable. One sort takes half the time of two.
+    """
+    bits = min(24, 32 - (tiles - 1).bit_length())  # whole numbers that a float can hold
+    step = float((1 << bits) - 1) / _OCTAVES
+    level = dr.clip(dr.log2(dr.maximum(depth, 1.0)) * dr.opaque(mi.Float, step), 0.0, float((1 << bits) - 1))
+    return tile * dr.opaque(mi.UInt32, 1 << bits) + mi.UInt32(level)
 
 
 def _depth_near_centre(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from scipy.special import comb
 
 from mitsplat.optimise import Model
-from mitsplat.plugins.gaussian import rotation_axes
+from mitsplat.plugins.gaussian import rotation_axes, wrapped
 from mitsplat.splats import SH_C0, Splats
 
 FloatArray = npt.NDArray[np.float64]
@@ -125,9 +125,11 @@ def _share_out(model: Model, rows: npt.NDArray[np.intp], opacities: FloatArray) 
     logit[several] = np.log(opacity / (1 - opacity))
     changed = several[rows]
     model.take(rows.astype(np.uint32), model.widths, changed)
-    own = mi.Bool(changed)
-    model.values["opacities"] = dr.select(own, mi.Float(logit[rows].astype(np.float32)), model.values["opacities"])
-    model.values["scales"] += mi.Float(np.repeat(log_factor[rows], 3).astype(np.float32))
+    own = wrapped(mi.Bool, changed)
+    model.values["opacities"] = dr.select(
+        own, wrapped(mi.Float, logit[rows].astype(np.float32)), model.values["opacities"]
+    )
+    model.values["scales"] += wrapped(mi.Float, np.repeat(log_factor[rows], 3).astype(np.float32))
     dr.eval(model.values)
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.plugins.gaussian import Cloud
+from mitsplat.plugins.gaussian import Cloud, wrapped
 from mitsplat.splats import Splats
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15
@@ -28,7 +28,7 @@ class Adam:
     """
 
     def __init__(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
-        self.values: dict[str, Any] = {k: mi.Float(np.ravel(v).astype(np.float32)) for k, v in values.items()}
+        self.values: dict[str, Any] = {k: wrapped(mi.Float, np.asarray(v, dtype=np.float32)) for k, v in values.items()}
         self.first: dict[str, Any] = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
         self.second: dict[str, Any] = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
         self.steps = 0
@@ -56,7 +56,7 @@ class Adam:
 
     def take(self, rows: npt.NDArray[np.uint32], widths: Mapping[str, int], fresh: npt.NDArray[np.bool_]) -> None:
         """Become these rows of the parameters, of so many floats each; ``fresh`` rows lose their moments."""
-        index, kept = mi.UInt32(rows), mi.Float((~fresh).astype(np.float32))
+        index, kept = wrapped(mi.UInt32, rows), wrapped(mi.Float, (~fresh).astype(np.float32))
         for name, width in widths.items():
             element = dr.arange(mi.UInt32, len(rows) * width)
             row = element // width
@@ -80,7 +80,7 @@ class Adam:
         """Go on from what :meth:`state` gave."""
         for group, members in (("value", self.values), ("first", self.first), ("second", self.second)):
             for name in members:
-                members[name] = mi.Float(state[f"{group}.{name}"])
+                members[name] = wrapped(mi.Float, state[f"{group}.{name}"])
         self.steps = int(state["steps"])
         self._settle()
 

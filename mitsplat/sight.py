@@ -17,6 +17,7 @@ from mitsplat.capture import Photo
 from mitsplat.files import write_file
 from mitsplat.metrics import psnr, ssim
 from mitsplat.optimise import Model
+from mitsplat.plugins.gaussian import wrapped
 from mitsplat.quality import Quality
 from mitsplat.render import make_sensor
 
@@ -98,7 +99,7 @@ class Sight:
 
     def pixels(self) -> tuple[list[Any], Any]:
         """Display-encoded colour times mask, and the mask, flat on the device."""
-        packed = mi.UInt32(self._packed)
+        packed = wrapped(mi.UInt32, self._packed)
         red, green, blue, mask = (mi.Float((packed >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24))
         return [red * mask, green * mask, blue * mask], mask
 
@@ -112,7 +113,8 @@ class Sight:
             column, row = pixels[inside].astype(np.uint32).T
             shown = self.mask[row, column] > 0.5
             number = (row * self.camera.width + column)[shown]
-            self._depths = mi.UInt32(number), mi.Float((1 / depth[inside][shown]).astype(np.float32))
+            inverse = (1 / depth[inside][shown]).astype(np.float32)
+            self._depths = wrapped(mi.UInt32, number), wrapped(mi.Float, inverse)
         return self._depths
 
     def render(self, model: Model, quality: Quality) -> tuple[FloatArray, FloatArray]:

@@ -91,6 +91,19 @@ def aligned(values: np.ndarray) -> Any:
     return result
 
 
+def wrapped(kind: type, values: np.ndarray) -> Any:
+    """Device array of type ``kind`` on a copy of ``values`` that always starts at a whole cache line.
+
+    Dr.Jit compiles other kernels for memory that does not, and where NumPy's own starts is chance.
+    """
+    values = np.ascontiguousarray(values).ravel()
+    memory = np.empty(values.nbytes + 64, dtype=np.uint8)
+    start = -memory.ctypes.data % 64
+    line = memory[start : start + values.nbytes].view(values.dtype)
+    line[...] = values
+    return kind(line)
+
+
 def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
     """Display-encoded colour of Gaussians seen along unit vectors, 3DGS's real spherical harmonics (Kerbl et al. 2023).
 

@@ -28,6 +28,7 @@ from mitsplat.plugins.gaussian import (
     general_response,
     project_gaussian,
     rotation_axes,
+    wrapped,
 )
 from mitsplat.plugins.rays import View
 from mitsplat.quality import KERNELS, Quality
@@ -211,7 +212,7 @@ def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vi
         starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
         dr.scatter(marks, mi.UInt32(repeats.astype(np.uint32)), mi.UInt32(starts.astype(np.uint32)))
         owner = dr.cumsum(marks)
-    offsets = mi.Int32(shift.astype(np.int32))
+    offsets = wrapped(mi.Int32, shift.astype(np.int32))
     local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, offsets, owner))
     dr.eval(owner, local)
     return aligned(rows), owner, local

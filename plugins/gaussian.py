@@ -84,9 +84,7 @@ def aligned(values: np.ndarray) -> Any:
     """Device copy of an array. Wrapping NumPy's memory instead would switch Dr.Jit's packet loads off (unaligned)."""
     result = dr.empty(mi.Float, values.size)
     if values.size:
-        dr.scatter(
-            result, mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel()), dr.arange(mi.UInt32, values.size)
-        )
+        dr.scatter(result, wrapped(mi.Float, np.asarray(values, dtype=np.float32)), dr.arange(mi.UInt32, values.size))
         dr.eval(result)
     return result
 

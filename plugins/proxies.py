@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.plugins.gaussian import wrapped
 from mitsplat.surfels import CREASE_ANGLE, corner_normals
 
 NOISE_CREASE = 10.0
@@ -148,9 +149,9 @@ class _TraceScene:
         return cls(
             mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh, **others}),
             mi.ShapePtr(mesh),
-            mi.UInt32(instances.astype(np.uint32)),
+            wrapped(mi.UInt32, instances.astype(np.uint32)),
             positions,
-            mi.Float(np.concatenate(normals).ravel().astype(np.float32)),
+            wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
         )
 
 

@@ -13,7 +13,7 @@ from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
 from mitsplat.plugins.emitters import reference_irradiance
-from mitsplat.plugins.gaussian import Cloud, upload_cloud
+from mitsplat.plugins.gaussian import Cloud, upload_cloud, wrapped
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, trace
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
@@ -300,9 +300,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             placements,
             Proxies(occluders, visible),
             bool(visible),
-            mi.Bool(relit),
-            mi.Float(roughness),
-            mi.Float(specular),
+            wrapped(mi.Bool, relit),
+            wrapped(mi.Float, roughness),
+            wrapped(mi.Float, specular),
             self._surroundings(carriers),
         )
         return self._contents

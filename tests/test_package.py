@@ -70,5 +70,5 @@ def test_wheel_ships_package_and_plugins(tmp_path: Path) -> None:
     expected = {f"mitsplat/{file.name}" for file in (source / "mitsplat").glob("*.py")}
     expected |= {f"mitsplat/plugins/{file.name}" for file in (source / "plugins").glob("*.py")}
     assert expected <= names
-    assert {"mitsplat/plugins/splats.py", "mitsplat/plugins/splat_proxy.py", "mitsplat/cli.py"} <= expected
+    assert {"mitsplat/plugins/splats.py", "mitsplat/plugins/splat_proxy.py", "mitsplat/cli/__init__.py"} <= expected
     assert not any(name.startswith(("tests/", "plugins/", "scenes/", "benchmarks/")) for name in names)

@@ -1,0 +1,82 @@
+"""The command ``mitsplat``: arguments to calls, and errors in one sentence instead of a traceback.
+
+Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 3 something is missing on the machine,
+4 a result was written that misses a threshold, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from mitsplat import __version__
+from mitsplat.cli import assets, datasets
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+
+app = typer.Typer(
+    help="Labelled training images of settled objects, from Gaussian splats, physics and traced light.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+for _command in (
+    datasets.render,
+    datasets.chart,
+    datasets.audit,
+    datasets.report,
+    datasets.preview,
+    datasets.settle,
+    datasets.export,
+    assets.bake,
+    assets.fit,
+    assets.capture,
+    assets.board,
+    assets.mesh,
+    assets.asset,
+    datasets.schema,
+    datasets.doctor,
+):
+    app.command()(_command)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command line and exit.
+
+    Args:
+        args: Arguments; those of the process if None.
+    """
+    try:
+        app(args)
+    except InputError as error:
+        _fail(str(error))
+    except MissingResourceError as error:
+        _fail(str(error), status=3)
+    except PartialResultError as error:
+        _fail(str(error), status=4)
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mitsplat {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+def _fail(sentence: str, *, status: int = 2) -> None:
+    typer.echo(f"mitsplat: {sentence}", err=True)
+    sys.exit(status)

@@ -1,0 +1,276 @@
+"""Commands on scenes and datasets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from mitsplat.cli.options import progress_bar
+from mitsplat.errors import InputError
+
+# Commands import what they need themselves, so that help appears at once.
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
+DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset folder.")]
+FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, from 0.")]
+FrameSize = Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")]
+SceneSeed = Annotated[int | None, typer.Option(help="Decides everything that is random.")]
+Preset = Annotated[Literal["fast", "balanced", "exact"] | None, typer.Option(help="Rendering preset.")]
+
+
+def render(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a Mitsuba scene (.xml).")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Dataset folder (for .xml: picture); out/<name of SCENE> if absent."),
+    ] = None,
+    frames: Annotated[int | None, typer.Option("--frames", "-n", help="Only the first so many images.")] = None,
+    size: FrameSize = None,
+    seed: SceneSeed = None,
+    quality: Preset = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Choose the cheapest preset within this error (RMSE of encoded colours), as `chart` does."),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes that make images.")] = 1,
+    formats: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAMES", help="Label formats as in output.formats, separated by commas."),
+    ] = None,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite/--resume", help="Replace the dataset in the folder, or keep what is finished of it."),
+    ] = False,
+) -> None:
+    """Write the labelled dataset that SCENE describes.
+
+    Options replace what the file says. A Mitsuba scene (.xml) gives one picture.
+    """
+    overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
+    if out is None:
+        out = Path("out") / scene.stem
+    if scene.suffix == ".xml":
+        if overrides or frames is not None or tolerance is not None:
+            raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
+        from mitsplat.xml_scene import render_xml
+
+        typer.echo(f"picture: {render_xml(scene, out)}")
+        return
+    from mitsplat.dataset import write_dataset
+    from mitsplat.scene import load_scene
+
+    loaded = load_scene(scene, overrides=overrides)
+    if tolerance is not None:
+        if quality is not None:
+            raise InputError("--quality and --tolerance both choose the preset: give one of them")
+        from mitsplat.chart import choose_preset
+
+        with progress_bar() as progress:
+            best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
+        typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
+        loaded = load_scene(scene, overrides=overrides | {"quality": best.name})
+    with progress_bar() as progress:
+        summary = write_dataset(loaded, out, frames=frames, workers=workers, overwrite=overwrite, progress=progress)
+    images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
+    typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
+    typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
+    typer.echo(f"contact sheet: {summary.contact_sheet}")
+
+
+def chart(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a file of splats.")],
+    frames: Annotated[int, typer.Option("--frames", "-n", help="Images to compare, spread over the scene's.")] = 3,
+    size: FrameSize = None,
+    tolerance: Annotated[
+        float, typer.Option(help="Mark the cheapest preset within this error (RMSE of encoded colours).")
+    ] = 0.004,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Chart to write (.png); a .csv of the same name goes beside it.")
+    ] = Path("chart.png"),
+) -> None:
+    """Chart speed against accuracy for SCENE.
+
+    Every preset, and cheaper models of light, beside the preset exact. Times are those of this machine, now.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from mitsplat.chart import cheapest, draw_chart, measure_steps, write_csv
+
+    if out.suffix.lower() != ".png" or not out.parent.is_dir():
+        raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
+    with progress_bar() as progress:
+        rows = measure_steps(scene, frames=frames, overrides=_overrides(size=size), note=progress)
+    best = cheapest(rows, tolerance)
+    table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "SSIM", "mask IoU", "peak [GiB]")
+    for row in rows:
+        name = f"{row.name} *" if row == best else row.name
+        numbers = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.ssim:.4f}", f"{row.mask_iou:.4f}"
+        table.add_row(name, f"{row.seconds:.2f}", *numbers, f"{row.memory:.2f}")
+    Console(width=100).print(table)
+    typer.echo(f"* the cheapest preset within {tolerance:g}")
+    write_csv(rows, out.with_suffix(".csv"))
+    draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)
+    typer.echo(f"chart: {out}, {out.with_suffix('.csv')}")
+
+
+def audit(dataset: DatasetFolder) -> None:
+    """Re-check DATASET from its files alone.
+
+    Every violation is one line; with any, the exit status is 1.
+    """
+    from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, audit_dataset
+
+    found = audit_dataset(dataset)
+    for file, text in found.violations:
+        typer.echo(f"{file}: {text}")
+    typer.echo(f"{found.frames} frames, {found.instances} instances, {found.files} files")
+    typer.echo(f"not labelled: {_counts(found.dropped)}; marked: {_counts(found.marked)}")
+    typer.echo(f"polygons below an IoU of {POLYGON_IOU} (masks in parts, over {POLYGON_AREA} px): {found.low_polygons}")
+    typer.echo(f"violations: {len(found.violations)}")
+    raise typer.Exit(1 if found.violations else 0)
+
+
+def report(
+    dataset: DatasetFolder,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Page to write (.html); report.html in DATASET if absent.")
+    ] = None,
+) -> None:
+    """Write a page to look at DATASET by.
+
+    It is one HTML file that needs no network: samples with their labels, statistics, audit, origin.
+    """
+    from mitsplat.report import write_report
+
+    page, found = write_report(dataset, out)
+    typer.echo(f"report: {page} ({len(found.violations)} violations)")
+
+
+def preview(
+    scene: SceneFile,
+    frame: FrameIndex = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write (.png or .jpg).")] = Path("preview.png"),
+    size: FrameSize = None,
+    seed: SceneSeed = None,
+    quality: Preset = None,
+    layers: Annotated[
+        bool, typer.Option("--layers/--no-layers", help="Show ids, depth, light and highlight beside the picture.")
+    ] = True,
+) -> None:
+    """Render one frame of SCENE to a picture, with its layers side by side."""
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(f"--out must end in .png or .jpg (got {out})")
+    if not out.parent.is_dir():
+        raise InputError(f"--out must be in a folder that exists (got {out})")
+    from PIL import Image
+
+    from mitsplat.frame import render_frame
+    from mitsplat.scene import load_scene
+    from mitsplat.sheet import layer_sheet
+
+    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality))
+    rendered = render_frame(loaded, frame)
+    Image.fromarray(layer_sheet(rendered) if layers else rendered.image).save(out)
+    typer.echo(f"picture: {out}")
+
+
+def settle(
+    scene: SceneFile,
+    layouts: Annotated[int | None, typer.Option("--layouts", "-n", help="Only the first so many layouts.")] = None,
+    preview: Annotated[bool, typer.Option("--preview", help="Write the drop of the first layout as a GIF.")] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="GIF to write.")] = Path("settle.gif"),
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the GIF [px].")] = "480x270",
+    seed: SceneSeed = None,
+    workers: Annotated[int, typer.Option(help="Processes that settle layouts.")] = 1,
+) -> None:
+    """Settle the layouts of SCENE and print their rest certificates.
+
+    They are kept, so that rendering finds them settled.
+    """
+    if out.suffix.lower() != ".gif":
+        raise InputError(f"--out must end in .gif (got {out})")
+    if not out.parent.is_dir():
+        raise InputError(f"--out must be in a folder that exists (got {out})")
+    from rich.console import Console
+
+    from mitsplat.rest import certificate_table, write_preview
+    from mitsplat.scene import load_scene
+    from mitsplat.settle import settle_layouts
+
+    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed))
+    wanted = loaded.spec.output.layouts if layouts is None else layouts
+    if not 1 <= wanted <= loaded.spec.output.layouts:
+        raise InputError(
+            f"--layouts must be 1 to {loaded.spec.output.layouts}, the scene's output.layouts (got {wanted})"
+        )
+    with Console(stderr=True).status("settling") as status:
+        found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
+        settled = sorted(found, key=lambda layout: layout.index)
+    Console().print(certificate_table(settled))
+    if preview:
+        pictures = write_preview(loaded, settled[0], out)
+        typer.echo(f"drop: {out} ({pictures} pictures)")
+
+
+def export(
+    scene: SceneFile,
+    frame: FrameIndex = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Mitsuba scene to write (.xml).")] = Path("scene.xml"),
+) -> None:
+    """Write one frame of SCENE as a Mitsuba scene.
+
+    It can be edited, and rendered by `mitsplat render`.
+    """
+    from mitsplat.scene import load_scene
+    from mitsplat.xml_scene import export_xml
+
+    export_xml(load_scene(scene), frame, out)
+    typer.echo(f"scene: {out}")
+
+
+def schema() -> None:
+    """Print the JSON Schema of scene files, for editors."""
+    import json
+
+    from mitsplat.scene import scene_json_schema
+
+    typer.echo(json.dumps(scene_json_schema(), indent=2))
+
+
+def doctor() -> None:
+    """Check that this machine has what is needed.
+
+    Python, Mitsuba, LLVM, Warp and memory, and what to do about what is missing.
+    """
+    from mitsplat.doctor import examine
+
+    healthy = True
+    for finding in examine():
+        healthy &= finding.ok
+        typer.echo(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name}: {finding.text}")
+        if not finding.ok:
+            typer.echo(f"      to do: {finding.remedy}")
+    raise typer.Exit(0 if healthy else 1)
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in counts.items() if count) or "none"
+
+
+def _overrides(
+    *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
+) -> dict[str, Any]:
+    """The options that were given, by the scene file's keys."""
+    overrides: dict[str, Any] = {"seed": seed, "quality": quality}
+    if size is not None:
+        width, _, height = size.lower().partition("x")
+        if not (width.isdecimal() and height.isdecimal()):
+            raise InputError(f"--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got {size})")
+        overrides |= {"output.width": int(width), "output.height": int(height)}
+    if formats is not None:
+        overrides["output.formats"] = [name.strip() for name in formats.split(",")]
+    return {key: value for key, value in overrides.items() if value is not None}

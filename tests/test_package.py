@@ -67,7 +67,7 @@ def test_wheel_ships_package_and_plugins(tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("mitsplat-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    expected = {f"mitsplat/{file.name}" for file in (source / "mitsplat").glob("*.py")}
+    expected = {str(file.relative_to(source)) for file in (source / "mitsplat").rglob("*.py")}
     expected |= {f"mitsplat/plugins/{file.name}" for file in (source / "plugins").glob("*.py")}
     assert expected <= names
     assert {"mitsplat/plugins/splats.py", "mitsplat/plugins/splat_proxy.py", "mitsplat/cli/__init__.py"} <= expected

@@ -199,14 +199,9 @@ def _sum_shares(shares: Any, lists: TileLists) -> Any:
 
     They are added in a fixed order, so that every run gives the same bits, which additions by atomics do not.
     """
-    number = dr.empty(mi.UInt32, lists.pairs)
-    dr.scatter(number, lists.entries, lists.slots, mode=dr.ReduceMode.Permute)
-    slot, last = dr.arange(mi.UInt32, lists.pairs), dr.opaque(mi.UInt32, lists.pairs - 1)
-    start, stop = dr.zeros(mi.UInt32, lists.visible), dr.zeros(mi.UInt32, lists.visible)
-    begins = (slot == 0) | (number != dr.gather(mi.UInt32, number, dr.maximum(slot, 1) - 1))
-    ends = (slot == last) | (number != dr.gather(mi.UInt32, number, dr.minimum(slot + 1, last)))
-    dr.scatter(start, slot * TILE, number, begins)
-    dr.scatter(stop, (slot + 1) * TILE, number, ends)
+    record = dr.arange(mi.UInt32, lists.visible)
+    start = dr.gather(mi.UInt32, lists.first, record) * TILE
+    stop = dr.gather(mi.UInt32, lists.first, record + 1) * TILE
 
     def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
         share = dr.gather(mi.ArrayXf, shares, i, shape=(RECORD, dr.width(i)))
@@ -215,6 +210,6 @@ def _sum_shares(shares: Any, lists: TileLists) -> Any:
     zeros = [mi.Float(0) for _ in range(RECORD)]
     _, sums = dr.while_loop((start, zeros), lambda i, sums: i < stop, add, label="sum shares")
     result = dr.empty(mi.Float, RECORD * lists.visible)
-    dr.scatter(result, mi.ArrayXf(sums), dr.arange(mi.UInt32, lists.visible))
+    dr.scatter(result, mi.ArrayXf(sums), record)
     dr.eval(result)
     return result

@@ -14,7 +14,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.errors import MissingResourceError
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import CloudSet, CrowdedError, Placement, TileLists, bin_gaussians
@@ -65,13 +64,24 @@ a third one evicts the lighter if it weighs more (Misra and Gries' frequent-elem
 T, RED, GREEN, BLUE, SUM_Z, HALF_Z, W_ENV, ID_1, W_1, ID_2, W_2 = range(11)
 
 
-def _new_pixel() -> Pixel:
-    return [mi.Float(1.0), *(mi.Float(0.0) for _ in range(10))]
+def _new_pixel(several: bool) -> Pixel:
+    """A ray that has met nothing yet; weights of instances are kept only where there are ``several``."""
+    return [mi.Float(1.0), *(mi.Float(0.0) for _ in range(10 if several else HALF_Z))]
 
 
 def _blend(pixel: Pixel, weight: Any, transmittance: Any, colour: list[Any], z: Any, instance: Any) -> Pixel:
     """The pixel after one more Gaussian in front-to-back order; a weight of 0 changes nothing."""
     half = dr.select((pixel[T] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z])
+    seen = [
+        transmittance,
+        dr.fma(weight, colour[0], pixel[RED]),
+        dr.fma(weight, colour[1], pixel[GREEN]),
+        dr.fma(weight, colour[2], pixel[BLUE]),
+        dr.fma(weight, z, pixel[SUM_Z]),
+        half,
+    ]
+    if len(pixel) == len(seen):
+        return seen
     first, second = instance == pixel[ID_1], instance == pixel[ID_2]
     environment = instance == 0
     other = ~(first | second | environment)
@@ -81,12 +91,7 @@ def _blend(pixel: Pixel, weight: Any, transmittance: Any, colour: list[Any], z: 
     first &= ~environment
     second &= ~environment
     return [
-        transmittance,
-        dr.fma(weight, colour[0], pixel[RED]),
-        dr.fma(weight, colour[1], pixel[GREEN]),
-        dr.fma(weight, colour[2], pixel[BLUE]),
-        dr.fma(weight, z, pixel[SUM_Z]),
-        half,
+        *seen,
         dr.select(environment, pixel[W_ENV] + weight, pixel[W_ENV]),
         dr.select(into_1, instance, pixel[ID_1]),
         dr.select(into_1, weight, dr.select(first, pixel[W_1] + weight, pixel[W_1])),
@@ -169,15 +174,13 @@ def trace(
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
 
     Raises:
-        MissingResourceError: If even one row of tiles is too crowded.
+        CrowdedError: If even one row of tiles is too crowded.
     """
     try:
         return march(bin_gaussians(clouds, placements, view, quality), view, quality, z_max=z_max)
     except CrowdedError:
         if view.tiles_y == 1:
-            raise MissingResourceError(
-                "the splats cover too much of the image for the memory: render a smaller image, or split the splats"
-            ) from None
+            raise
     middle = view.tiles_y // 2 * TILE
     parts = []
     for start, stop in ((0, middle), (middle, view.height)):
@@ -214,7 +217,7 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
         us, vs = lanes.slopes(dx, dy)
         respond = partial(_respond, lists=lists, us=us, vs=vs, shared_column=not view.distortion, cap=cap)
         pixels = walk(lists, lanes.start, lanes.stop, respond, far, view.near_plane, cut, end)
-        passes.append(_collect(pixels, lanes.pixel, lanes.inside, view.width * view.height))
+        passes.append(_collect(pixels, lanes, lists.instance))
         if n > 1:
             dr.eval(passes[-1])
     return passes[0] if n == 1 else _average(passes)
@@ -271,7 +274,10 @@ def _walk_in_tile_order(
         return i + 1, blended
 
     _, pixels = dr.while_loop(
-        (start, [_new_pixel() for _ in far]), lambda i, pixels: (i < stop) & alive(pixels), body, label="march"
+        (start, [_new_pixel(lists.instance is None) for _ in far]),
+        lambda i, pixels: (i < stop) & alive(pixels),
+        body,
+        label="march",
     )
     return pixels
 
@@ -365,7 +371,7 @@ def _walk_in_ray_order(
         return blended, new_last, next_begin, dr.maximum(seen, reached), active & unfinished
 
     state = (
-        [_new_pixel() for _ in far],
+        [_new_pixel(lists.instance is None) for _ in far],
         [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in far],
         mi.UInt32(start),
         mi.UInt32(start),
@@ -379,16 +385,22 @@ _Slots = list[tuple[Any, Any, Any]]
 """Peaks in order of depth: depth, opacity and entry."""
 
 
-def _collect(pixels: list[Pixel], rays: list[Any], inside: list[Any], count: int) -> Image:
-    """Scatter the lanes' pixels to row-major arrays."""
+def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None) -> Image:
+    """Scatter the lanes' pixels to row-major arrays; ``only`` is the id of all Gaussians if there is but one."""
+    count = lanes.view.width * lanes.view.height
+    everything = None if only is None else dr.opaque(mi.Float, only)
 
     def image(dtype: Any, values: list[Any]) -> Any:
         target = dr.empty(dtype, count)
-        for value, ray, mask in zip(values, rays, inside, strict=True):
-            dr.scatter(target, dtype(value), ray, mask, mode=dr.ReduceMode.Permute)
+        for value, number, mask in zip(values, lanes.pixel, lanes.inside, strict=True):
+            dr.scatter(target, dtype(value), number, mask, mode=dr.ReduceMode.Permute)
         return target
 
     def winner(pixel: Pixel) -> tuple[Any, Any]:
+        if everything is not None:
+            alpha = 1.0 - pixel[T]
+            shown = (everything != 0) & (alpha > pixel[T])
+            return dr.select(shown, everything, 0.0), dr.select(shown | (everything == 0), alpha, 0.0)
         second = pixel[W_2] > pixel[W_1]
         weight = dr.select(second, pixel[W_2], pixel[W_1])
         environment = pixel[W_ENV] + pixel[T] >= weight  # what is left of the ray shows what lies behind

@@ -216,18 +216,20 @@ class View:
         x0, x1, y0, y1 = self._clip_tiles(lo_x, hi_x, lo_y, hi_y, margin)
         return x0, dr.select(empty, x0, x1), y0, y1
 
+    def tile_columns(self, u0: Any, u1: Any) -> tuple[Any, Any]:
+        """Half-open range of columns of tiles that a range of slopes meets in an undistorted view."""
+        o = self._opaque
+        return self._tile_range(u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], self.tiles_x)
+
     def _clip_tiles(self, x0: Any, x1: Any, y0: Any, y1: Any, margin: Any) -> tuple[Any, Any, Any, Any]:
-        # A pixel is sampled at its centre: a box that ends before the first centre or starts after the last one is out.
+        columns = self._tile_range(x0 - margin, x1 + margin, self.tiles_x)
+        return *columns, *self._tile_range(y0 - margin, y1 + margin, self.tiles_y)
+
+    def _tile_range(self, low: Any, high: Any, tiles: int) -> tuple[Any, Any]:
+        # A pixel is sampled at its centre: what ends before the first centre or starts after the last one is out.
         half = 0.5 if self.samples == 1 else 0.0
-        size = float(TILE)
-
-        def lower(a: Any, tiles: int) -> Any:
-            return mi.UInt32(dr.clip(dr.floor((a - margin + half) / size), 0.0, float(tiles)))
-
-        def upper(a: Any, tiles: int) -> Any:
-            return mi.UInt32(dr.clip(dr.floor((a + margin - half) / size) + 1.0, 0.0, float(tiles)))
-
-        return lower(x0, self.tiles_x), upper(x1, self.tiles_x), lower(y0, self.tiles_y), upper(y1, self.tiles_y)
+        first, last = dr.floor((low + half) / TILE), dr.floor((high - half) / TILE) + 1.0
+        return mi.UInt32(dr.clip(first, 0.0, float(tiles))), mi.UInt32(dr.clip(last, 0.0, float(tiles)))
 
     def tile_slopes(self, tile: Any) -> tuple[Any, Any, Any, Any]:
         """Box (u_min, u_max, v_min, v_max) of the slopes of a tile's rays."""

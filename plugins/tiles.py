@@ -1,15 +1,16 @@
 """From clouds of Gaussians to depth-sorted lists per image tile, all on the device.
 
-1. *Cull and bound* every Gaussian of every placement (one kernel): exact screen box of its cut-off ellipsoid.
-2. *Sort* the visible ones by depth; compute view records in that order (one kernel).
-3. *Pair* each with the tiles that its cut-off ellipse really meets, and sort the pairs by tile and by depth there. For
-   the order per tile that is the peak's depth along the tile's ray nearest to the Gaussian's centre; for the order per
-   ray it is a lower bound over all rays of the tile, which says when a ray has seen all that can come first.
+1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
+2. *Project* what is left to view records (one kernel).
+3. *Pair* each with the tiles that its cut-off ellipse really meets: the ellipse cuts a span out of every row of tiles.
+4. *Sort* the pairs by tile and by depth there. For the order per tile that is the peak's depth along the tile's ray
+   nearest to the Gaussian's centre; for the order per ray it is a lower bound over all rays of the tile, which says
+   when a ray has seen all that can come first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.errors import MissingResourceError
 from mitsplat.plugins.gaussian import (
     LOG2_E_HALF,
     RECORD,
@@ -24,6 +26,7 @@ from mitsplat.plugins.gaussian import (
     aligned,
     conic_touches_rectangle,
     ellipse_bounds,
+    ellipse_span,
     evaluate_sh,
     general_response,
     project_gaussian,
@@ -36,9 +39,6 @@ from mitsplat.quality import KERNELS, Quality
 PLACEMENT = 32
 """Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
 cloud's frame as a sum of two floats (3 + 3), padding. Two floats keep the difference exact far from the origin."""
-
-BOUNDS = 12
-"""Floats per visible Gaussian for pairing: u0, v0, cut-off conic about them, least depth of the ellipsoid, padding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +95,21 @@ _ADJOINT = dr.ReduceMode.NoConflicts
 """How gradients are added to a cloud: they are asked for where it is placed once, so each Gaussian has but one sum. The
 default would write the number of Gaussians into the kernels, and compile them anew whenever it changes."""
 
-CANDIDATES_MAX = 1 << 26
-"""Most pairs of a Gaussian and a tile in its box that are held at once, about 40 bytes each."""
+PAIRS_MAX = 1 << 26
+"""Most pairs of a Gaussian and a tile that are held at once, about 40 bytes each."""
+
+DEPTH_BITS = 16
+"""Bits of a depth that pairs are sorted by: 11 of its mantissa tell depths apart that differ by 0.05 %, and 5 of its
+exponent those up to 2^32 times the near plane. Equals stay in the order of the clouds."""
 
 
-_OCTAVES = 20.0
-"""Depths from the near plane to a million times as far are told apart in the order per tile."""
+class CrowdedError(MissingResourceError):
+    """A view has more pairs than :data:`PAIRS_MAX`: render a part of it."""
 
-
-class CrowdedError(Exception):
-    """A view has more pairs than :data:`CANDIDATES_MAX`: render a part of it."""
+    def __init__(self) -> None:
+        super().__init__(
+            "the splats cover too much of the image for the memory: render a smaller image, or split the splats"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,25 +117,29 @@ class TileLists:
     """Depth-sorted Gaussians of every tile.
 
     Attributes:
-        records: View records in depth order, see :data:`mitsplat.plugins.gaussian.RECORD`.
+        records: View records, see :data:`mitsplat.plugins.gaussian.RECORD`.
         near: Coefficients of :func:`mitsplat.plugins.gaussian.general_response`, 16 floats each, of the Gaussians that
             reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
         entries: Record numbers, tile after tile.
         slots: Place of every entry if they were sorted by record number instead.
+        first: First of those places of each record, and the number of entries.
         nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
         visible, pairs: Number of records and of entries.
+        instance: Id of all of them, or None if they have several.
     """
 
     records: Any
     near: Any | None
     entries: Any
     slots: Any
+    first: Any
     nearest: Any
     start: Any
     stop: Any
     visible: int
     pairs: int
+    instance: int | None = None
 
 
 def bin_gaussians(
@@ -155,30 +164,41 @@ def bin_gaussians(
         return _empty(tiles)
     source = _Source(clouds, table, view, quality, at_camera)
 
-    depth, visible = source.cull(owner, local)
+    visible, near = source.cull(owner, local)
     index = dr.compress(visible)
     count = dr.width(index)
     if count == 0:
         return _empty(tiles)
-    index = dr.gather(mi.UInt32, index, dr.argsort(dr.detach(dr.gather(mi.Float, depth, index))))
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
-    dr.eval(owner, local)
+    near = dr.gather(mi.Bool, near, index)
+    dr.eval(owner, local, near)
 
-    records, near, bounds, box, candidates = source.records(owner, local)
-    # As floats, because a sum of integers would wrap.
-    if dr.sum(mi.Float(candidates))[0] > CANDIDATES_MAX:
-        raise CrowdedError
-    entries, slots, nearest, start, stop = _pair(
-        dr.detach(records), bounds, box, candidates, view, tiles, quality.order
-    )
-    return TileLists(records, near, entries, slots, nearest, start, stop, count, dr.width(entries))
+    records, near_rows, least, box = source.records(owner, local, near)
+    pairs = _pair(dr.detach(records), least, box, view, quality)
+    if pairs is None:
+        return _empty(tiles, records)
+    slots = _sorted(pairs.level, DEPTH_BITS)
+    slots = _sorted(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
+    entries = dr.gather(mi.UInt32, pairs.record, slots)
+    nearest = dr.zeros(mi.Float, 1)
+    if quality.order == "ray":
+        nearest = _depth_of_level(dr.gather(mi.UInt32, pairs.level, slots), view)
+    begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
+    start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
+    dr.eval(entries, nearest, start, stop)
+    ids = {placement.instance for placement in placements}
+    only = ids.pop() if len(ids) == 1 else None
+    numbers = count, dr.width(entries), only
+    return TileLists(records, near_rows, entries, slots, pairs.first, nearest, start, stop, *numbers)
 
 
-def _empty(tiles: int) -> TileLists:
+def _empty(tiles: int, records: Any | None = None) -> TileLists:
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
     entry = dr.zeros(mi.UInt32, 1)
-    return TileLists(dr.zeros(mi.Float, RECORD), None, entry, entry, dr.zeros(mi.Float, 1), zeros, zeros, 0, 0)
+    visible = 0 if records is None else dr.width(records) // RECORD
+    records = dr.zeros(mi.Float, RECORD) if records is None else records
+    return TileLists(records, None, entry, entry, entry, dr.zeros(mi.Float, 1), zeros, zeros, visible, 0)
 
 
 def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
@@ -290,33 +310,27 @@ class _Source:
         return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
     def cull(self, owner: Any, local: Any) -> tuple[Any, Any]:
+        """Whether Gaussians are in view, and whether they reach the camera's plane."""
         g = self.load(owner, local)
-        response, _, _, _, visible, box, _ = self.bounds(g)
+        _, _, _, near, visible, box, _ = self.bounds(g)
         x0, x1, y0, y1 = self.view.tile_box(*box)
-        visible &= (x1 > x0) & (y1 > y0)
-        depth, visible = dr.detach(response.depth), dr.detach(visible)
-        # Depth first as the sort key; Gaussians behind the camera that still reach in front of it come first.
-        depth = dr.maximum(depth, 0.0)
-        dr.eval(depth, visible)
-        return depth, visible
+        visible, near = dr.detach(visible & (x1 > x0) & (y1 > y0)), dr.detach(near)
+        dr.eval(visible, near)
+        return visible, near
 
-    def records(self, owner: Any, local: Any) -> tuple[Any, ...]:
+    def records(self, owner: Any, local: Any, near: Any) -> tuple[Any, Any, Any, Any]:
+        """View records, rows of those at the camera, least depths of the ellipsoids, and boxes of tiles."""
         count = dr.width(local)
         g = self.load(owner, local)
-        response, opacity, k2, near, _, box, least = self.bounds(g)
+        response, opacity, _, _, _, box, least = self.bounds(g)
         colour = self.colour(g["mean"], local)
         order = dr.arange(mi.UInt32, count)
         near_rows = None
         near_index = dr.compress(near)
         near_number = dr.zeros(mi.UInt32, count)
-        conic = response.cutoff(k2)
-        u0, v0 = response.u0, response.v0
         if dr.width(near_index) > 0:
-            near_rows, near_cut = self.near_rows(near_index, owner, local)
+            near_rows = self.near_rows(near_index, owner, local)
             dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
-            u0, v0 = dr.select(near, 0.0, u0), dr.select(near, 0.0, v0)
-            row = dr.gather(mi.ArrayXf, near_cut, near_number, near, shape=(8, count))
-            conic = tuple(dr.select(near, row[i], c) for i, c in enumerate(conic))
         scaled = LOG2_E_HALF
         record = [
             dr.select(near, mi.Float(near_number), response.u0),
@@ -334,31 +348,25 @@ class _Source:
             response.i,
             g["instance"],
         ]
-        records, bounds = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, BOUNDS * count)
+        records, tile_box = dr.empty(mi.Float, RECORD * count), dr.empty(mi.UInt32, 4 * count)
         dr.scatter(records, mi.ArrayXf(record), order)
-        dr.scatter(bounds, mi.ArrayXf([dr.detach(v) for v in (u0, v0, *conic, least, *[mi.Float(0)] * 3)]), order)
         x0, x1, y0, y1 = self.view.tile_box(*(dr.detach(side) for side in box))
-        candidates = (x1 - x0) * (y1 - y0)
-        tile_box = dr.empty(mi.UInt32, 4 * count)
-        dr.scatter(tile_box, mi.ArrayXu([x0, y0, x1 - x0, y1 - y0]), order)
-        dr.eval(records, bounds, tile_box, candidates)
-        return records, near_rows, bounds, tile_box, candidates
+        dr.scatter(tile_box, mi.ArrayXu([x0, x1, y0, y1]), order)
+        least = dr.detach(least)
+        dr.eval(records, tile_box, least)
+        return records, near_rows, least, tile_box
 
-    def near_rows(self, index: Any, owner: Any, local: Any) -> tuple[Any, Any]:
-        """General responses of Gaussians at the camera's plane, and their cut-off conics padded to 8 floats."""
+    def near_rows(self, index: Any, owner: Any, local: Any) -> Any:
+        """General responses of Gaussians at the camera's plane."""
         count = dr.width(index)
         g = self.load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
-        k2 = 2 * dr.log(g.pop("opacity") / self.cut)
-        g.pop("instance")
-        c = [dr.detach(v) for v in general_response(**g)]
-        k2 = dr.detach(k2)
-        rows, cuts = dr.empty(mi.Float, RECORD * count), dr.empty(mi.Float, 8 * count)
-        order = dr.arange(mi.UInt32, count)
-        zero = dr.zeros(mi.Float, count)
-        dr.scatter(rows, mi.ArrayXf([*[x * LOG2_E_HALF for x in c[:6]], *c[6:], zero]), order)
-        dr.scatter(cuts, mi.ArrayXf([*[n - k2 * d for n, d in zip(c[:6], c[6:12], strict=True)], zero, zero]), order)
-        dr.eval(rows, cuts)
-        return rows, cuts
+        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
+        c = [dr.detach(v) for v in general_response(**shape)]
+        rows = dr.empty(mi.Float, RECORD * count)
+        row = [*[x * LOG2_E_HALF for x in c[:6]], *c[6:], mi.Float(0)]
+        dr.scatter(rows, mi.ArrayXf(row), dr.arange(mi.UInt32, count))
+        dr.eval(rows)
+        return rows
 
     def colour(self, mean: Any, local: Any) -> list[Any]:
         clouds = self.clouds
@@ -375,70 +383,164 @@ class _Source:
         return evaluate_sh(direction, coefficient, bands)
 
 
-def _pair(
-    records: Any, bounds: Any, box: Any, candidates: Any, view: View, tiles: int, order: str
-) -> tuple[Any, Any, Any, Any, Any]:
-    """Sorted (tile, Gaussian) pairs: record number, slot and least depth per entry, and each tile's range."""
-    count = dr.width(candidates)
-    offset = dr.prefix_sum(candidates)
-    total = int((dr.gather(mi.UInt32, offset, count - 1) + dr.gather(mi.UInt32, candidates, count - 1))[0])
-    marks = dr.zeros(mi.UInt32, total)
-    dr.scatter(marks, mi.UInt32(1), offset, offset > 0)
-    rank = dr.cumsum(marks)
-    cell = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, offset, rank)
-    x0, y0, width, _ = dr.gather(mi.ArrayXu, box, rank, shape=(4, total))
-    # Lanes past the end of the arrays compute too, on zeros: an integer division by zero would end the process.
-    row = cell // dr.maximum(width, 1)
-    tile = (y0 + row) * view.tiles_x + x0 + (cell - row * width)
-    u0, v0, *conic, _, _, _, _ = dr.gather(mi.ArrayXf, bounds, rank, shape=(BOUNDS, total))
-    lo_u, hi_u, lo_v, hi_v = view.tile_slopes(tile)
-    meets = conic_touches_rectangle(tuple(conic), lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
-    dr.eval(tile, rank, meets)
-    kept = dr.compress(meets)
-    pairs = dr.width(kept)
-    start, stop = dr.zeros(mi.UInt32, tiles), dr.zeros(mi.UInt32, tiles)
-    if pairs == 0:
-        dr.eval(start, stop)
-        entry = dr.zeros(mi.UInt32, 1)
-        return entry, entry, dr.zeros(mi.Float, 1), start, stop
-    tile, rank = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, rank, kept)
-    record = dr.gather(mi.ArrayXf, records, rank, shape=(RECORD, pairs))
-    if order == "ray":
-        ellipsoid = dr.gather(mi.Float, bounds, rank * BOUNDS + 8)
-        depth = _least_depth(record, ellipsoid, view.tile_slopes(tile))
-        dr.eval(tile, rank, depth)
-        by_depth = dr.argsort(depth)
-        by_tile = dr.argsort(dr.gather(mi.UInt32, tile, by_depth))
-        sorted_pairs = dr.gather(mi.UInt32, by_depth, by_tile)
-        nearest = dr.gather(mi.Float, depth, sorted_pairs)
-    else:
-        depth = _depth_near_centre(record, view.tile_slopes(tile))
-        key = _tile_key(tile, depth / view.near_plane, tiles)
-        dr.eval(tile, rank, key)
-        sorted_pairs = dr.argsort(key)
-        nearest = dr.zeros(mi.Float, 1)
-    tile, entries = dr.gather(mi.UInt32, tile, sorted_pairs), dr.gather(mi.UInt32, rank, sorted_pairs)
-    dr.eval(tile, entries, nearest)
-    i = dr.arange(mi.UInt32, pairs)
-    last = dr.opaque(mi.UInt32, pairs - 1)
-    first_of_tile = (i == 0) | (tile != dr.gather(mi.UInt32, tile, dr.maximum(i, 1) - 1))
-    last_of_tile = (i == last) | (tile != dr.gather(mi.UInt32, tile, dr.minimum(i + 1, last)))
-    dr.scatter(start, i, tile, first_of_tile)
-    dr.scatter(stop, i + 1, tile, last_of_tile)
-    dr.eval(start, stop)
-    return entries, sorted_pairs, nearest, start, stop
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs of a record and a tile, record after record: record, tile, level of depth; and where each record starts."""
+
+    record: Any
+    tile: Any
+    level: Any
+    first: Any
 
 
-def _tile_key(tile: Any, depth: Any, tiles: int) -> Any:
-    """Sort key of a tile and, in the bits that are left, the logarithm of a depth in units of the near plane's.
+def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _Pairs | None:
+    """Pairs of every record with the tiles it meets, or None if there are none.
 
-    In 1280 x 720 pixels that tells depths apart that differ by 0.02 %; what is nearer together stays in the order of
-    the centres, because the sort is stable. One sort takes half the time of two.
+    Raises:
+        CrowdedError: If there are more than :data:`PAIRS_MAX`.
     """
-    bits = min(24, 32 - (tiles - 1).bit_length())  # whole numbers that a float can hold
-    step = float((1 << bits) - 1) / _OCTAVES
-    level = dr.clip(dr.log2(dr.maximum(depth, 1.0)) * dr.opaque(mi.Float, step), 0.0, float((1 << bits) - 1))
-    return tile * dr.opaque(mi.UInt32, 1 << bits) + mi.UInt32(level)
+    count = dr.width(least)
+    order = dr.arange(mi.UInt32, count)
+    x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
+    row_of, rows = _ranges(dr.select(y1 > y0, y1 - y0, 0))
+    if rows == 0:
+        return None
+    # Rows first: one lane finds the spans of one record, and then one lane fills one span.
+    record = dr.gather(mi.ArrayXf, records, order, shape=(RECORD, count))
+    cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
+    owner, first_tile = dr.empty(mi.UInt32, rows), dr.empty(mi.UInt32, rows)
+    length = dr.empty(mi.UInt32, rows)
+    span_of = _spans(record, cut, x0, x1, view)
+
+    def one_row(y: Any) -> tuple[Any]:
+        lo, hi = span_of(y)
+        row = row_of + (y - y0)
+        dr.scatter(owner, order, row, mode=dr.ReduceMode.Permute)
+        dr.scatter(first_tile, y * view.tiles_x + lo, row, mode=dr.ReduceMode.Permute)
+        dr.scatter(length, dr.select(hi > lo, hi - lo, 0), row, mode=dr.ReduceMode.Permute)
+        return (y + 1,)
+
+    dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
+    dr.eval(owner, first_tile, length)
+    pair_of, pairs = _ranges(length)
+    if pairs == 0:
+        return None
+    record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
+    ellipsoid = dr.gather(mi.Float, least, owner)
+    number, tile_of, level_of = (dr.empty(mi.UInt32, pairs) for _ in range(3))
+    first = dr.empty(mi.UInt32, count + 1)
+
+    def one_tile(k: Any) -> tuple[Any]:
+        tile, pair = first_tile + k, pair_of + k
+        slopes = view.tile_slopes(tile)
+        if quality.order == "ray":
+            depth = _least_depth(record, ellipsoid, slopes)
+        else:
+            depth = _depth_near_centre(record, slopes)
+        for target, value in ((number, owner), (tile_of, tile), (level_of, _level(depth, view))):
+            dr.scatter(target, value, pair, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, rows),), lambda k: k < length, one_tile, label="pairs")
+    end, inside = dr.opaque(mi.UInt32, pairs), row_of < dr.opaque(mi.UInt32, rows)
+    dr.scatter(first, dr.select(inside, dr.gather(mi.UInt32, pair_of, row_of, inside), end), order)
+    dr.scatter(first, end, dr.opaque(mi.UInt32, count))
+    dr.eval(number, tile_of, level_of, first)
+    return _Pairs(number, tile_of, level_of, first)
+
+
+def _ranges(sizes: Any) -> tuple[Any, int]:
+    """Where each of consecutive ranges begins, and their whole size.
+
+    Raises:
+        CrowdedError: If that is more than :data:`PAIRS_MAX`.
+    """
+    # As floats, because a sum of integers would wrap.
+    if dr.sum(mi.Float(sizes))[0] > PAIRS_MAX:
+        raise CrowdedError
+    begin, last = dr.prefix_sum(sizes), dr.width(sizes) - 1
+    return begin, int((dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last))[0])
+
+
+def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any], tuple[Any, Any]]:
+    """Function from a row of tiles to the half-open range of its tiles that a record's cut-off ellipse meets.
+
+    Gaussians at the camera's plane take their whole box. Under lens distortion, rows are no bands of slopes: the tiles
+    of the box are tried one by one.
+    """
+    u0, v0, a, b2, c, opacity, _, _, _, _, e, f, g, h, i, _ = record
+    k2 = opacity - cut
+    conic = a - k2 * g, b2 - k2 * h, c - k2 * i, -k2 * e, -k2 * f, -k2
+    whole = a < 0
+
+    def straight(y: Any) -> tuple[Any, Any]:
+        _, _, lo_v, hi_v = view.tile_slopes(y * view.tiles_x)
+        lo_u, hi_u, meets = ellipse_span(conic, lo_v - v0, hi_v - v0)
+        lo, hi = view.tile_columns(u0 + lo_u, u0 + hi_u)
+        lo, hi = dr.maximum(lo, x0), dr.minimum(dr.select(meets, hi, 0), x1)
+        return dr.select(whole, x0, lo), dr.select(whole, x1, hi)
+
+    def distorted(y: Any) -> tuple[Any, Any]:
+        def one_tile(x: Any, lo: Any, hi: Any) -> tuple[Any, Any, Any]:
+            lo_u, hi_u, lo_v, hi_v = view.tile_slopes(y * view.tiles_x + x)
+            meets = whole | conic_touches_rectangle(conic, lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
+            return x + 1, dr.select(meets, dr.minimum(lo, x), lo), dr.select(meets, x + 1, hi)
+
+        _, lo, hi = dr.while_loop(
+            (mi.UInt32(x0), mi.UInt32(x1), mi.UInt32(x0)), lambda x, lo, hi: x < x1, one_tile, label="tiles of a row"
+        )
+        return lo, hi
+
+    return distorted if view.distortion else straight
+
+
+def _sorted(key: Any, bits: int, order: Any | None = None) -> Any:
+    """Stable order of keys of so many bits: positions in ``key``, which is taken in ``order`` if that is given.
+
+    A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.
+    """
+    count = dr.width(key)
+    radix = 16 if dr.backend_v(key) == dr.JitBackend.LLVM else 8
+    passes = -(-bits // radix)
+    width = -(-bits // passes)
+    for shift in range(0, bits, width):
+        digit = (key if order is None else dr.gather(mi.UInt32, key, order)) >> shift & ((1 << width) - 1)
+        dr.eval(digit)
+        permutation = dr.detail.block_mkperm(digit, count, 1 << width)
+        order = permutation if order is None else dr.gather(mi.UInt32, order, permutation)
+        dr.eval(order)
+    return order
+
+
+def _first_entries(tile: Any, order: Any, tiles: int) -> Any:
+    """Number of the first entry of every tile, and of all entries, by bisection."""
+    wanted = dr.arange(mi.UInt32, tiles + 1)
+    pairs = dr.opaque(mi.UInt32, dr.width(order))
+
+    def halve(low: Any, high: Any) -> tuple[Any, Any]:
+        middle = (low + high) // 2
+        before = dr.gather(mi.UInt32, tile, dr.gather(mi.UInt32, order, middle, low < high), low < high) < wanted
+        return dr.select(before, middle + 1, low), dr.select(before, high, middle)
+
+    state = dr.zeros(mi.UInt32, tiles + 1), pairs + dr.zeros(mi.UInt32, tiles + 1)
+    first, _ = dr.while_loop(state, lambda low, high: low < high, halve, label="first entries")
+    dr.eval(first)
+    return first
+
+
+def _level(depth: Any, view: View) -> Any:
+    """Sort key of a depth: the leading bits of its ratio to the near plane, which grow with it."""
+    ratio = dr.clip(depth / view.near_plane, 1.0, 0.9999 * 2.0**32)
+    return (dr.reinterpret_array(mi.UInt32, ratio) - _BITS_OF_1) >> (23 + 5 - DEPTH_BITS)
+
+
+_BITS_OF_1 = 0x3F800000
+
+
+def _depth_of_level(level: Any, view: View) -> Any:
+    """Least depth that has a level; what is nearer than the near plane has level 0."""
+    ratio = dr.reinterpret_array(mi.Float, (level << (23 + 5 - DEPTH_BITS)) + _BITS_OF_1)
+    return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
 
 def _depth_near_centre(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:

@@ -455,11 +455,14 @@ def _ranges(sizes: Any) -> tuple[Any, int]:
     Raises:
         CrowdedError: If that is more than :data:`PAIRS_MAX`.
     """
-    # As floats, because a sum of integers would wrap.
-    if dr.sum(mi.Float(sizes))[0] > PAIRS_MAX:
-        raise CrowdedError
     begin, last = dr.prefix_sum(sizes), dr.width(sizes) - 1
-    return begin, int((dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last))[0])
+    whole = dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last)
+    # Added as floats too, because a sum of integers would wrap.
+    rough = mi.UInt32(dr.minimum(dr.sum(mi.Float(sizes)), 2.0 * PAIRS_MAX))
+    total, rough = np.array(dr.concat([whole, rough])).tolist()
+    if rough > PAIRS_MAX:
+        raise CrowdedError
+    return begin, total
 
 
 def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any], tuple[Any, Any]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 FloatArray = npt.NDArray[np.float64]
+
+Lens = Literal["opencv", "fisheye"]
+"""OpenCV's camera models: rational with tangential distortion, or fisheye."""
 
 FISHEYE_MAX = float(np.radians(85.0))
 """Widest angle to the optical axis that a fisheye may show [rad]: rays are held as slopes, which grow beyond bounds."""
@@ -33,11 +36,13 @@ class Camera:
             ``k1, k2, k3, k4``.
         near: Nearest depth at which anything is seen [m].
         lens: ``opencv``, or ``fisheye`` for OpenCV's fisheye model (Kannala and Brandt 2006).
+        aperture_radius: Of a thin lens [m]; 0 for a pinhole, which sees everything sharp.
+        focus_distance: Depth along z that a thin lens sees sharp [m].
 
     Raises:
         ValueError: If a size is below 1, a focal length is not positive, the pose is not rigid, or the number of
             distortion coefficients is not 0, 4, 5 or 8 (of a fisheye 4), or if a fisheye shows more than 85 degrees to
-            any side of its axis.
+            any side of its axis, or if the aperture is negative or the focus not beyond ``near``.
     """
 
     width: int
@@ -49,7 +54,9 @@ class Camera:
     world_from_camera: FloatArray
     distortion: tuple[float, ...] = ()
     near: float = 0.01
-    lens: Literal["opencv", "fisheye"] = "opencv"
+    lens: Lens = "opencv"
+    aperture_radius: float = 0.0
+    focus_distance: float = 1.0
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -58,6 +65,10 @@ class Camera:
             raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
         if not self.near > 0:
             raise ValueError(f"near must be > 0 (got {self.near})")
+        if not 0 <= self.aperture_radius < np.inf:
+            raise ValueError(f"aperture_radius must be finite and >= 0 (got {self.aperture_radius})")
+        if not self.near < self.focus_distance < np.inf:
+            raise ValueError(f"focus_distance must be finite and > near, {self.near} (got {self.focus_distance})")
         if self.lens == "fisheye":
             self._check_fisheye()
         elif len(self.distortion) not in (0, 4, 5, 8):
@@ -77,7 +88,7 @@ class Camera:
         x, y = np.meshgrid([0, self.width], [0, self.height])
         farthest = float(np.hypot((x - self.cx) / self.fx, (y - self.cy) / self.fy).max())
         angle = np.linspace(0, FISHEYE_MAX, 200)
-        shown = _fisheye_radius(angle, self.distortion)
+        shown = fisheye_radius(angle, self.distortion)
         if np.any(np.diff(shown) <= 0) or farthest > shown[-1]:
             raise ValueError(
                 f"a fisheye must show at most 85 degrees to each side, in growing distance from the principal point "
@@ -164,7 +175,7 @@ class Camera:
         elif self.lens == "fisheye":
             slopes = local[front, :2] / depth[front, None]
             slope = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
-            shown = slopes * _fisheye_radius(np.arctan(slope), self.distortion) / slope
+            shown = slopes * fisheye_radius(np.arctan(slope), self.distortion) / slope
             pixels[front] = shown * (self.fx, self.fy) + (self.cx, self.cy)
         elif front.any():
             import cv2
@@ -185,7 +196,7 @@ class Camera:
             radius = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
             angle = radius.copy()
             for _ in range(20):
-                angle -= (_fisheye_radius(angle, self.distortion) - radius) / _fisheye_rate(angle, self.distortion)
+                angle -= (fisheye_radius(angle, self.distortion) - radius) / fisheye_rate(angle, self.distortion)
             return np.asarray(slopes * np.tan(np.clip(angle, 0, FISHEYE_MAX)) / radius, dtype=np.float64)
         import cv2
 
@@ -196,14 +207,14 @@ class Camera:
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
 
-def _fisheye_radius(angle: FloatArray, k: Sequence[float]) -> FloatArray:
-    """Distance from the principal point in focal lengths, of rays at an angle to the axis [rad]."""
+def fisheye_radius(angle: Any, k: Sequence[Any]) -> Any:
+    """Distance from the principal point in focal lengths, of rays at an angle to the axis [rad], on host or device."""
     square = angle * angle
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 
 
-def _fisheye_rate(angle: FloatArray, k: Sequence[float]) -> FloatArray:
-    """Derivative of :func:`_fisheye_radius`."""
+def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
+    """Derivative of :func:`fisheye_radius`."""
     square = angle * angle
     return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
 

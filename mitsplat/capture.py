@@ -22,7 +22,7 @@ import numpy.typing as npt
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsplat.camera import Camera
+from mitsplat.camera import Camera, Lens
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.yaml_input import load_yaml
@@ -54,7 +54,7 @@ class CameraSpec(_Strict):
     cy: float
     distortion: tuple[float, ...] = ()
     near: float
-    lens: Literal["opencv", "fisheye"] = "opencv"
+    lens: Lens = "opencv"
     world_from_camera: tuple[_Row, _Row, _Row, _Row]
 
 

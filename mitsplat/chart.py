@@ -191,7 +191,7 @@ def _scene_shooter(path: Path, quality: Quality, frames: int, overrides: dict[st
 
     scene = load_scene(path, overrides=overrides)
     drawn = scene.spec.rendering
-    quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples)
+    quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings)
     indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
 
     def shoot(i: int) -> Shot:

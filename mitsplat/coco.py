@@ -139,7 +139,8 @@ def camera_of(record: Record) -> Camera:
     stored = record["camera"]
     ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
     pose, distortion = np.array(stored["world_from_camera"]), tuple(stored["distortion"])
-    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, distortion, lens=stored["lens"])
+    lens = {key: stored[key] for key in ("lens", "aperture_radius", "focus_distance")}
+    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, distortion, **lens)
 
 
 def image_file(record: Record) -> str:

@@ -108,6 +108,8 @@ def describe_sensor(camera: Camera) -> dict[str, Any]:
         "cy": camera.cy,
         "distortion": " ".join(repr(float(k)) for k in camera.distortion),
         "lens": camera.lens,
+        "aperture_radius": camera.aperture_radius,
+        "focus_distance": camera.focus_distance,
         "near_clip": camera.near,
         "to_world": mi.ScalarTransform4f(pose),
         "film": {

@@ -386,6 +386,8 @@ def _camera_at(pose: FloatArray, intrinsics: Intrinsics, output: Output) -> Came
         distortion=intrinsics.distortion,
         near=intrinsics.near,
         lens=intrinsics.lens,
+        aperture_radius=intrinsics.aperture,
+        focus_distance=intrinsics.focus,
     )
     return camera.resized(output.width, output.height)
 

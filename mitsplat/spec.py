@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, model_validator
 
+from mitsplat.camera import Lens
+from mitsplat.quality import KernelName, PresetName, ResponseName
 from mitsplat.yaml_input import FieldError
 
 
@@ -187,7 +189,9 @@ class Intrinsics(StrictModel):
     distortion: tuple[float, ...] = Field(
         (), description="OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole. A fisheye's k1, k2, k3, k4."
     )
-    lens: Literal["opencv", "fisheye"] = Field("opencv", description="Which of OpenCV's camera models.")
+    lens: Lens = Field("opencv", description="Which of OpenCV's camera models.")
+    aperture: NonNegativeFloat = Field(0.0, description="Radius of a thin lens's aperture [m]; 0 for a pinhole.")
+    focus: Positive = Field(1.0, description="Depth that a thin lens sees sharp [m].")
     near: Positive = Field(0.01, description="Nearest depth at which anything is seen [m].")
 
     @model_validator(mode="after")
@@ -197,6 +201,8 @@ class Intrinsics(StrictModel):
         for key in ("fy", "cx", "cy", "size"):
             if self.fx is None and getattr(self, key) is not None:
                 raise FieldError(key, "needs fx")
+        if self.focus <= self.near:
+            raise FieldError("focus", f"must be beyond near, {self.near} (got {self.focus})")
         if self.lens == "fisheye":
             if self.fx is None or len(self.distortion) != 4:
                 raise FieldError("lens", "fisheye needs fx and 4 coefficients of distortion")
@@ -452,15 +458,16 @@ class Output(StrictModel):
 class Rendering(StrictModel):
     """How splats are drawn, whatever the preset; see :class:`mitsplat.quality.Quality`."""
 
-    response: Literal["perspective", "ewa"] = Field(
+    response: ResponseName = Field(
         "perspective",
         description="Every ray's exact perspective, or parallel rays within a Gaussian as in trainers.",
     )
-    kernel: Literal["exact", "mip", "3dgs", "gsplat"] = Field(
+    kernel: KernelName = Field(
         "exact",
         description="The Gaussian itself, widened by a pixel so that nothing sparkles, or as those trainers dilate it.",
     )
     samples: int = Field(1, ge=1, le=8, description="Rays per pixel along each axis: 2 smooths silhouettes.")
+    lens_rings: int = Field(2, ge=1, le=8, description="Rings of points on a thin lens: 1, 2, 3 take 7, 19, 37 images.")
 
 
 class Labelling(StrictModel):
@@ -500,7 +507,7 @@ class SceneSpec(StrictModel):
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
     labels: Labelling = Field(Labelling(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
-    quality: Literal["fast", "balanced", "exact"] = Field("balanced", description="Rendering preset.")
+    quality: PresetName = Field("balanced", description="Rendering preset.")
     rendering: Rendering = Field(Rendering(), description="How splats are drawn.")
     seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
 

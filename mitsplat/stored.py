@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mitsplat.camera import Lens
 from mitsplat.coco import camera_of
 from mitsplat.errors import InputError
 from mitsplat.files import Record
@@ -52,7 +53,9 @@ class _Camera(_Stored):
     height: Pixels
     intrinsics: tuple[Point, Point, Point]
     distortion: list[float]
-    lens: Literal["opencv", "fisheye"]
+    lens: Lens
+    aperture_radius: Annotated[float, Field(ge=0)]
+    focus_distance: Annotated[float, Field(gt=0)]
     world_from_camera: Pose
 
 

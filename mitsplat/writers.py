@@ -127,6 +127,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
             "intrinsics": frame.camera.intrinsics.tolist(),
             "distortion": list(frame.camera.distortion),
             "lens": frame.camera.lens,
+            "aperture_radius": frame.camera.aperture_radius,
+            "focus_distance": frame.camera.focus_distance,
             "near": frame.camera.near,
             "world_from_camera": frame.camera.world_from_camera.tolist(),
         },

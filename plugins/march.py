@@ -270,6 +270,7 @@ def _walk_in_tile_order(
         for pixel, (log_alpha, z), z_far in zip(pixels, responses, far, strict=True):
             hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[T] > end)
             weight = dr.select(hit, pixel[T] * dr.exp2(log_alpha), 0.0)
+            z = dr.select(hit, z, 0.0)
             blended.append(_blend(pixel, weight, pixel[T] - weight, [record[6], record[7], record[8]], z, record[15]))
         return i + 1, blended
 
@@ -359,6 +360,7 @@ def _walk_in_ray_order(
                 number = dr.gather(mi.UInt32, lists.entries, i, found)
                 record = dr.gather(mi.ArrayXf, lists.records, number, found, shape=(RECORD, width))
                 weight = dr.select(found, pixel[T] * alpha, 0.0)
+                z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, which no weight makes 0
                 pixel = _blend(pixel, weight, pixel[T] - weight, [record[6], record[7], record[8]], z, record[15])
             # A ray that has ended takes nothing more: no peak lies behind infinity.
             open_ray = pixel[T] > end

@@ -38,6 +38,14 @@ class OpenCVCamera(mi.Sensor):
        - |transform|
        - Pose in Mitsuba's camera axes (x left, y up, z forward), as ``lookat`` gives it. (Default: none)
 
+     * - aperture_radius
+       - |float|
+       - Of a thin lens [m]; 0 for a pinhole. (Default: 0)
+
+     * - focus_distance
+       - |float|
+       - Depth along the optical axis that a thin lens sees sharp [m]. (Default: 1)
+
      * - near_clip
        - |float|
        - Nearest visible depth [m]. (Default: 0.01)
@@ -64,9 +72,13 @@ class OpenCVCamera(mi.Sensor):
         self.lens = props.get("lens", "opencv")
         if self.lens not in ("opencv", "fisheye"):
             raise InputError(f"sensor 'opencv_camera': 'lens' must be opencv or fisheye (got {self.lens!r})")
+        self.thin_lens = _number(props, "aperture_radius", 0.0), _positive(props, "focus_distance", 1.0)
+        self.m_needs_sample_3 = self.thin_lens[0] > 0
         intrinsics = self.fx, self.fy, self.cx, self.cy
         try:
-            Camera(int(width), int(height), *intrinsics, np.eye(4), self.distortion, self.near, self.lens)
+            Camera(
+                int(width), int(height), *intrinsics, np.eye(4), self.distortion, self.near, self.lens, *self.thin_lens
+            )
         except ValueError as error:
             raise InputError(f"sensor 'opencv_camera': {error}") from None
 
@@ -76,7 +88,7 @@ class OpenCVCamera(mi.Sensor):
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         pose = self.world_from_mitsuba @ flip
         intrinsics = self.fx, self.fy, self.cx, self.cy
-        return View(width, height, *intrinsics, pose, self.distortion, self.near, samples, self.lens)
+        return View(width, height, *intrinsics, pose, self.distortion, self.near, samples, self.lens, *self.thin_lens)
 
     def sample_ray(  # noqa: D102 - Mitsuba's interface
         self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
@@ -85,8 +97,10 @@ class OpenCVCamera(mi.Sensor):
         u, v = self.view().slopes(position.x * width, position.y * height)
         ray = dr.zeros(mi.Ray3f, dr.width(position))
         to_world = mi.Transform4f(mi.Matrix4f(self.world_from_mitsuba.tolist()))
-        ray.o = to_world @ mi.Point3f(0, 0, 0)
-        ray.d = dr.normalize(to_world @ mi.Vector3f(-u, -v, 1))
+        radius, focus = self.thin_lens
+        point = radius * mi.warp.square_to_uniform_disk_concentric(aperture) if radius else mi.Point2f(0)
+        ray.o = to_world @ mi.Point3f(point.x, point.y, 0)
+        ray.d = dr.normalize(to_world @ mi.Vector3f(-u - point.x / focus, -v - point.y / focus, 1))
         ray.time = time
         ray.maxt = dr.inf
         return ray, mi.Color3f(1)

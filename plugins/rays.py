@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.camera import FISHEYE_MAX, Camera
+from mitsplat.camera import FISHEYE_MAX, Camera, Lens, fisheye_radius, fisheye_rate
 
 TILE = 4
 """Edge of a tile [px]. Smaller tiles make more pairs to sort; larger ones idle more lanes, blend further from the order
@@ -29,6 +29,8 @@ class View:
         world_from_camera: Pose, OpenCV axes, shape (4, 4).
         samples: Rays per pixel along each axis.
         lens: Model of the lens.
+        aperture_radius, focus_distance: Of a thin lens [m].
+        shift: What the slopes of rays lack of those through the lens's centre; of a view through another of its points.
     """
 
     width: int
@@ -41,7 +43,10 @@ class View:
     distortion: tuple[float, ...] = ()
     near: float = 0.01
     samples: int = 1
-    lens: Literal["opencv", "fisheye"] = "opencv"
+    lens: Lens = "opencv"
+    aperture_radius: float = 0.0
+    focus_distance: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
     _opaque: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -53,6 +58,8 @@ class View:
             self._opaque[name] = dr.opaque(mi.Float, getattr(self, name))
         for i, value in enumerate(self.distortion):
             self._opaque[f"k{i}"] = dr.opaque(mi.Float, value)
+        if self.distortion:
+            self._opaque["du"], self._opaque["dv"] = (dr.opaque(mi.Float, value) for value in self.shift)
 
     @property
     def near_plane(self) -> Any:
@@ -84,7 +91,32 @@ class View:
             self.distortion,
             self.near,
             self.lens,
+            self.aperture_radius,
+            self.focus_distance,
         )
+
+    def apertures(self, rings: int) -> list[View]:
+        """Views through evenly spaced points of the aperture, the centre first: a hexagon and so many rings around it.
+
+        All of them see the plane at ``focus_distance`` at the same pixels. A pinhole has one.
+        """
+        if self.aperture_radius == 0:
+            return [self]
+        points, count = [(0.0, 0.0)], 1 + 3 * rings * (rings + 1)
+        for ring in range(1, rings + 1):
+            # In the middle, by area, of the annulus that belongs to the ring's 6 n points.
+            radius = self.aperture_radius * np.sqrt((1 + 3 * ring * ring) / count)
+            angles = (np.arange(6 * ring) + 0.5 * (ring % 2)) * np.pi / (3 * ring)
+            points += [(radius * np.cos(angle), radius * np.sin(angle)) for angle in angles]
+        return [self._through(float(x), float(y)) for x, y in points]
+
+    def _through(self, x: float, y: float) -> View:
+        pose = self.world_from_camera.copy()
+        pose[:3, 3] += pose[:3, 0] * x + pose[:3, 1] * y
+        du, dv = x / self.focus_distance, y / self.focus_distance
+        if self.distortion:
+            return replace(self, world_from_camera=pose, shift=(du, dv))
+        return replace(self, world_from_camera=pose, cx=self.cx + self.fx * du, cy=self.cy + self.fy * dv)
 
     def rows(self, start: int, stop: int) -> View:
         """The part of the view from pixel row ``start`` up to ``stop``."""
@@ -116,7 +148,8 @@ class View:
         if not self.distortion:
             return xd, yd
         if self.lens == "fisheye":
-            return self._fisheye_slopes(xd, yd)
+            u, v = self._fisheye_slopes(xd, yd)
+            return u - o["du"], v - o["dv"]
         u, v = xd, yd
         # Newton's method on the 2-D distortion map with a numerical-free Jacobian: converges in 3 to 5 steps.
         for _ in range(8):
@@ -124,29 +157,25 @@ class View:
             ru, rv = xd - pu, yd - pv
             det = j[0] * j[3] - j[1] * j[2]
             u, v = u + (j[3] * ru - j[1] * rv) / det, v + (j[0] * rv - j[2] * ru) / det
-        return u, v
+        return u - o["du"], v - o["dv"]
 
     def _fisheye_slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
         radius = dr.maximum(dr.sqrt(x * x + y * y), 1e-9)
         angle = mi.Float(radius)
         for _ in range(8):
-            shown, rate = self._fisheye_radius(angle)
-            angle -= (shown - radius) / rate
+            angle -= (fisheye_radius(angle, self._k) - radius) / fisheye_rate(angle, self._k)
         scale = dr.tan(dr.clip(angle, 0, FISHEYE_MAX)) / radius
         return x * scale, y * scale
 
-    def _fisheye_radius(self, angle: Any) -> tuple[Any, Any]:
-        """Distance from the principal point in focal lengths, and its derivative, of rays at an angle to the axis."""
-        k1, k2, k3, k4 = (self._opaque[f"k{i}"] for i in range(4))
-        s = angle * angle
-        shown = angle * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
-        return shown, 1 + s * (3 * k1 + s * (5 * k2 + s * (7 * k3 + s * 9 * k4)))
+    @property
+    def _k(self) -> list[Any]:
+        return [self._opaque[f"k{i}"] for i in range(len(self.distortion))]
 
     def _fisheye_distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
         slope2 = dr.maximum(u * u + v * v, 1e-12)
         slope = dr.sqrt(slope2)
-        shown, rate = self._fisheye_radius(dr.atan(slope))
-        scale = shown / slope
+        angle = dr.atan(slope)
+        rate, scale = fisheye_rate(angle, self._k), fisheye_radius(angle, self._k) / slope
         # Along the radius the map grows by d(shown)/d(slope), across it by the scale.
         growth = (rate / (1 + slope2) - scale) / slope2
         return u * scale, v * scale, (scale + growth * u * u, growth * u * v, growth * u * v, scale + growth * v * v)
@@ -159,7 +188,7 @@ class View:
         """
         if self.lens == "fisheye":
             return self._fisheye_distort(u, v)
-        k1, k2, p1, p2, k3, k4, k5, k6 = (self._opaque[f"k{i}"] for i in range(8))
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._k
         r2 = u * u + v * v
         top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
         radial = top / bottom
@@ -185,7 +214,7 @@ class View:
         if not self.distortion:
             return variance / dr.square(o["fx"]), mi.Float(0), variance / dr.square(o["fy"])
         lo_u, hi_u, lo_v, hi_v = self._extent
-        _, _, (a, b, c, d) = self.distort(dr.clip(u, lo_u, hi_u), dr.clip(v, lo_v, hi_v))
+        _, _, (a, b, c, d) = self.distort(dr.clip(u, lo_u, hi_u) + o["du"], dr.clip(v, lo_v, hi_v) + o["dv"])
         # Inverse of the map from slopes to pixels, diag(f) J.
         det = (a * d - b * c) * o["fx"] * o["fy"]
         a, b, c, d = d * o["fy"] / det, -b * o["fx"] / det, -c * o["fy"] / det, a * o["fx"] / det
@@ -208,7 +237,7 @@ class View:
             for t in (0.0, 0.25, 0.5, 0.75, 1.0):
                 if s not in (0.0, 1.0) and t not in (0.0, 1.0):
                     continue
-                pu, pv, _ = self.distort(dr.lerp(u0, u1, s), dr.lerp(v0, v1, t))
+                pu, pv, _ = self.distort(dr.lerp(u0, u1, s) + o["du"], dr.lerp(v0, v1, t) + o["dv"])
                 x, y = pu * o["fx"] + o["cx"], pv * o["fy"] + o["cy"]
                 lo_x, hi_x = dr.minimum(lo_x, x), dr.maximum(hi_x, x)
                 lo_y, hi_y = dr.minimum(lo_y, y), dr.maximum(hi_y, y)

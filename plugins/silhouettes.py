@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.camera import Camera
+from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.march import _respond
@@ -89,7 +89,7 @@ def _margin(
     cx: float,
     cy: float,
     distortion: tuple[float, ...],
-    lens: Literal["opencv", "fisheye"],
+    lens: Lens,
 ) -> float:
     if not distortion:
         return MARGINS[0]

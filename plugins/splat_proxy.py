@@ -91,6 +91,10 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - |int|
        - Rays per pixel along each axis, 1 to 8. (Default: 1)
 
+     * - lens_rings
+       - |int|
+       - Rings of points that the aperture of a thin lens is sampled at, 1 to 8. (Default: 2)
+
      * - shadow
        - |string|
        - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured.
@@ -139,6 +143,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             "response": _text(props, "response", "perspective"),
             "kernel": _text(props, "kernel", "exact"),
             "samples": props.get("samples", 1),
+            "lens_rings": props.get("lens_rings", 2),
         }
         self.quality = replace(resolve_quality(_text(props, "quality", "balanced")), **refined)
         self.shadow = _text(props, "shadow", "traced")
@@ -192,26 +197,18 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         contents = self._read(scene)
         view = view_of(sensor)
         rays = view.rays()
-        behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
-        splat = self._trace_splats(contents, view, behind.depth if behind else None)
+        seen = self._look(contents, scene, view, rays)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
-        dr.eval(splat, proxy_depth, hit, static)
-
-        covered = dr.maximum(splat.alpha, 1e-6)
-        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
-        alpha, depth, instance = splat.alpha, splat.depth, splat.instance
-        if behind:
-            front = behind.valid & (splat.alpha < 0.5)
-            colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
-            alpha = dr.select(behind.valid, 1, alpha)
-            depth = dr.select(front, behind.depth, depth)
-            instance = dr.select(front, 0, instance)
+        dr.eval(proxy_depth, hit, static)
+        colour, alpha, depth, instance = seen.colour, seen.alpha, seen.depth, seen.instance
+        if view.aperture_radius > 0:
+            colour, alpha = self._blur(contents, scene, view, seen)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
             surface = _surface(contents, view, rays, alpha, depth, instance, hit, static)
-            if behind:
-                surface.relit |= front
+            if seen.mesh is not None:
+                surface.relit |= seen.mesh
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
@@ -238,6 +235,34 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         }
         dr.eval(layers)
         return layers
+
+    def _look(self, contents: _Contents, scene: Any, view: View, rays: Any) -> _Seen:
+        """Splats, and visible meshes behind them, through one point of the lens."""
+        behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
+        splat = self._trace_splats(contents, view, behind.depth if behind else None)
+        dr.eval(splat)
+        covered = dr.maximum(splat.alpha, 1e-6)
+        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
+        if behind is None:
+            return _Seen(colour, splat.alpha, splat.depth, splat.instance, None)
+        front = behind.valid & (splat.alpha < 0.5)
+        return _Seen(
+            colour + dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0),
+            dr.select(behind.valid, 1, splat.alpha),
+            dr.select(front, behind.depth, splat.depth),
+            dr.select(front, 0, splat.instance),
+            front,
+        )
+
+    def _blur(self, contents: _Contents, scene: Any, view: View, middle: _Seen) -> tuple[Any, Any]:
+        """Mean colour and opacity over the aperture, whose middle is known."""
+        views = view.apertures(self.quality.lens_rings)
+        colour, alpha = middle.colour, middle.alpha
+        for other in views[1:]:
+            seen = self._look(contents, scene, other, other.rays())
+            colour, alpha = colour + seen.colour, alpha + seen.alpha
+            dr.eval(colour, alpha)
+        return colour / len(views), alpha / len(views)
 
     def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
         """Every instance above 0 as it would be seen alone, by its splats or its proxies (``source``).
@@ -329,6 +354,17 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""
         return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Linear colour times opacity, opacity, depth [m], instance, and where a visible mesh is what is seen."""
+
+    colour: Any
+    alpha: Any
+    depth: Any
+    instance: Any
+    mesh: Any | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -21,15 +22,10 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.quality import KERNELS, PRESETS, Quality
 from mitsplat.render import Layers, make_sensor, render_splats
 from mitsplat.splats import SH_C0, Splats
-from mitsplat.trace import encode_srgb
+from mitsplat.trace import decode_srgb, encode_srgb
 
 CAPTURES = Path(__file__).parents[2] / "shared/data/splats"
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=50)
-
-
-def decode(encoded: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB-encoded ones."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def make_splats(
@@ -58,7 +54,7 @@ def error(layers: Layers, splats: Splats, camera: Camera, quality: Quality = PRE
     """Largest difference of colour and alpha from the twin, colour compared linear."""
     twin = render_reference(splats, camera, quality)
     alpha = np.maximum(twin.alpha, 1e-6)[..., None]
-    linear = decode(twin.rgb / alpha) * twin.alpha[..., None]
+    linear = decode_srgb(twin.rgb / alpha) * twin.alpha[..., None]
     return float(max(np.abs(layers.rgb - linear).max(), np.abs(layers.alpha - twin.alpha).max()))
 
 
@@ -66,6 +62,17 @@ def error(layers: Layers, splats: Splats, camera: Camera, quality: Quality = PRE
 def test_exact_preset_equals_the_twin(seed: int) -> None:
     splats = make_splats(60, seed)
     assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_depth_of_a_thin_fog_is_the_mean_of_what_was_met(preset: str) -> None:
+    splats = replace(make_splats(40, 13), opacities=np.random.default_rng(1).uniform(0.05, 0.3, 40))
+    layers, twin = render_splats(splats, CAMERA, quality=preset), render_reference(splats, CAMERA)
+    thin = (twin.alpha > 0.02) & (twin.alpha < 0.49)
+    assert thin.sum() > 100
+    tolerance = {"fast": 5e-2, "balanced": 2e-2, "exact": 5e-4}[preset]  # cut-offs, and the order of a tile
+    np.testing.assert_allclose(layers.depth[thin], twin.depth[thin], rtol=tolerance)
+    assert (layers.depth[twin.alpha == 0] == 0).all() and np.isfinite(layers.depth).all()
 
 
 def test_tile_order_equals_the_twin_where_gaussians_do_not_overlap_in_depth() -> None:
@@ -220,6 +227,71 @@ def test_picture_through_a_lens_undistorts_to_the_pinhole(lens: str) -> None:
     assert np.abs(undistorted - expected)[inside].max() < 2e-3
 
 
+@dataclass(frozen=True, eq=False)
+class ThroughAPoint(Camera):
+    """A thin lens as one of its points sees: rays meet those of the centre in the plane of focus."""
+
+    point: tuple[float, float] = (0.0, 0.0)
+
+    def ray_slopes(self, pixels: npt.ArrayLike) -> np.ndarray:
+        return super().ray_slopes(pixels) - np.array(self.point) / self.focus_distance
+
+
+@pytest.mark.parametrize("lens", [None, *LENSES])
+def test_thin_lens_follows_the_twin_through_every_point_of_the_aperture(lens: str | None) -> None:
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=24, height=18, fov_x=70)
+    options = {} if lens is None else LENSES[lens] | {"fx": 14.0, "fy": 14.0}
+    camera = replace(camera, **options, aperture_radius=0.1, focus_distance=1.8)
+    splats = make_splats(40, 13)
+    quality = replace(PRESETS["exact"], lens_rings=1)
+    views = make_sensor(camera).view().apertures(1)
+    assert len(views) == 7
+    rgb, alpha = [], []
+    for view in views:
+        point = (np.linalg.inv(camera.world_from_camera) @ view.world_from_camera)[:2, 3]
+        pose = {"world_from_camera": view.world_from_camera, "point": tuple(point)}
+        seen = render_reference(splats, ThroughAPoint(**vars(camera) | pose))
+        rgb.append(decode_srgb(seen.rgb / np.maximum(seen.alpha, 1e-6)[..., None]) * seen.alpha[..., None])
+        alpha.append(seen.alpha)
+    layers = render_splats(splats, camera, quality=quality)
+    np.testing.assert_allclose(layers.rgb, np.mean(rgb, axis=0), atol=2e-4)
+    np.testing.assert_allclose(layers.alpha, np.mean(alpha, axis=0), atol=2e-4)
+    pinhole = render_splats(splats, replace(camera, aperture_radius=0.0), quality=quality)
+    assert np.array_equal(layers.depth, pinhole.depth) and np.array_equal(layers.instance, pinhole.instance)
+
+
+@pytest.mark.parametrize("z", [0.8, 1.5, 4.0])
+def test_thin_lens_blurs_by_its_circle_of_confusion(z: float) -> None:
+    """A uniform disk of radius f a |1/F - 1/z| has the variance radius^2 / 4 along each axis, which is added.
+
+    A Gaussian is blurred by its own depth too: in the mean over it, radius^2 is larger by (f a sigma / z^2)^2.
+    """
+    camera = Camera(96, 72, 150.0, 150.0, 48.0, 36.0, np.eye(4), aperture_radius=0.08, focus_distance=1.5)
+    dot = one((0.01 * z,) * 3, mean=(0, 0, z), opacity=0.5)
+    x = np.arange(96) + 0.5 - 48.0
+
+    def variance(camera: Camera) -> float:
+        alpha = render_splats(dot, camera, quality=replace(PRESETS["exact"], lens_rings=3)).alpha
+        return float((alpha * x**2).sum() / alpha.sum())
+
+    radius = 150.0 * 0.08 * np.hypot(1 / 1.5 - 1 / z, 0.01 / z)
+    added = variance(camera) - variance(replace(camera, aperture_radius=0.0))
+    assert added == pytest.approx(radius**2 / 4, rel=0.01, abs=1e-4)
+
+
+def test_other_integrators_see_through_the_thin_lens() -> None:
+    """A far bright disk in Mitsuba's path tracer is blurred to the same size."""
+    camera = Camera(64, 48, 100.0, 100.0, 32.0, 24.0, np.eye(4), aperture_radius=0.1, focus_distance=1.0)
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    pose = mi.ScalarTransform4f().translate([0, 0, 4]).rotate([0, 1, 0], 180).scale(0.04)
+    disk = {"type": "disk", "to_world": pose, "light": light}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, "disk": disk})
+    image = np.array(mi.render(scene, sensor=make_sensor(camera), spp=256, seed=1))[..., 0]
+    x = np.arange(64) + 0.5 - 32.0
+    variance = (image * x**2).sum() / image.sum()
+    assert variance == pytest.approx((100 * 0.1 * 0.75) ** 2 / 4 + (100 * 0.04 / 4) ** 2 / 4 + 1 / 12, rel=0.02)
+
+
 def test_means_far_from_the_origin_keep_their_place() -> None:
     """10 km from the origin, on coordinates that float32 can hold."""
     near = make_splats(30, 15)
@@ -270,7 +342,7 @@ def test_opaque_gaussian_hides_what_is_behind() -> None:
     behind = Splats(behind.means, behind.quats, behind.scales, behind.opacities, behind.sh * -3)
     both = render_splats(Splats.concatenate([behind, front]), CAMERA)
     assert both.alpha[12, 16] == pytest.approx(1.0, abs=1e-5)
-    np.testing.assert_allclose(both.rgb[12, 16], decode(np.array([0.2, 0.5, 0.8])), atol=1e-3)
+    np.testing.assert_allclose(both.rgb[12, 16], decode_srgb(np.array([0.2, 0.5, 0.8])), atol=1e-3)
     assert both.depth[12, 16] == pytest.approx(1.5, abs=1e-3)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from mitsplat.cli.options import progress_bar
 from mitsplat.errors import InputError
+from mitsplat.quality import PresetName
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -18,7 +19,7 @@ DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset 
 FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, from 0.")]
 FrameSize = Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")]
 SceneSeed = Annotated[int | None, typer.Option(help="Decides everything that is random.")]
-Preset = Annotated[Literal["fast", "balanced", "exact"] | None, typer.Option(help="Rendering preset.")]
+Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset.")]
 
 
 def render(

@@ -22,6 +22,7 @@ import numpy as np
 
 # isort: on
 from benchmarks.volprim import render_volprim, volprim_scene
+from mitsplat.colour import encode_srgb
 from mitsplat.quality import resolve_quality
 from mitsplat.render import make_sensor, render_splats
 from mitsplat.splats import Splats
@@ -122,9 +123,7 @@ def main() -> None:
         return
     theirs = time_gsplat(splats)
     layers = render_splats(splats, CAMERA)
-    ours = np.where(
-        layers.rgb <= 0.0031308, 12.92 * layers.rgb, 1.055 * np.maximum(layers.rgb, 1e-9) ** (1 / 2.4) - 0.055
-    )
+    ours = encode_srgb(layers.rgb)
     error = np.mean((np.clip(theirs, 0, 1) - np.clip(ours, 0, 1)) ** 2)
     print(f"difference of the two images: {-10 * np.log10(error):.1f} dB (alpha is not composited alike)")
 

@@ -43,12 +43,13 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 from mitsplat.bake import BakeSettings, bake_asset
 from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
+from mitsplat.colour import encode_srgb
 from mitsplat.composite import LUMINANCE, light_image
 from mitsplat.plugins.proxies import Occluder, Proxies
 from mitsplat.render import Layers, ensure_variant, make_integrator, make_sensor, make_splats_shape, render_layers
 from mitsplat.scene import AreaLight, EnvironmentLight, LightSpec, SpotLight
 from mitsplat.spec import Composite
-from mitsplat.trace import encode_srgb, trace_radiance
+from mitsplat.trace import trace_radiance
 from scenes.build import materials as m
 from scenes.build.parts import build_part
 
@@ -322,14 +323,19 @@ def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth
     opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
     exact = replace(layers, **opaque)
     ratio = np.where(truth.objects[..., None], layers.light, truth.ratio).astype(np.float32)
-    pictures = {"none": light_image(layers, Composite(shadow="none", highlight=False))}
+    pictures = {"none": light_image(layers, Composite(shadow="none"))}
     pictures |= {"image": light_image(relative, Composite(shadow="image"))}
     pictures |= {"traced": light_image(layers, Composite())}
     pictures |= {"capture image": light_image(replace(relative, **opaque), Composite(shadow="image"))}
-    pictures |= {"no bounce": light_image(replace(unbounced, **opaque), Composite())}
-    pictures |= {"capture traced": light_image(exact, Composite())}
-    pictures["direct"] = light_image(replace(exact, light=ratio), Composite())
+    pictures |= {"no bounce": lit(replace(unbounced, **opaque))}
+    pictures |= {"capture traced": lit(exact)}
+    pictures["direct"] = lit(replace(exact, light=ratio))
     return {name: np.asarray(picture, dtype=np.float64) for name, picture in pictures.items()}
+
+
+def lit(layers: Layers) -> FloatArray:
+    """The linear picture of opaque layers that were changed after they were rendered."""
+    return np.maximum(layers.captured * layers.light + layers.highlight, 0)
 
 
 def psnr(picture: FloatArray, photo: FloatArray, region: npt.NDArray[np.bool_]) -> float:

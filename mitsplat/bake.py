@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 from mitsplat.assets import Asset
 from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
+from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces
 from mitsplat.metrics import psnr_of
@@ -30,7 +31,7 @@ from mitsplat.refine import Picture, RefineSettings, refine_splats
 from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
-from mitsplat.trace import RAYS_PER_LAUNCH, encode_srgb, render_mesh, trace_radiance
+from mitsplat.trace import RAYS_PER_LAUNCH, render_mesh, trace_radiance
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -14,11 +14,11 @@ import trimesh
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial
 
+from mitsplat.colour import decode_srgb
 from mitsplat.composite import black_body_colour
 from mitsplat.errors import InputError
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
-from mitsplat.trace import decode_srgb
 
 FloatArray = npt.NDArray[np.float64]
 

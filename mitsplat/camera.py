@@ -67,7 +67,7 @@ class Camera:
             raise ValueError(f"near must be > 0 (got {self.near})")
         if not 0 <= self.aperture_radius < np.inf:
             raise ValueError(f"aperture_radius must be finite and >= 0 (got {self.aperture_radius})")
-        if not self.near < self.focus_distance < np.inf:
+        if self.aperture_radius > 0 and not self.near < self.focus_distance < np.inf:
             raise ValueError(f"focus_distance must be finite and > near, {self.near} (got {self.focus_distance})")
         if self.lens == "fisheye":
             self._check_fisheye()

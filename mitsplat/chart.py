@@ -185,9 +185,9 @@ Shot = tuple[npt.NDArray[np.float32], npt.NDArray[np.uint16], float]
 
 
 def _scene_shooter(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+    from mitsplat.colour import encode_srgb
     from mitsplat.frame import render_frame
     from mitsplat.scene import load_scene
-    from mitsplat.trace import encode_srgb
 
     scene = load_scene(path, overrides=overrides)
     drawn = scene.spec.rendering
@@ -203,8 +203,8 @@ def _scene_shooter(path: Path, quality: Quality, frames: int, overrides: dict[st
 
 
 def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+    from mitsplat.colour import encode_srgb
     from mitsplat.render import render_splats
-    from mitsplat.trace import encode_srgb
 
     splats = Splats.load(path)
     width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)

@@ -31,16 +31,14 @@ CURVE_WHITE = 16.0
 
 
 def light_image(layers: Layers, composite: Composite) -> FloatArray:
-    """Linear picture (H, W, 3) from captured colour, shadow and highlight, over a grey background."""
+    """Linear picture (H, W, 3) with the shadows asked for, over a grey background."""
     if composite.shadow == "image":
         factor, shine = shadow_from_image(layers.light @ LUMINANCE, composite.image_shadow)
         lit = layers.captured * factor[..., None]
         if composite.highlight:
             lit += (shine * layers.alpha)[..., None]
     else:
-        lit = layers.captured if composite.shadow == "none" else layers.captured * layers.light
-        if composite.highlight:
-            lit = np.maximum(lit + layers.highlight * layers.alpha[..., None], 0)
+        lit = layers.captured if composite.shadow == "none" else layers.rgb
     return np.asarray(lit + (BACKGROUND * (1 - layers.alpha))[..., None], dtype=np.float32)
 
 

@@ -17,7 +17,8 @@ from scipy.spatial import KDTree
 from scipy.special import comb
 
 from mitsplat.optimise import Model
-from mitsplat.plugins.gaussian import rotation_axes, wrapped
+from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.gaussian import rotation_axes
 from mitsplat.splats import SH_C0, Splats
 
 FloatArray = npt.NDArray[np.float64]

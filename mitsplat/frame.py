@@ -17,8 +17,10 @@ import trimesh
 from mitsplat.assets import Asset
 from mitsplat.cad import emitter_dict
 from mitsplat.camera import Camera
+from mitsplat.colour import decode_srgb
 from mitsplat.composite import develop, light_image
 from mitsplat.label import LabelRules, Labels, Truth, label_instances
+from mitsplat.plugins.device import plain_mesh
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.render import (
     Layers,
@@ -172,14 +174,7 @@ class _Studio:
     def __init__(self, scene: Scene, quality: Quality) -> None:
         ensure_variant()
         self.scene = scene
-        self.integrator = make_integrator(
-            quality=quality,
-            shadow="none" if scene.spec.composite.shadow == "none" else "traced",
-            reference=reference_point(scene),
-            white=white_irradiance(scene),
-            bounce=scene.spec.composite.bounce,
-            shadow_error=scene.spec.composite.shadow_error,
-        )
+        self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self.static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None
 
@@ -233,30 +228,32 @@ def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) ->
     """A plain diffuse mesh; its colour is display-encoded, as in the scene file."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(
-        {"type": "diffuse", "reflectance": {"type": "rgb", "value": srgb_to_linear(colour).tolist()}}
+        {"type": "diffuse", "reflectance": {"type": "rgb", "value": decode_srgb(colour).tolist()}}
     )
-    shape = mi.Mesh("shape", len(mesh.vertices), len(mesh.faces), props=props)
-    params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, dtype=np.float32).ravel())
-    params["faces"] = mi.UInt32(np.asarray(mesh.faces, dtype=np.uint32).ravel())
-    params.update()
-    return shape
+    return plain_mesh(mesh, props)
 
 
-def srgb_to_linear(encoded: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Linear values of display-encoded ones (IEC 61966-2-1)."""
-    values = np.asarray(encoded, dtype=np.float64)
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+def light_properties(scene: Scene) -> dict[str, Any]:
+    """Properties of the integrator ``splat_proxy`` by which it lights a scene as its file says."""
+    composite = scene.spec.composite
+    return {
+        "shadow": "none" if composite.shadow == "none" else "traced",
+        "shadow_error": composite.shadow_error,
+        "bounce": composite.bounce,
+        "highlight": composite.highlight,
+        "reference": list(reference_point(scene)),
+        "white": white_irradiance(scene),
+    }
 
 
-def white_irradiance(scene: Scene) -> float | None:
-    """Irradiance [W/m^2] of display white in the surroundings, where it is known and matters.
+def white_irradiance(scene: Scene) -> float:
+    """Irradiance [W/m^2] of display white in the surroundings, or 0 where it is unknown or of no matter.
 
     The image-space shadow only looks at light relative to its brightest.
     """
     if scene.environment is None or scene.spec.composite.shadow == "image":
-        return None
-    return scene.environment.white
+        return 0.0
+    return scene.environment.white or 0.0
 
 
 def reference_point(scene: Scene) -> tuple[float, float, float]:

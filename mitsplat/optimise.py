@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.plugins.gaussian import Cloud, wrapped
+from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.gaussian import Cloud
 from mitsplat.splats import Splats
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15

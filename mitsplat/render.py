@@ -25,6 +25,9 @@ VARIANT = "llvm_ad_rgb"
 class Layers:
     """What the integrator makes of one view, H x W pixels.
 
+    Through a thin lens, ``rgb``, ``captured`` and ``alpha`` are means over its aperture; all else is what its centre
+    sees.
+
     Attributes:
         rgb: Linear colour with light and highlight applied, multiplied by alpha, (H, W, 3) float32.
         alpha: Opacity, (H, W) float32.
@@ -64,29 +67,13 @@ def ensure_variant() -> None:
         mi.set_variant(VARIANT)
 
 
-def make_integrator(
-    *,
-    quality: str | Quality = "balanced",
-    shadow: str = "traced",
-    shadow_samples: int = 64,
-    shadow_error: float = 0.03,
-    reference: npt.ArrayLike = (0.0, 0.0, 0.0),
-    white: float | None = None,
-    bounce: bool = True,
-) -> Any:
-    """The integrator ``splat_proxy``, which keeps what it uploaded as long as it sees the same shapes."""
+def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> Any:
+    """The integrator ``splat_proxy``, which keeps what it uploaded as long as it sees the same shapes.
+
+    ``properties`` are those of the plugin.
+    """
     ensure_variant()
-    integrator = mi.load_dict(
-        {
-            "type": "splat_proxy",
-            "shadow": shadow,
-            "shadow_samples": shadow_samples,
-            "shadow_error": shadow_error,
-            "reference": [float(v) for v in np.asarray(reference)],
-            "white": white or 0.0,
-            "bounce": bounce,
-        }
-    )
+    integrator = mi.load_dict({"type": "splat_proxy", **properties})
     integrator.quality = resolve_quality(quality)
     return integrator
 

@@ -17,7 +17,7 @@ from mitsplat.capture import Photo
 from mitsplat.files import write_file
 from mitsplat.metrics import psnr, ssim
 from mitsplat.optimise import Model
-from mitsplat.plugins.gaussian import wrapped
+from mitsplat.plugins.device import wrapped
 from mitsplat.quality import Quality
 from mitsplat.render import make_sensor
 

@@ -201,7 +201,7 @@ class Intrinsics(StrictModel):
         for key in ("fy", "cx", "cy", "size"):
             if self.fx is None and getattr(self, key) is not None:
                 raise FieldError(key, "needs fx")
-        if self.focus <= self.near:
+        if self.aperture > 0 and self.focus <= self.near:
             raise FieldError("focus", f"must be beyond near, {self.near} (got {self.focus})")
         if self.lens == "fisheye":
             if self.fx is None or len(self.distortion) != 4:

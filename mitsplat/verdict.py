@@ -12,10 +12,10 @@ import trimesh
 from mitsplat.align import measure_offset, surface_points
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
+from mitsplat.colour import encode_srgb
 from mitsplat.isolate import Isolation
 from mitsplat.render import make_integrator, make_splats_shape, render_layers
 from mitsplat.splats import Splats
-from mitsplat.trace import encode_srgb
 
 FloatArray = npt.NDArray[np.float32]
 

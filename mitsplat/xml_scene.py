@@ -12,9 +12,10 @@ import trimesh
 
 from mitsplat.assets import Asset
 from mitsplat.cad import emitter_dict
+from mitsplat.colour import decode_srgb
 from mitsplat.composite import develop
 from mitsplat.errors import InputError
-from mitsplat.frame import reference_point, srgb_to_linear, white_irradiance
+from mitsplat.frame import light_properties
 from mitsplat.render import describe_sensor, ensure_variant
 from mitsplat.scene import Scene, layout_of, plan_frame
 from mitsplat.settle import settle_layout
@@ -52,11 +53,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
             "type": "splat_proxy",
             "quality": scene.spec.quality,
             **scene.spec.rendering.model_dump(),
-            "shadow": "none" if scene.spec.composite.shadow == "none" else "traced",
-            "reference": list(reference_point(scene)),
-            "white": white_irradiance(scene) or 0.0,
-            "bounce": scene.spec.composite.bounce,
-            "shadow_error": scene.spec.composite.shadow_error,
+            **light_properties(scene),
         },
         "sensor": describe_sensor(plan.camera),
         **shapes,
@@ -131,7 +128,7 @@ def _describe_shape(shape: Shape, mesh: trimesh.Trimesh, path: Path) -> dict[str
         "type": "ply",
         "filename": f"{path.parent.name}/{path.name}",
         "face_normals": True,
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": srgb_to_linear(shape.colour).tolist()}},
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": decode_srgb(shape.colour).tolist()}},
     }
 
 

@@ -14,6 +14,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from mitsplat.colour import decode_srgb
+from mitsplat.plugins.device import wrapped
 from mitsplat.splats import SH_C0, Splats
 
 CELLS = 80
@@ -47,7 +49,7 @@ class RadianceGrid:
             return None
         points = splats.means[opaque] @ world_from_splats[:3, :3].T + world_from_splats[:3, 3]
         encoded = np.clip(0.5 + SH_C0 * splats.sh[opaque, 0], 0.0, None)
-        colours = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        colours = decode_srgb(encoded)
         area = np.prod(np.sort(splats.scales[opaque], axis=1)[:, 1:], axis=1)
         low, high = points.min(axis=0), points.max(axis=0)
         size = float((high - low).max()) / CELLS or 1.0
@@ -62,7 +64,7 @@ class RadianceGrid:
         source = np.ravel_multi_index(tuple(nearest), tuple(cells[::-1])).ravel()
         mean = (sums / np.maximum(weight, 1e-30)[:, None])[source]
         return cls(
-            mi.Float(mean.ravel().astype(np.float32)),
+            wrapped(mi.Float, mean.astype(np.float32)),
             mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in low]),
             dr.opaque(mi.Float, size),
             mi.Point3i(*[dr.opaque(mi.Int32, int(v)) for v in cells]),

@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.plugins.device import wrapped
+
 SURVEY_LATTICE = (233, 144)
 OPEN_LATTICE = (144, 89)
 SKY_LATTICE = (377, 233)
@@ -160,8 +162,8 @@ class _Choice:
         """Chances in proportion to ``share`` (N,)."""
         chance = share / share.sum()
         self.ends = [dr.opaque(mi.Float, float(end)) for end in np.cumsum(chance)[:-1]]
-        self.starts = mi.Float(np.concatenate([[0], np.cumsum(chance)[:-1]]).astype(np.float32))
-        self.chances = mi.Float(chance.astype(np.float32))
+        self.starts = wrapped(mi.Float, np.concatenate([[0], np.cumsum(chance)[:-1]]).astype(np.float32))
+        self.chances = wrapped(mi.Float, chance.astype(np.float32))
         dr.make_opaque(self.starts, self.chances)
 
     def sample(self, x: Any) -> tuple[Any, Any, Any]:

@@ -34,6 +34,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.plugins.device import wrapped
+
 RECORD = 16
 """Floats in a view record: u0, v0, A, 2B, C, log2(opacity), red, green | blue, m_z, E, F, G, H, I, instance bits.
 A, 2B and C carry the factor log2(e)/2, so that opacity along a ray is ``exp2(log2(opacity) - q)``."""
@@ -77,29 +79,7 @@ def upload_cloud(
     sigma = np.zeros((count, 4), np.float32)
     sigma[:, :3] = np.maximum(scales, SCALE_RATIO_MIN * widest)
     geometry = np.concatenate([means, opacities[:, None], quats], axis=1, dtype=np.float32)
-    return Cloud(count, aligned(geometry), aligned(sigma), aligned(padded), bands, stride)
-
-
-def aligned(values: np.ndarray) -> Any:
-    """Device copy of an array. Wrapping NumPy's memory instead would switch Dr.Jit's packet loads off (unaligned)."""
-    result = dr.empty(mi.Float, values.size)
-    if values.size:
-        dr.scatter(result, wrapped(mi.Float, np.asarray(values, dtype=np.float32)), dr.arange(mi.UInt32, values.size))
-        dr.eval(result)
-    return result
-
-
-def wrapped(kind: type, values: np.ndarray) -> Any:
-    """Device array of type ``kind`` on a copy of ``values`` that always starts at a whole cache line.
-
-    Dr.Jit compiles other kernels for memory that does not, and where NumPy's own starts is chance.
-    """
-    values = np.ascontiguousarray(values).ravel()
-    memory = np.empty(values.nbytes + 64, dtype=np.uint8)
-    start = -memory.ctypes.data % 64
-    line = memory[start : start + values.nbytes].view(values.dtype)
-    line[...] = values
-    return kind(line)
+    return Cloud(count, wrapped(mi.Float, geometry), wrapped(mi.Float, sigma), wrapped(mi.Float, padded), bands, stride)
 
 
 def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:

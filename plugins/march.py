@@ -100,7 +100,7 @@ def _blend(pixel: Pixel, weight: Any, transmittance: Any, colour: list[Any], z: 
     ]
 
 
-def _respond(
+def respond_along(
     record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
 ) -> list[tuple[Any, Any]]:
     """(log2 of opacity along the ray, depth of the peak) of one Gaussian on several rays, as in module `gaussian`."""
@@ -215,7 +215,7 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
     for i in range(n * n):
         dx, dy = dr.opaque(mi.Float, (i % n + 0.5) / n), dr.opaque(mi.Float, (i // n + 0.5) / n)
         us, vs = lanes.slopes(dx, dy)
-        respond = partial(_respond, lists=lists, us=us, vs=vs, shared_column=not view.distortion, cap=cap)
+        respond = partial(respond_along, lists=lists, us=us, vs=vs, shared_column=not view.distortion, cap=cap)
         pixels = walk(lists, lanes.start, lanes.stop, respond, far, view.near_plane, cut, end)
         passes.append(_collect(pixels, lanes, lists.instance))
         if n > 1:

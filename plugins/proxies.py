@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.plugins.gaussian import wrapped
+from mitsplat.plugins.device import wrapped
 from mitsplat.surfels import CREASE_ANGLE, corner_normals
 
 NOISE_CREASE = 10.0
@@ -138,12 +138,12 @@ class _TraceScene:
             corners.append(occluder.mesh.triangles.reshape(-1, 3) @ turn.T + shift)
             turn = turn / np.cbrt(np.linalg.det(turn))
             normals.append(smooth_normals(occluder.mesh).reshape(-1, 3) @ turn.T)
-        positions = mi.Float(np.concatenate(corners).ravel().astype(np.float32))
+        positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
         count = sum(len(c) for c in corners)
         mesh = mi.Mesh("proxies", count, count // 3)
         params = mi.traverse(mesh)
         params["vertex_positions"] = positions
-        params["faces"] = mi.UInt32(np.arange(count, dtype=np.uint32))
+        params["faces"] = dr.arange(mi.UInt32, count)
         params.update()
         instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
         return cls(

@@ -20,8 +20,9 @@ import trimesh
 
 from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
+from mitsplat.plugins.device import plain_mesh, wrapped
 from mitsplat.plugins.gaussian import RECORD
-from mitsplat.plugins.march import _respond
+from mitsplat.plugins.march import respond_along
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
 from mitsplat.quality import Quality
@@ -48,7 +49,7 @@ def splat_silhouettes(
         return {}
     ids = np.unique([placement.instance for placement in objects])
     tile, slot = _occupied(lists, fine, ids)
-    covered = _covered(lists, fine, quality, tile, dr.gather(mi.Float, mi.Float(ids.astype(np.float32)), slot))
+    covered = _covered(lists, fine, quality, tile, dr.gather(mi.Float, wrapped(mi.Float, ids.astype(np.float32)), slot))
     return _assemble(np.array(tile), np.array(slot), np.array(covered), ids, canvas, left, top)
 
 
@@ -124,7 +125,7 @@ def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any]:
     dr.scatter(marks, mi.UInt32(1), dr.gather(mi.UInt32, lists.start, filled))
     owner = dr.gather(mi.UInt32, filled, dr.cumsum(marks) - 1)
     instance = dr.gather(mi.Float, lists.records, lists.entries * RECORD + RECORD - 1)
-    slot = dr.gather(mi.UInt32, mi.UInt32(slot_of_id), mi.UInt32(instance))
+    slot = dr.gather(mi.UInt32, wrapped(mi.UInt32, slot_of_id), mi.UInt32(instance))
     seen = dr.zeros(mi.UInt32, tiles * slots)
     count = dr.opaque(mi.UInt32, slots)
     dr.scatter(seen, mi.UInt32(1), owner * count + slot)
@@ -158,7 +159,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance
             mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
         )
         mine = record[RECORD - 1] == instance
-        responses = _respond(record, lists, us, vs, shared_column, cap=None)
+        responses = respond_along(record, lists, us, vs, shared_column, cap=None)
         return i + 1, [
             dr.select(mine & (log_alpha > cut) & (z > near), t * (1 - dr.exp2(log_alpha)), t)
             for t, (log_alpha, z) in zip(through, responses, strict=True)
@@ -238,9 +239,4 @@ def _trace_alone(view: View, window: tuple[int, int, int, int], mesh: trimesh.Tr
 
 @lru_cache(maxsize=128)
 def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> Any:
-    shape = mi.Mesh("alone", len(mesh.vertices), len(mesh.faces))
-    params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, dtype=np.float32).ravel())
-    params["faces"] = mi.UInt32(np.asarray(mesh.faces, dtype=np.uint32).ravel())
-    params.update()
-    return mi.load_dict({"type": "scene", "mesh": shape})
+    return mi.load_dict({"type": "scene", "mesh": plain_mesh(mesh)})

@@ -12,8 +12,9 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
+from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.emitters import reference_irradiance
-from mitsplat.plugins.gaussian import Cloud, upload_cloud, wrapped
+from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, trace
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
@@ -113,6 +114,10 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - |bool|
        - Whether uniformly captured objects also get the light that the surroundings reflect. (Default: true)
 
+     * - highlight
+       - |bool|
+       - Whether lights shine in surfaces, as roughness and specular of the splats say. (Default: true)
+
      * - white
        - |float|
        - Irradiance under which uniformly captured colours are shown unchanged [W/m^2]: pi where radiance 1 is the white
@@ -152,9 +157,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow_error = _number(props, "shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
             raise InputError(f"integrator 'splat_proxy': 'shadow_error' must be in [0, 1) (got {self.shadow_error!r})")
-        self.bounce = props.get("bounce", True)
-        if type(self.bounce) is not bool:
-            raise InputError(f"integrator 'splat_proxy': 'bounce' must be true or false (got {self.bounce!r})")
+        self.bounce, self.highlight = _truth(props, "bounce"), _truth(props, "highlight")
         self.white = _number(props, "white", 0.0)
         if not 0 <= self.white < np.inf:
             raise InputError(f"integrator 'splat_proxy': 'white' must be >= 0 (got {self.white!r})")
@@ -193,34 +196,62 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return image
 
     def render_layers(self, scene: Any, sensor: Any, *, seed: int = 0) -> dict[str, Any]:
-        """All layers as flat row-major device arrays: colours linear, depths along z [m]."""
+        """All layers as flat row-major device arrays: colours linear, depths along z [m].
+
+        Through a thin lens, colours and opacity are means over its aperture; all else is what its centre sees.
+        """
         contents = self._read(scene)
-        view = view_of(sensor)
+        views = view_of(sensor).apertures(self.quality.lens_rings)
+        layers = self._layers(contents, scene, views[0], Accuracy(self.shadow_error, self.shadow_samples), seed)
+        if len(views) > 1:
+            # The mean of n views has sqrt(n) times less noise than each of them.
+            coarse = Accuracy(self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views)))
+            blurred = {name: layers[name] for name in ("rgb", "alpha", "captured")}
+            for number, view in enumerate(views[1:], start=1):
+                seen = self._layers(contents, scene, view, coarse, seed + number)
+                blurred = {name: value + seen[name] for name, value in blurred.items()}
+                dr.eval(blurred)
+            layers |= {name: value / len(views) for name, value in blurred.items()}
+            dr.eval(layers)
+        return layers
+
+    def _layers(self, contents: _Contents, scene: Any, view: View, accuracy: Accuracy, seed: int) -> dict[str, Any]:
+        """The layers that one point of the lens sees."""
         rays = view.rays()
-        seen = self._look(contents, scene, view, rays)
+        behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
+        splat = self._trace_splats(contents, view, behind.depth if behind else None)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
-        dr.eval(proxy_depth, hit, static)
-        colour, alpha, depth, instance = seen.colour, seen.alpha, seen.depth, seen.instance
-        if view.aperture_radius > 0:
-            colour, alpha = self._blur(contents, scene, view, seen)
+        dr.eval(splat, proxy_depth, hit, static)
+
+        covered = dr.maximum(splat.alpha, 1e-6)
+        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
+        alpha, depth, instance = splat.alpha, splat.depth, splat.instance
+        if behind:
+            front = behind.valid & (splat.alpha < 0.5)
+            colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
+            alpha = dr.select(behind.valid, 1, alpha)
+            depth = dr.select(front, behind.depth, depth)
+            instance = dr.select(front, 0, instance)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
             surface = _surface(contents, view, rays, alpha, depth, instance, hit, static)
-            if seen.mesh is not None:
-                surface.relit |= seen.mesh
+            if behind:
+                surface.relit |= front
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
                 surface,
                 instance,
                 view,
-                accuracy=Accuracy(self.shadow_error, self.shadow_samples),
+                accuracy=accuracy,
                 seed=seed,
                 point=self.reference,
                 reference=self._white(scene),
                 grid=contents.grid if self.bounce else None,
             )
+        if not self.highlight:
+            highlight = mi.Color3f(0)
         layers = {
             "rgb": dr.maximum(colour * light + highlight * alpha, 0),
             "alpha": alpha,
@@ -235,34 +266,6 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         }
         dr.eval(layers)
         return layers
-
-    def _look(self, contents: _Contents, scene: Any, view: View, rays: Any) -> _Seen:
-        """Splats, and visible meshes behind them, through one point of the lens."""
-        behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
-        splat = self._trace_splats(contents, view, behind.depth if behind else None)
-        dr.eval(splat)
-        covered = dr.maximum(splat.alpha, 1e-6)
-        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
-        if behind is None:
-            return _Seen(colour, splat.alpha, splat.depth, splat.instance, None)
-        front = behind.valid & (splat.alpha < 0.5)
-        return _Seen(
-            colour + dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0),
-            dr.select(behind.valid, 1, splat.alpha),
-            dr.select(front, behind.depth, splat.depth),
-            dr.select(front, 0, splat.instance),
-            front,
-        )
-
-    def _blur(self, contents: _Contents, scene: Any, view: View, middle: _Seen) -> tuple[Any, Any]:
-        """Mean colour and opacity over the aperture, whose middle is known."""
-        views = view.apertures(self.quality.lens_rings)
-        colour, alpha = middle.colour, middle.alpha
-        for other in views[1:]:
-            seen = self._look(contents, scene, other, other.rays())
-            colour, alpha = colour + seen.colour, alpha + seen.alpha
-            dr.eval(colour, alpha)
-        return colour / len(views), alpha / len(views)
 
     def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
         """Every instance above 0 as it would be seen alone, by its splats or its proxies (``source``).
@@ -357,17 +360,6 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """Linear colour times opacity, opacity, depth [m], instance, and where a visible mesh is what is seen."""
-
-    colour: Any
-    alpha: Any
-    depth: Any
-    instance: Any
-    mesh: Any | None
-
-
-@dataclass(frozen=True, eq=False)
 class _Behind:
     """Visible meshes as the camera sees them."""
 
@@ -448,6 +440,13 @@ def _number(props: mi.Properties, name: str, default: float) -> float:
     if type(value) not in (int, float):
         raise InputError(f"integrator 'splat_proxy': {name!r} must be a number (got {value!r})")
     return float(value)
+
+
+def _truth(props: mi.Properties, name: str) -> bool:
+    value = props.get(name, True)
+    if type(value) is not bool:
+        raise InputError(f"integrator 'splat_proxy': {name!r} must be true or false (got {value!r})")
+    return value
 
 
 def _text(props: mi.Properties, name: str, default: str) -> str:

@@ -19,11 +19,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import MissingResourceError
+from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.gaussian import (
     LOG2_E_HALF,
     RECORD,
     Cloud,
-    aligned,
     conic_touches_rectangle,
     ellipse_bounds,
     ellipse_span,
@@ -31,7 +31,6 @@ from mitsplat.plugins.gaussian import (
     general_response,
     project_gaussian,
     rotation_axes,
-    wrapped,
 )
 from mitsplat.plugins.rays import View
 from mitsplat.quality import KERNELS, Quality
@@ -219,7 +218,7 @@ def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vi
     total = int(sum(counts))
     if len(placements) == 1:
         local = dr.arange(mi.UInt32, total) + dr.opaque(mi.UInt32, clouds.first[placements[0].cloud])
-        return aligned(rows), dr.zeros(mi.UInt32, total), local
+        return wrapped(mi.Float, rows), dr.zeros(mi.UInt32, total), local
     ends = np.cumsum(counts)
     begins = ends - counts
     number = dr.arange(mi.UInt32, total)
@@ -235,7 +234,7 @@ def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vi
     offsets = wrapped(mi.Int32, shift.astype(np.int32))
     local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, offsets, owner))
     dr.eval(owner, local)
-    return aligned(rows), owner, local
+    return wrapped(mi.Float, rows), owner, local
 
 
 class _Source:

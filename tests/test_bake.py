@@ -15,12 +15,13 @@ from mitsplat.assets import Asset
 from mitsplat.bake import BakeSettings, bake_asset
 from mitsplat.cad import bake_lights, emitter_dict, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
+from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.render import ensure_variant
 from mitsplat.scene import AreaLight, EnvironmentLight
 from mitsplat.splats import Splats, evaluate_sh
 from mitsplat.surfels import CREASE_ANGLE, corner_normals, place_surfels, poisson_subset
-from mitsplat.trace import encode_srgb, render_mesh, trace_radiance
+from mitsplat.trace import render_mesh, trace_radiance
 
 FACE_COLOURS = np.array(
     [[230, 40, 40], [40, 200, 60], [50, 70, 220], [220, 200, 40], [40, 200, 210], [200, 60, 200]], dtype=np.uint8

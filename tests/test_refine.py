@@ -9,13 +9,10 @@ import pytest
 from test_render import make_splats
 
 from mitsplat.camera import Camera
+from mitsplat.colour import encode_srgb
 from mitsplat.refine import QUALITY, Picture, RefineSettings, refine_splats
 from mitsplat.render import render_splats
 from mitsplat.splats import Splats
-
-
-def encode(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def cameras(count: int) -> list[Camera]:
@@ -27,7 +24,7 @@ def cameras(count: int) -> list[Camera]:
 def picture(splats: Splats, camera: Camera) -> Picture:
     layers = render_splats(splats, camera, quality=QUALITY)
     alpha = layers.alpha[..., None]
-    colour = np.clip(encode(layers.rgb / np.maximum(alpha, 1e-6)), 0, None) * alpha
+    colour = np.clip(encode_srgb(layers.rgb / np.maximum(alpha, 1e-6)), 0, None) * alpha
     return Picture(camera, colour.astype(np.float32), layers.alpha)
 
 

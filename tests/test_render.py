@@ -17,12 +17,12 @@ from reference import render_reference
 from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
+from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.composite import tone_curve
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.quality import KERNELS, PRESETS, Quality
 from mitsplat.render import Layers, make_sensor, render_splats
 from mitsplat.splats import SH_C0, Splats
-from mitsplat.trace import decode_srgb, encode_srgb
 
 CAPTURES = Path(__file__).parents[2] / "shared/data/splats"
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=50)

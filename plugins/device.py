@@ -1,0 +1,32 @@
+"""Arrays and meshes of the host on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+
+def wrapped(kind: type, values: np.ndarray) -> Any:
+    """Device array of type ``kind`` on a copy of ``values`` that always starts at a whole cache line.
+
+    Dr.Jit compiles other kernels for memory that does not, and where NumPy's own starts is chance.
+    """
+    values = np.ascontiguousarray(values).ravel()
+    memory = np.empty(values.nbytes + 64, dtype=np.uint8)
+    start = -memory.ctypes.data % 64
+    line = memory[start : start + values.nbytes].view(values.dtype)
+    line[...] = values
+    return kind(line)
+
+
+def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:
+    """Mitsuba's shape of a mesh without normals or texture."""
+    shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), props=properties or mi.Properties())
+    params = mi.traverse(shape)
+    params["vertex_positions"] = wrapped(mi.Float, np.asarray(mesh.vertices, dtype=np.float32))
+    params["faces"] = wrapped(mi.UInt32, np.asarray(mesh.faces, dtype=np.uint32))
+    params.update()
+    return shape

@@ -12,8 +12,8 @@ colours of the surroundings are exposed: an object taken in a light tent keeps i
 less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.plugins.bounce`. The highlight is what
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
-Rays are spent where they are needed. A few towards the dynamic objects alone find the points whose light may differ;
-those get ``FIRST_RAYS``, and as many more as the wanted standard error of the filtered ratio asks for.
+Rays are spent where they are needed. One a pixel, towards the dynamic objects alone, finds the places whose light may
+differ; those get ``FIRST_RAYS``, and as many more as the wanted standard error of the filtered ratio asks for.
 """
 
 from __future__ import annotations
@@ -37,9 +37,6 @@ that follows averages a stratified set."""
 R2 = (3242174889, 2447445414)
 """Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
 effectiveness of quasirandom sequences")."""
-
-SEARCH_RAYS = 2
-"""Rays per pixel that look for dynamic objects in the light, of which a tile and its neighbours have 1152."""
 
 FAINT = 0.25
 """Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced."""
@@ -135,8 +132,8 @@ def light_factor(
     needed = surface.valid & (surface.relit | (surface.specular > 0))
     if accuracy.error > 0:
         rays = min(FIRST_RAYS, accuracy.most)
-        enough = FAINT * accuracy.error * SEARCH_RAYS * (3 * BLOCK) ** 2
-        needed = surface.valid & _spread(dr.select(needed, SEARCH_RAYS, tracer.search()), enough, view)
+        enough = dr.opaque(mi.Float, FAINT * accuracy.error * (3 * BLOCK) ** 2)
+        needed = surface.valid & _spread(dr.select(needed, enough, tracer.search()), enough, view)
     else:
         rays = accuracy.most
         needed = mi.Bool(surface.valid)
@@ -146,7 +143,7 @@ def light_factor(
     if not dr.width(index):
         return light, highlight
     estimate = tracer.trace(index, Estimate.nothing(dr.width(surface.valid)), dr.opaque(mi.UInt32, rays))
-    light_filter = LightFilter(surface, group, view, index, needed)
+    light_filter = LightFilter(surface, group, view, index)
     if rays < accuracy.most:
         wanted = light_filter.rays_for(estimate, accuracy.error)
         # Doubled until enough: pixels with the same number of rays go together, so that no lane waits for another.
@@ -180,20 +177,15 @@ def light_factor(
     return light, highlight
 
 
-def _spread(found: Any, enough: float, view: View) -> Any:
-    """Whether enough was found in a pixel's tile of BLOCK x BLOCK pixels and those beside it.
-
-    A pixel counts as often as its rays met something, and is enough alone where all of them did.
-    """
+def _spread(found: Any, enough: Any, view: View) -> Any:
+    """Whether enough was found in a pixel's tile of BLOCK x BLOCK pixels and those beside it."""
     tiles_x, tiles_y = -(-view.width // BLOCK) + 2, -(-view.height // BLOCK) + 2
     pixel = dr.arange(mi.UInt32, view.width * view.height)
     tile = (pixel // view.width // BLOCK + 1) * tiles_x + pixel % view.width // BLOCK + 1
     hits = dr.zeros(mi.Float, tiles_x * tiles_y)
-    alone = dr.opaque(mi.Float, enough)
-    value = dr.select(found < SEARCH_RAYS, mi.Float(found), alone)
-    dr.scatter_reduce(dr.ReduceOp.Add, hits, value, tile, found > 0)
+    dr.scatter_reduce(dr.ReduceOp.Add, hits, found, tile, found > 0)
     beside = [dy * tiles_x + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    return sum((dr.gather(mi.Float, hits, mi.UInt32(mi.Int32(tile) + step)) for step in beside), mi.Float(0)) >= alone
+    return sum((dr.gather(mi.Float, hits, mi.UInt32(mi.Int32(tile) + step)) for step in beside), mi.Float(0)) >= enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,24 +199,16 @@ class _Tracer:
     seed: int
 
     def search(self) -> Any:
-        """How many of ``SEARCH_RAYS`` rays towards the light meet a dynamic proxy."""
+        """1 where one ray towards the light meets a dynamic proxy, else 0."""
         if self.proxies.dynamic is None:
-            return mi.UInt32(0)
+            return mi.Float(0)
         surface = self.surface
-        scene = self.proxies.dynamic.scene
-        start = self._start(dr.arange(mi.UInt32, dr.width(surface.valid)))
         si = receiver(surface.position, surface.normal)
-        origin = _origin(surface)
-
-        def body(i: Any, found: Any) -> tuple[Any, Any]:
-            beam = self.emitters.sample(si, _sequence(start + i * (BLOCK * BLOCK)), surface.valid)
-            active = surface.valid & (dr.sum(beam.irradiance) > 0)
-            met = scene.ray_test(_shadow_ray(origin, beam, surface.offset), active=active)
-            return i + 1, found + dr.select(met, mi.UInt32(1), mi.UInt32(0))
-
-        rounds = dr.opaque(mi.UInt32, SEARCH_RAYS)
-        state = dr.zeros(mi.UInt32, dr.width(surface.valid)), mi.UInt32(0)
-        return dr.while_loop(state, lambda i, _: i < rounds, body, label="search")[1]
+        start = self._start(dr.arange(mi.UInt32, dr.width(surface.valid)))
+        beam = self.emitters.sample(si, _sequence(start), surface.valid)
+        active = surface.valid & (dr.sum(beam.irradiance) > 0)
+        ray = _shadow_ray(_origin(surface), beam, surface.offset)
+        return dr.select(self.proxies.dynamic.scene.ray_test(ray, active=active), mi.Float(1), 0)
 
     def trace(self, index: Any, before: Estimate, rays: Any, *, first: int = 0) -> Estimate:
         """What ``rays`` more rays add to an estimate at the pixels ``index``, which have had ``first``."""
@@ -267,13 +251,10 @@ class _Tracer:
             grid, self.proxies, _origin(here), here.normal, lambda i: _sequence(start + i * (BLOCK * BLOCK))
         )
         count = dr.width(surface.valid)
+        dr.eval(total)
+        ones = dr.full(mi.Float, 1, dr.width(pixels))
+        smooth = LightFilter(surface, group, view, pixels).average([*total], ones, RADIUS)
         images = [dr.zeros(mi.Float, count) for _ in range(3)]
-        traced, rays = dr.zeros(mi.Bool, count), dr.full(mi.Float, 1, count)
-        dr.scatter(traced, mi.Bool(True), pixels)
-        for image, channel in zip(images, total, strict=True):
-            dr.scatter(image, channel, pixels)
-        dr.eval(images, traced)
-        smooth = LightFilter(surface, group, view, pixels, traced).average(images, rays, RADIUS)
         for image, channel in zip(images, smooth, strict=True):
             dr.scatter(image, channel, pixels)
         return mi.Color3f(*[dr.gather(mi.Float, image, index) for image in images])

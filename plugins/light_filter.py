@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +50,12 @@ class Estimate:
         lit, base, shine = (dr.zeros(mi.Color3f, count) for _ in range(3))
         return cls(lit, base, shine, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
 
+    def at(self, index: Any) -> Estimate:
+        """The sums of some pixels."""
+        return Estimate(
+            *[dr.gather(type(v), v, index) for v in (self.lit, self.base, self.shine, self.squares, self.rays)]
+        )
+
     def updated(self, index: Any, *values: Any) -> Estimate:
         """The estimate with new values at some pixels."""
         for old, new in zip((self.lit, self.base, self.shine, self.squares, self.rays), values, strict=True):
@@ -72,95 +77,106 @@ class LightFilter:
     the known neighbours that show the same thing.
     """
 
-    def __init__(self, surface: Any, group: Any, view: View, index: Any, traced: Any) -> None:
-        """A filter at the pixels ``index``; ``traced`` says of every pixel whether it is among them."""
-        self.surface, self.group, self.view, self.index, self.traced = surface, group, view, index, traced
-        self.here = surface.at(index)
-        self.own_group = dr.gather(mi.UInt32, group, index)
-        dr.eval(surface.position, surface.normal, surface.known, self.here, self.own_group)
+    def __init__(self, surface: Any, group: Any, view: View, index: Any) -> None:
+        """A filter at the pixels ``index`` of an image."""
+        self.view, self.index, self.here = view, index, surface.at(index)
+        # What is gathered from neighbours lies together, and holds no more than the pixels in question.
+        self.place = dr.full(mi.UInt32, _NOWHERE, dr.width(group))
+        dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
+        self.group = mi.Float(dr.gather(mi.UInt32, group, index))
+        dr.eval(self.here, self.place, self.group)
 
     def rays_for(self, estimate: Estimate, error: float) -> Any:
         """Rays per pixel of ``index`` after which the filtered share of light has a standard error of ``error``."""
-        _, variance = self._share(estimate)
-        return dr.gather(mi.Float, estimate.rays, self.index) * variance / (GAIN * error * error)
+        here = estimate.at(self.index)
+        _, variance = self._share(here)
+        return here.rays * variance / (GAIN * error * error)
 
     def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any]:
         """Light that arrives, light to compare with, and highlight (Color3f) per ray, at the pixels of ``index``."""
-        share, variance = self._share(estimate)
-        own_share, own_variance = share, variance
-        share, variance = self._everywhere([share, variance])
-
-        def alike(other: Any, same: Any) -> Any:
-            noise = own_variance + dr.gather(mi.Float, variance, other, same)
-            return dr.square(dr.gather(mi.Float, share, other, same) - own_share) <= NOISE_LIMIT * noise
-
-        weight = dr.rcp(dr.maximum(estimate.rays, 1))
-        values = [c * weight for colour in (estimate.lit, estimate.base, estimate.shine) for c in colour]
-        dr.eval(values)
-        values = self.average(values, estimate.rays, RADIUS, alike)
+        here = estimate.at(self.index)
+        weight = dr.rcp(dr.maximum(here.rays, 1))
+        values = [c * weight for colour in (here.lit, here.base, here.shine) for c in colour]
+        values = self.average(values, here.rays, RADIUS, self._share(here))
         return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])
 
-    def _share(self, estimate: Estimate) -> tuple[Any, Any]:
+    def _share(self, here: Estimate) -> tuple[Any, Any]:
         """Share of light that arrives, over 3 x 3 pixels, and its variance."""
-        weight = dr.rcp(dr.maximum(estimate.rays, 1))
-        values = [dr.sum(estimate.lit) * weight, dr.sum(estimate.base) * weight, estimate.squares * weight]
-        dr.eval(values)
-        lit, base, squares = self.average(values, estimate.rays, 1)
+        weight = dr.rcp(dr.maximum(here.rays, 1))
+        values = [dr.sum(here.lit) * weight, dr.sum(here.base) * weight, here.squares * weight]
+        lit, base, squares = self.average(values, here.rays, 1)
         share = dr.select(base > 0, lit / base, 1)
-        rays = SMALL * dr.gather(mi.Float, estimate.rays, self.index)
-        draws = dr.maximum(rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
+        draws = dr.maximum(SMALL * here.rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
         likely = (share * draws + 0.5) / (draws + 1)
         variance = likely * (1 - likely) / draws
         dr.eval(share, variance)
         return share, variance
 
-    def _everywhere(self, values: list[Any]) -> list[Any]:
-        """Values at ``index`` as images."""
-        images = [dr.zeros(mi.Float, dr.width(self.group)) for _ in values]
-        for image, value in zip(images, values, strict=True):
-            dr.scatter(image, value, self.index)
-        dr.eval(images)
-        return images
+    def average(self, values: list[Any], rays: Any, radius: int, share: tuple[Any, Any] | None = None) -> list[Any]:
+        """Averages at the pixels of ``index`` of values there, weighted by rays.
 
-    def average(
-        self, images: list[Any], rays: Any, radius: int, alike: Callable[[Any, Any], Any] = lambda _, same: same
-    ) -> list[Any]:
-        """Averages of images, weighted by their rays, at the pixels of ``index``."""
+        Given a ``share`` of light and its variance, only those neighbours count whose share noise explains.
+        """
+        here = self.here
+        known = dr.select(here.known, mi.Float(1), 0)
+        traits = _packed([*here.position, *here.normal, self.group, known, rays, *(share or (0, 0))])
         steps = [s for r in range(1, radius + 1) for s in (-r, r)]
-        across = self._everywhere(self._average_along(images, rays, [(s, 0) for s in steps], alike))
-        averages = self._average_along(across, rays, [(0, s) for s in steps], alike)
-        dr.eval(averages)
-        return averages
+        for direction in ((1, 0), (0, 1)):
+            values = self._average_along(values, traits, [(s * direction[0], s * direction[1]) for s in steps], share)
+            dr.eval(values)
+        return values
 
     def _average_along(
-        self, images: list[Any], rays: Any, steps: list[tuple[int, int]], alike: Callable[[Any, Any], Any]
+        self, values: list[Any], traits: Any, steps: list[tuple[int, int]], share: tuple[Any, Any] | None
     ) -> list[Any]:
         """Averages over the pixels that are ``steps`` (x, y) away, of which the last ones count half."""
-        here, view = self.here, self.view
+        here, view, width = self.here, self.view, dr.width(self.index)
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
         radius = max(abs(sum(step)) for step in steps)
-        own = [dr.gather(mi.Float, image, self.index) for image in images]
-        weights = dr.gather(mi.Float, rays, self.index) * dr.select(here.known, 1, GUESS_WEIGHT)
-        sums = [mi.Float(0) for _ in images]
+        images = _packed(values)
+        own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_TRAITS, width))[8]
+        weights = own_rays * dr.select(here.known, 1, GUESS_WEIGHT)
+        sums = [mi.Float(0) for _ in values]
         for step in steps:
             nx, ny, distance = x + step[0], y + step[1], abs(sum(step))
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
-            other = mi.UInt32(ny * view.width + nx)
-            inside &= dr.gather(mi.Bool, self.traced, other, inside)
-            same = inside & (dr.gather(mi.UInt32, self.group, other, inside) == self.own_group)
-            position = dr.gather(mi.Point3f, self.surface.position, other, same)
-            normal = dr.gather(mi.Vector3f, self.surface.normal, other, same)
+            place = dr.gather(mi.UInt32, self.place, mi.UInt32(ny * view.width + nx), inside)
+            same = inside & (place != _NOWHERE)
+            other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
+            position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
+            group, known, rays = other[6], other[7] > 0, other[8]
+            same &= group == self.group
             plane = dr.abs(dr.dot(here.normal, position - here.position))
-            known = dr.gather(mi.Bool, self.surface.known, other, same)
-            near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * (8 * distance)) & alike(other, same)
+            near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * (8 * distance))
+            if share is not None:
+                near &= dr.square(other[9] - share[0]) <= NOISE_LIMIT * (share[1] + other[10])
             same &= (near & (known == here.known)) | (known & ~here.known)
             # Halves at the ends: the filter spans one period of the dither, not one pixel more.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * (0.5 if distance == radius else 1.0)
-            weight = dr.select(same, weight * dr.gather(mi.Float, rays, other, same), 0)
+            weight = dr.select(same, weight * rays, 0)
             weights += weight
+            theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))
             # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
             sums = [
-                dr.fma(weight, dr.gather(mi.Float, image, other, same) - middle, total)
-                for image, middle, total in zip(images, own, sums, strict=True)
+                dr.fma(weight, their - own, total)
+                for their, own, total in zip(theirs[: len(values)], values, sums, strict=True)
             ]
-        return [middle + total / weights for middle, total in zip(own, sums, strict=True)]
+        return [own + total / weights for own, total in zip(values, sums, strict=True)]
+
+
+_NOWHERE = 0xFFFFFFFF
+_TRAITS = 12
+
+
+def _padded(count: int) -> int:
+    return -(-count // 4) * 4
+
+
+def _packed(columns: list[Any]) -> Any:
+    """One row of floats per pixel, padded to packets of four."""
+    columns = [mi.Float(column) for column in columns]
+    count, stride = max(dr.width(column) for column in columns), _padded(len(columns))
+    rows = dr.empty(mi.Float, stride * count)
+    dr.scatter(rows, mi.ArrayXf([*columns, *[mi.Float(0)] * (stride - len(columns))]), dr.arange(mi.UInt32, count))
+    dr.eval(rows)
+    return rows

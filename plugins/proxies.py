@@ -92,7 +92,7 @@ class _TraceScene:
         """The nearer of ``other`` and what the rays meet here."""
         if self is None:
             return other
-        si = self.scene.ray_intersect(ray)
+        si = self.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True)
         closer = si.t < other.distance
         proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
         number = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)

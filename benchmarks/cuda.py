@@ -21,11 +21,11 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
-from benchmarks.volprim import render_volprim, volprim_scene
 from mitsplat.colour import encode_srgb
 from mitsplat.quality import resolve_quality
 from mitsplat.render import make_sensor, render_splats
 from mitsplat.splats import Splats
+from mitsplat.volprim import render_volprim, volprim_scene
 
 
 def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int = 30) -> float:

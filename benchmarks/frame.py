@@ -16,8 +16,8 @@ from pathlib import Path
 
 import mitsplat as ms
 from benchmarks.captures import CAMERA, crowd
-from benchmarks.volprim import render_volprim, volprim_scene
 from mitsplat.scene import layout_of
+from mitsplat.volprim import render_volprim, volprim_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 

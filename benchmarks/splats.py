@@ -23,11 +23,11 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
-from benchmarks.volprim import render_volprim, volprim_scene
 from mitsplat.camera import Camera
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.render import ensure_variant, make_sensor, render_splats
 from mitsplat.splats import Splats
+from mitsplat.volprim import render_volprim, volprim_scene
 
 FMA_PER_EVALUATION = 20
 """Fused multiply-adds, or operations that cost as much, of one Gaussian on one ray: response, blending, ids."""

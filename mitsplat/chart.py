@@ -36,10 +36,13 @@ INSTANCE_MIN = 50
 
 @dataclass(frozen=True)
 class Step:
-    """One way to make the pictures: what the splat renderer computes, and changes to the scene file by key."""
+    """One way to make the pictures: what the splat renderer computes, and changes to the scene file by key.
+
+    Without a quality, Mitsuba's own ``ellipsoids`` and ``volprim_rf_basic`` render a file of splats.
+    """
 
     name: str
-    quality: Quality
+    quality: Quality | None
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -49,6 +52,7 @@ STEPS = (
     Step("fast, EWA response", replace(_FAST, response="ewa")),
     Step("fast, cut at 1/255, SH 1", replace(_FAST, alpha_min=1 / 255, sh_degree=1)),
 )
+SPLATS_STEPS = (Step("Mitsuba's volprim_rf_basic", None),)
 LIGHT_STEPS = (
     Step("fast, shadow error 0.1", _FAST, {"composite.shadow_error": 0.1}),
     Step("fast, no bounce", _FAST, {"composite.bounce": False}),
@@ -68,7 +72,7 @@ class Row:
         psnr: The same in dB; infinite for ``exact``.
         largest: Largest error of a channel.
         ssim: Mean structural similarity (Wang et al. 2004).
-        mask_iou: Mean IoU of the instances' pixels; NaN without instances.
+        mask_iou: Mean IoU of the instances' pixels; NaN without instances, and where the step tells none.
         memory: Peak memory of the process [GiB].
     """
 
@@ -87,7 +91,7 @@ class _Shots:
     """Pictures (K, H, W, 3) and instances (K, H, W) of one step, their median time [s] and peak memory [GiB]."""
 
     pictures: npt.NDArray[np.float32]
-    instances: npt.NDArray[np.uint16]
+    instances: npt.NDArray[np.uint16] | None
     seconds: float
     memory: float
 
@@ -117,7 +121,7 @@ def measure_steps(
     if frames < 1:
         raise InputError(f"frames must be at least 1 (got {frames})")
     if steps is None:
-        steps = STEPS if _is_splats(path) else STEPS + LIGHT_STEPS
+        steps = STEPS + (SPLATS_STEPS if _is_splats(path) else LIGHT_STEPS)
     exact = Step("exact", PRESETS["exact"])
     plan = [exact, *(step for step in steps if step != exact)]
     rows: dict[str, Row] = {}
@@ -167,15 +171,18 @@ def _run_alone(path: Path, step: Step, frames: int, overrides: Mapping[str, Any]
             raise MissingResourceError(f"{path}: the process of '{step.name}' died; is there enough memory?") from error
 
 
-def _shoot(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> _Shots:
+def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any]) -> _Shots:
     """Make the pictures; the first one twice, because it compiles or loads kernels."""
-    shooter = _splats_shooter if _is_splats(path) else _scene_shooter
-    shoot = shooter(path, quality, frames, overrides)
+    if quality is None:
+        shoot = _volprim_shooter(path, frames, overrides)
+    else:
+        shooter = _splats_shooter if _is_splats(path) else _scene_shooter
+        shoot = shooter(path, quality, frames, overrides)
     shots = [shoot(i) for i in (0, *range(frames))][1:]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return _Shots(
         np.stack([picture for picture, _, _ in shots]),
-        np.stack([instance for _, instance, _ in shots]),
+        None if quality is None else np.stack([instance for _, instance, _ in shots]),
         statistics.median(seconds for _, _, seconds in shots),
         peak / 2 ** (30 if sys.platform == "darwin" else 20),
     )
@@ -221,6 +228,25 @@ def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[s
     return shoot
 
 
+def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+    from mitsplat.colour import encode_srgb
+    from mitsplat.render import ensure_variant
+    from mitsplat.volprim import render_volprim, volprim_scene
+
+    ensure_variant()
+    splats = Splats.load(path)
+    width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
+
+    def shoot(i: int) -> Shot:
+        scene = volprim_scene(splats, look_around(splats, i, frames, width=width, height=height))
+        start = time.perf_counter()
+        picture = render_volprim(scene)
+        seconds = time.perf_counter() - start
+        return np.clip(encode_srgb(picture), 0, 1).astype(np.float32), np.empty(0, np.uint16), seconds
+
+    return shoot
+
+
 def look_around(splats: Splats, index: int, count: int, *, width: int, height: int) -> Camera:
     """View ``index`` of ``count`` on a circle around splats whose up axis is -y, as files of 3DGS have it."""
     centre = np.median(splats.means, axis=0)
@@ -239,12 +265,6 @@ def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
         structural_similarity(a, b, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
         for a, b in zip(shots.pictures, truth.pictures, strict=True)
     ]
-    ious = []
-    for a, b in zip(shots.instances, truth.instances, strict=True):
-        ids, counts = np.unique(b[b > 0], return_counts=True)
-        for instance in ids[counts >= INSTANCE_MIN]:
-            mine, theirs = a == instance, b == instance
-            ious.append(np.count_nonzero(mine & theirs) / np.count_nonzero(mine | theirs))
     return Row(
         name,
         shots.seconds,
@@ -252,9 +272,22 @@ def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
         -20 * math.log10(rmse) if rmse > 0 else math.inf,
         float(np.abs(difference).max()),
         float(np.mean(ssim)),
-        float(np.mean(ious)) if ious else math.nan,
+        _mask_iou(shots.instances, truth.instances),
         shots.memory,
     )
+
+
+def _mask_iou(mine: npt.NDArray[np.uint16] | None, theirs: npt.NDArray[np.uint16] | None) -> float:
+    """Mean IoU over the instances of all pictures, or NaN."""
+    if mine is None or theirs is None:
+        return math.nan
+    ious = []
+    for a, b in zip(mine, theirs, strict=True):
+        ids, counts = np.unique(b[b > 0], return_counts=True)
+        for instance in ids[counts >= INSTANCE_MIN]:
+            own, other = a == instance, b == instance
+            ious.append(np.count_nonzero(own & other) / np.count_nonzero(own | other))
+    return float(np.mean(ious)) if ious else math.nan
 
 
 def write_csv(rows: Sequence[Row], file: Path) -> None:

@@ -64,6 +64,8 @@ def test_chart_command_writes_table_csv_and_picture(splat_file: Path, tmp_path: 
     with out.with_suffix(".csv").open() as stream:
         lines = list(csv.DictReader(stream))
     assert {"fast", "balanced", "exact"} < {line["name"] for line in lines}
+    theirs = next(line for line in lines if "volprim" in line["name"])
+    assert 0 < float(theirs["rmse"]) < 0.5 and theirs["mask_iou"] == "nan"
     assert float(next(line for line in lines if line["name"] == "exact")["rmse"]) == 0
 
 

@@ -1,4 +1,4 @@
-"""Mitsuba's own splat path, ``ellipsoids`` + ``volprim_rf_basic``, on the same splats and camera: the yardstick."""
+"""Mitsuba's own splat path, ``ellipsoids`` and ``volprim_rf_basic``, on the same splats and camera: a yardstick."""
 
 from __future__ import annotations
 
@@ -43,5 +43,5 @@ def volprim_scene(splats: Splats, camera: Camera) -> Any:
 
 
 def render_volprim(scene: Any) -> np.ndarray:
-    """One image (H, W, 3), as the plugin gives it."""
+    """One linear image (H, W, 3), as the plugin gives it."""
     return np.array(mi.render(scene, spp=1))

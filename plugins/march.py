@@ -144,16 +144,18 @@ class Lanes:
     """
 
     def __init__(self, lists: TileLists, view: View) -> None:
-        lane = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * TILE)
-        tile = lane // TILE
+        count = view.tiles_x * view.tiles_y if lists.tiles is None else dr.width(lists.tiles)
+        lane = dr.arange(mi.UInt32, count * TILE)
+        own = lane // TILE
+        tile = own if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, own)
         tile_y = tile // view.tiles_x
         self.view = view
         self.x = (tile - tile_y * view.tiles_x) * TILE + lane % TILE
         self.y = tile_y * TILE
         self.pixel = [(self.y + k) * view.width + self.x for k in range(TILE)]
         self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(TILE)]
-        self.start = dr.gather(mi.UInt32, lists.start, tile)
-        self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, tile), self.start)
+        self.start = dr.gather(mi.UInt32, lists.start, own)
+        self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, own), self.start)
 
     def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
         """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
@@ -207,6 +209,8 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
         for p, m in zip(lanes.pixel, lanes.inside, strict=True)
     ]
     walk = _walk_in_tile_order if quality.order == "tile" else _walk_in_ray_order
+    if quality.order == "ray":
+        dr.eval(lists.nearest)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end = dr.opaque(mi.Float, quality.transmittance_min)
     alpha_max = KERNELS[quality.kernel].alpha_max

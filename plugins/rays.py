@@ -67,6 +67,12 @@ class View:
         return self._opaque["near"]
 
     @property
+    def key(self) -> tuple[Any, ...]:
+        """What tells two views apart."""
+        lens = self.fx, self.fy, self.cx, self.cy, self.distortion, self.lens, self.shift
+        return self.width, self.height, *lens, self.near, self.samples, self.world_from_camera.tobytes()
+
+    @property
     def tiles_x(self) -> int:
         """Number of tiles along x."""
         return -(-self.width // TILE)

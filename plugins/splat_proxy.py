@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,8 +22,9 @@ from mitsplat.plugins.march import Image, trace
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
-from mitsplat.plugins.tiles import CloudSet, Placement, merge_clouds
-from mitsplat.quality import resolve_quality
+from mitsplat.plugins.still import StillLayer
+from mitsplat.plugins.tiles import CloudSet, CrowdedError, Placement, merge_clouds
+from mitsplat.quality import Quality, resolve_quality
 
 AOVS = (
     "captured.R",
@@ -170,6 +173,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
         self._grid: tuple[Any, RadianceGrid | None] | None = None
+        self._still: tuple[tuple[Any, Quality, list[Any]], StillLayer | None] | None = None
 
     def aov_names(self) -> list[str]:
         """Names of the channels after R, G, B and A."""
@@ -294,17 +298,32 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
         fine = view.sampled(self.quality.samples)
+        still = self._still_layer(contents, fine, z_max)
+        if still is not None:
+            objects = [p for p in contents.placements if p.instance]
+            with suppress(CrowdedError):
+                return still.with_objects(contents.clouds, objects, fine, self.quality, z_max)
         return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
+
+    def _still_layer(self, contents: _Contents, view: View, z_max: Any | None) -> StillLayer | None:
+        """What is static as seen from here, from the second time that the camera is in the same place."""
+        static = [p for p in contents.placements if p.instance == 0]
+        if not static or len(static) == len(contents.placements):
+            return None
+        fixed = [s for s in contents.shapes if getattr(s, "instance", 0) == 0]
+        seen = view.key, self.quality, fixed
+        if self._still is None or not _same(self._still[0], seen):
+            self._still = seen, None
+        elif self._still[1] is None:
+            with suppress(CrowdedError):
+                self._still = seen, StillLayer.of(contents.clouds, static, view, self.quality, z_max)
+        return self._still[1]
 
     def _read(self, scene: Any) -> _Contents:
         """Upload what the shapes hold, unless they are those of the last call."""
         shapes = tuple(scene.shapes())
         known = self._contents
-        if (
-            known is not None
-            and len(known.shapes) == len(shapes)
-            and all(a is b for a, b in zip(known.shapes, shapes, strict=True))
-        ):
+        if known is not None and _identical(known.shapes, shapes):
             return known
         carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
         visible = [s for s in shapes if not hasattr(s, "world_from_splats") and not s.is_emitter()]
@@ -357,6 +376,15 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""
         return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
+
+
+def _same(a: tuple[Any, Quality, list[Any]], b: tuple[Any, Quality, list[Any]]) -> bool:
+    """Whether two cameras, presets and lists of shapes are the same."""
+    return a[:2] == b[:2] and _identical(a[2], b[2])
+
+
+def _identical(some: Sequence[Any], others: Sequence[Any]) -> bool:
+    return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,6 +126,8 @@ class TileLists:
         start, stop: Range of each tile in ``entries``.
         visible, pairs: Number of records and of entries.
         instance: Id of all of them, or None if they have several.
+        levels: What entries are sorted by in their tile.
+        tiles: Numbers of the tiles whose ranges these are; None for all of the view's.
     """
 
     records: Any
@@ -138,7 +140,9 @@ class TileLists:
     stop: Any
     visible: int
     pairs: int
-    instance: int | None = None
+    instance: int | None
+    levels: Any
+    tiles: Any | None = None
 
 
 def bin_gaussians(
@@ -176,19 +180,36 @@ def bin_gaussians(
     pairs = _pair(dr.detach(records), least, box, view, quality)
     if pairs is None:
         return _empty(tiles, records)
-    slots = _sorted(pairs.level, DEPTH_BITS)
-    slots = _sorted(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
-    entries = dr.gather(mi.UInt32, pairs.record, slots)
-    nearest = dr.zeros(mi.Float, 1)
-    if quality.order == "ray":
-        nearest = _depth_of_level(dr.gather(mi.UInt32, pairs.level, slots), view)
-    begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
-    start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
-    dr.eval(entries, nearest, start, stop)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
-    numbers = count, dr.width(entries), only
-    return TileLists(records, near_rows, entries, slots, pairs.first, nearest, start, stop, *numbers)
+    return _listed(records, near_rows, pairs, count, tiles, view, only)
+
+
+def _listed(
+    records: Any, near: Any, pairs: _Pairs, visible: int, tiles: int, view: View, only: int | None, own: Any = None
+) -> TileLists:
+    """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
+    slots = _sorted(pairs.level, DEPTH_BITS)
+    slots = _sorted(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
+    entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
+    begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
+    start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
+    dr.eval(entries, start, stop)
+    return TileLists(
+        records=records,
+        near=near,
+        entries=entries,
+        slots=slots,
+        first=pairs.first,
+        levels=levels,
+        nearest=_depth_of_level(levels, view),
+        start=start,
+        stop=stop,
+        visible=visible,
+        pairs=dr.width(entries),
+        instance=only,
+        tiles=own,
+    )
 
 
 def _empty(tiles: int, records: Any | None = None) -> TileLists:
@@ -197,7 +218,54 @@ def _empty(tiles: int, records: Any | None = None) -> TileLists:
     entry = dr.zeros(mi.UInt32, 1)
     visible = 0 if records is None else dr.width(records) // RECORD
     records = dr.zeros(mi.Float, RECORD) if records is None else records
-    return TileLists(records, None, entry, entry, entry, dr.zeros(mi.Float, 1), zeros, zeros, visible, 0)
+    none = dr.zeros(mi.Float, 1)
+    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry)
+
+
+def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:
+    """The lists of some tiles of a view with the Gaussians of both, as if they had been binned together.
+
+    Raises:
+        CrowdedError: If there are too many pairs to hold.
+    """
+    count = dr.width(tiles)
+    record: list[Any] = []
+    tile: list[Any] = []
+    level: list[Any] = []
+    visible = dr.width(first.records) // RECORD
+    for lists, shift in ((first, 0), (second, visible)):
+        start = dr.gather(mi.UInt32, lists.start, tiles)
+        length = dr.gather(mi.UInt32, lists.stop, tiles) - start
+        begin, size = _ranges(length)
+        if size == 0:
+            continue
+        parts = [dr.empty(mi.UInt32, size) for _ in range(3)]
+        offset = dr.opaque(mi.UInt32, shift)
+
+        def one_pair(
+            k: Any, start: Any = start, begin: Any = begin, parts: Any = parts, lists: Any = lists, offset: Any = offset
+        ) -> tuple[Any]:
+            entry, at = start + k, begin + k
+            dr.scatter(parts[0], dr.gather(mi.UInt32, lists.entries, entry) + offset, at, mode=dr.ReduceMode.Permute)
+            dr.scatter(parts[1], dr.arange(mi.UInt32, count), at, mode=dr.ReduceMode.Permute)
+            dr.scatter(parts[2], dr.gather(mi.UInt32, lists.levels, entry), at, mode=dr.ReduceMode.Permute)
+            return (k + 1,)
+
+        dr.while_loop((dr.zeros(mi.UInt32, count),), lambda k, length=length: k < length, one_pair, label="merge")
+        dr.eval(parts)
+        for whole, part in zip((record, tile, level), parts, strict=True):
+            whole.append(part)
+    pairs = _Pairs(dr.concat(record), dr.concat(tile), dr.concat(level), None)
+    records, near = second.records, second.near
+    if near is not None and first.near is not None:
+        # The rows of the second follow those of the first.
+        row, a = dr.arange(mi.UInt32, second.visible) * RECORD, mi.Float(dr.width(first.near) // RECORD)
+        shifted = dr.copy(records)
+        dr.scatter(shifted, dr.gather(mi.Float, records, row) + a, row, dr.gather(mi.Float, records, row + 2) < 0)
+        records, near = shifted, dr.concat([first.near, near])
+    records = dr.concat([first.records, records])
+    near = first.near if near is None else near
+    return _listed(records, near, pairs, visible + second.visible, count, view, None, tiles)
 
 
 def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import WriteScene
 from PIL import Image
 from pydantic import TypeAdapter
+from test_render import make_splats
 
 import mitsplat as ms
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.quality import PRESETS
+from mitsplat.render import make_integrator, make_splats_shape, render_layers
 from mitsplat.scene import FramePlan, LightSpec
 from mitsplat.writers import Catalogue, write_frame
 from mitsplat.xml_scene import export_xml, render_xml
@@ -195,3 +198,34 @@ def test_bad_xml_is_one_sentence(tmp_path: Any) -> None:
 def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:
     with pytest.raises(InputError):
         ms.render_frame(scene, 12)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("quality", ["fast", "balanced"])
+@pytest.mark.parametrize("close", [False, True])
+def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: int, close: bool) -> None:
+    """From the third picture on only tiles with objects are made anew, also where something static is before them."""
+    ms.render_splats(make_splats(1), Camera.look_at((0, 0, -2), (0, 0, 0), width=8, height=8, fov_x=50))
+    static = make_splats_shape(make_splats(300, 1, scales=(0.02, 0.1)))
+    things = [make_splats(40, seed, spread=0.15, scales=(0.01, 0.05)) for seed in (2, 3, 4)]
+    camera = Camera.look_at((0, 0, -0.3 if close else -2), (0, 0, 0), up=(0, -1, 0), width=50, height=37, fov_x=50)
+
+    def scene(number: int) -> Any:
+        pose = np.eye(4)
+        pose[0, 3] = 0.2 * number - 0.3
+        thing = make_splats_shape(things[number], pose, instance=number + 1)
+        return mi.load_dict({"type": "scene", "static": static, "thing": thing})
+
+    def layers(integrator: Any, number: int) -> ms.Layers:
+        return render_layers(integrator, scene(number), camera)
+
+    chosen = replace(PRESETS[quality], samples=samples)
+    still = make_integrator(quality=chosen, shadow="none")
+    for number in (0, 1, 2, 0):
+        got, fresh = layers(still, number), layers(make_integrator(quality=chosen, shadow="none"), number)
+        for field in fields(got):
+            assert np.array_equal(getattr(got, field.name), getattr(fresh, field.name)), (number, field.name)
+    assert still._still is not None and still._still[1] is not None
+    elsewhere = replace(camera, cx=camera.cx + 1)
+    render_layers(still, scene(0), elsewhere)
+    assert still._still[1] is None

@@ -1,0 +1,79 @@
+"""The static part of a picture, kept while the camera stands still.
+
+Where no Gaussian of a dynamic object meets a tile, its pixels are those of the static splats alone. Where one does, the
+tile's two lists are merged and walked as one, so that what is static still hides what is behind it: the picture is the
+same, bit for bit, as one made of everything at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.plugins.march import Image, Lanes, march
+from mitsplat.plugins.rays import View
+from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians, merge_lists
+from mitsplat.quality import Quality
+
+
+@dataclass(frozen=True, eq=False)
+class StillLayer:
+    """Static splats as one camera sees them.
+
+    Attributes:
+        lists: Their Gaussians per tile.
+        image: Their picture.
+    """
+
+    lists: TileLists
+    image: Image
+
+    @classmethod
+    def of(
+        cls, clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, z_max: Any | None
+    ) -> StillLayer:
+        """The layer of some placements; arguments as of :func:`mitsplat.plugins.march.trace`.
+
+        Raises:
+            CrowdedError: If they are too many to be kept.
+        """
+        # Weights of instances are kept as they are where there are several, so that no pixel changes.
+        lists = replace(bin_gaussians(clouds, placements, view, quality), instance=None)
+        image = march(lists, view, quality, z_max=z_max)
+        dr.eval(image)
+        return cls(lists, image)
+
+    def with_objects(
+        self, clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, z_max: Any | None
+    ) -> Image:
+        """The picture with more placements in it.
+
+        Raises:
+            CrowdedError: If they are too many.
+        """
+        objects = bin_gaussians(clouds, placements, view, quality)
+        touched = dr.compress(objects.stop > objects.start)
+        if dr.width(touched) == 0:
+            return self.image
+        lists = merge_lists(self.lists, objects, touched, view)
+        part = march(lists, view, quality, z_max=z_max)
+        changed = dr.zeros(mi.Bool, view.width * view.height)
+        lanes = Lanes(lists, view)
+        for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
+            dr.scatter(changed, mi.Bool(True), pixel, inside)
+        dr.eval(changed, part)
+        merged = {name: _select(changed, getattr(part, name), getattr(self.image, name)) for name in _CHANNELS}
+        return Image(**merged)
+
+
+_CHANNELS = tuple(field.name for field in fields(Image))
+
+
+def _select(changed: Any, new: Any, old: Any) -> Any:
+    if isinstance(new, list):
+        return [dr.select(changed, a, b) for a, b in zip(new, old, strict=True)]
+    return dr.select(changed, new, old)

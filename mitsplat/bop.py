@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
@@ -28,6 +27,7 @@ from scipy.spatial.distance import pdist
 from mitsplat.coco import camera_of
 from mitsplat.files import Record, write_file, write_text
 from mitsplat.label import Labels
+from mitsplat.maps import encode_mask_png
 
 MILLIMETRES = 1000.0
 
@@ -37,14 +37,12 @@ def scene_folder(record: Record) -> str:
     return f"bop/{record['split']}/{record['layout']:06d}"
 
 
-def mask_images(labels: Labels) -> Iterable[tuple[str, int, npt.NDArray[np.uint8]]]:
-    """(folder, position of the instance, picture of 0 and 255) of every mask of a frame."""
+def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
+    """(folder, position of the instance, PNG of 0 and 255) of every mask of a frame."""
+    size = labels.width, labels.height
     for position, label in enumerate(labels.instances):
-        for folder, box, mask in (("mask", label.amodal.box, label.amodal.mask), ("mask_visib", label.box, label.mask)):
-            x0, y0, x1, y1 = box
-            picture = np.zeros((labels.height, labels.width), dtype=np.uint8)
-            picture[y0:y1, x0:x1] = np.where(mask, np.uint8(255), np.uint8(0))
-            yield folder, position, picture
+        yield "mask", position, encode_mask_png(label.amodal.mask, label.amodal.box, size)
+        yield "mask_visib", position, encode_mask_png(label.mask, label.box, size)
 
 
 def write_scenes(root: Path, records: Iterable[Record]) -> None:

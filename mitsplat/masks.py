@@ -63,13 +63,17 @@ class Silhouette:
 def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
     """COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height).
 
-    Runs go down the columns. Only the box's columns are looked at, in a tenth of pycocotools' time for whole images.
+    Runs go down the columns. Only the box is looked at, in a tenth of pycocotools' time for whole images.
     """
     x0, y0, x1, y1 = box
     width, height = size
-    columns = np.zeros((x1 - x0) * height + 2, dtype=np.int8)
-    columns[1:-1].reshape(x1 - x0, height)[:, y0:y1] = mask.T
-    turns = np.flatnonzero(np.diff(columns)) + x0 * height
+    columns = np.zeros((x1 - x0, y1 - y0 + 2), dtype=np.int8)
+    columns[:, 1:-1] = mask.T
+    column, row = np.divmod(np.flatnonzero(np.diff(columns, axis=1)), y1 - y0 + 1)
+    turns = (x0 + column) * height + y0 + row
+    # A run that goes on at the top of the next column neither ends nor begins there.
+    goes_on = np.flatnonzero(np.diff(turns) == 0)
+    turns = np.delete(turns, np.concatenate([goes_on, goes_on + 1]))
     counts = np.diff(turns, prepend=0, append=width * height)
     if counts[-1] == 0:
         counts = counts[:-1]

@@ -39,7 +39,7 @@ def outline(mask: BoolArray) -> FloatArray:
         for ring in cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     ]
     polygon: FloatArray = _corners(_joined(rings, (height, width))) + np.float64(0.5)
-    ys, xs = np.nonzero(mask)
+    xs, ys = (np.flatnonzero(mask.any(axis=axis)) for axis in (0, 1))
     for axis, edge in ((0, xs.min()), (0, xs.max() + 1), (1, ys.min()), (1, ys.max() + 1)):
         at = int(np.abs(polygon[:, axis] - edge).argmin())
         spike = polygon[[at, at]]

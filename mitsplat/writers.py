@@ -168,8 +168,9 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
             scene = bop.scene_folder(record)
             add(f"{scene}/rgb/{frame.index:06d}.{output.image}", lambda path: link_file(root / image, path))
             add_png(f"{scene}/depth/{frame.index:06d}.png", depth)
-            for folder, position, picture in bop.mask_images(labels):
-                add_png(f"{scene}/{folder}/{frame.index:06d}_{position:06d}.png", picture)
+            for folder, position, data in bop.mask_pictures(labels):
+                file = f"{scene}/{folder}/{frame.index:06d}_{position:06d}.png"
+                add(file, lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
     if "normals" in formats:
         add_png(f"normals/{name}.png", maps.normal_picture(frame.normal))
     if "flow" in formats and plan.next_camera is not None:

@@ -1,5 +1,6 @@
 """Labels: what is kept, exclusivity, and outlines that come back through Ultralytics' way of reading them."""
 
+import io
 import json
 from dataclasses import dataclass
 
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from pycocotools import mask as coco_mask
 
 from mitsplat.label import LabelRules, Labels, Truth, label_instances
+from mitsplat.maps import encode_mask_png
 from mitsplat.masks import Silhouette, encode_mask
 from mitsplat.outline import fill_polygon, outline
 from mitsplat.yolo import yolo_lines
@@ -318,14 +321,36 @@ def test_masks_are_exclusive_and_cover_the_map():
     np.testing.assert_array_equal(total, ids > 0)
 
 
-@pytest.mark.parametrize("box", [(0, 0, 40, 30), (5, 3, 20, 17), (30, 20, 40, 30), (0, 29, 40, 30), (39, 0, 40, 30)])
-@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize(
+    "box", [(0, 0, 40, 30), (5, 3, 20, 17), (30, 20, 40, 30), (0, 29, 40, 30), (39, 0, 40, 30), (3, 0, 9, 30)]
+)
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.0])
 def test_run_lengths_are_those_of_pycocotools(box, share):
     x0, y0, x1, y1 = box
     mask = np.random.default_rng(x0 + y1).random((y1 - y0, x1 - x0)) <= share
     canvas = np.zeros((30, 40), dtype=np.uint8, order="F")
     canvas[y0:y1, x0:x1] = mask
     assert encode_mask(mask, box, (40, 30)) == coco_mask.encode(canvas)["counts"].decode()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (300, 2), (41, 700)])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_mask_as_png_is_what_readers_of_png_read(size, share):
+    """OpenCV (libpng) and Pillow both check every checksum."""
+    width, height = size
+    rng = np.random.default_rng(width)
+    for _ in range(8):
+        (x0, x1), (y0, y1) = (sorted(rng.choice(extent + 1, 2, replace=False).tolist()) for extent in size)
+        mask = rng.random((y1 - y0, x1 - x0)) < share
+        data = encode_mask_png(mask, (x0, y0, x1, y1), size)
+        canvas = np.zeros((height, width), dtype=np.uint8)
+        canvas[y0:y1, x0:x1] = 255 * mask
+        back = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(back, canvas)
+        with Image.open(io.BytesIO(data)) as picture:
+            assert picture.mode == "L"
+            np.testing.assert_array_equal(np.asarray(picture), canvas)
+        Image.open(io.BytesIO(data)).verify()
 
 
 def test_json_gives_the_labels_back():

@@ -178,7 +178,8 @@ def _check_whole(root: Path, records: list[Record]) -> Violations:
         if len(same) > 1:
             yield same[1], f"is the same picture as {same[0]}"
     known = {file for record in records for file in record["files"]}
-    for folder in sorted(f"{task.folder}{kind}" for task in TASKS.values() for kind in ("images", "labels")):
+    folders = [f"{task.folder}{kind}" for task in TASKS.values() for kind in ("images", "labels")]
+    for folder in sorted([*folders, "voc/Annotations", "voc/JPEGImages"]):
         for path in sorted((root / folder).rglob("*")):
             file = path.relative_to(root).as_posix()
             # Ultralytics leaves a cache of what it read beside the labels.

@@ -67,7 +67,7 @@ _UNFINISHED = re.compile(r"\.lock|\.dataset\.json\.\d+\.part")
 """Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
     *("images", "labels", "layers", "annotations", "layouts", "scene"),
-    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "bop", "colmap"),
+    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "voc", "bop", "colmap"),
     *("depth", "normals", "instances", "semantic", "flow", "report.html"),
     *("data.yaml", _SHEET, _MANIFEST, _TIMINGS, _RUNS, _CONTENT, _LOCK),
 )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from mitsplat.files import Record
 from mitsplat.label import InstanceLabel, Labels
 from mitsplat.maps import instance_picture
 from mitsplat.outline import fill_polygon
+from mitsplat.voc import flags
 from mitsplat.yolo import rotated_box
 
 _ROUNDED_PIXELS = 4
@@ -56,8 +58,12 @@ def check_image(frame: WrittenFrame, path: Path) -> Iterator[str]:
         yield "has one colour only"
 
 
-def _rows(frame: WrittenFrame, path: Path) -> Iterator[tuple[InstanceLabel, list[float]] | str]:
-    """The instances and the numbers of their lines, or what is wrong with the file."""
+LineCheck = Callable[[WrittenFrame, InstanceLabel, list[float]], Iterator[str]]
+"""What is wrong with the numbers of an instance's line."""
+
+
+def _check_lines(check: LineCheck, frame: WrittenFrame, path: Path) -> Iterator[str]:
+    """What is wrong with a file of one line per instance: its class, then numbers."""
     try:
         rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
     except ValueError as error:
@@ -69,68 +75,70 @@ def _rows(frame: WrittenFrame, path: Path) -> Iterator[tuple[InstanceLabel, list
     for label, row in zip(frame.labels.instances, rows, strict=True):
         if not row or row[0] != label.class_index:
             yield f"instance {label.id}: class is {row[:1]}, not {label.class_index}"
+        elif not np.isfinite(row).all():
+            yield f"instance {label.id}: its line holds a number that is not finite"
         else:
-            yield label, row[1:]
+            yield from check(frame, label, row[1:])
 
 
-def _check_segments(frame: WrittenFrame, path: Path) -> Iterator[str]:
+def _check_segment(frame: WrittenFrame, label: InstanceLabel, values: list[float]) -> Iterator[str]:
     size = np.array([frame.labels.width, frame.labels.height])
-    for row in _rows(frame, path):
-        if isinstance(row, str):
-            yield row
-            continue
-        label, values = row
-        if len(values) < 6 or len(values) % 2:
-            yield f"instance {label.id}: a polygon must have three or more vertices (got {len(values)} numbers)"
-            continue
-        points = np.array(values).reshape(-1, 2)
-        if points.min() < 0 or points.max() > 1:
-            yield f"instance {label.id}: its polygon leaves the image"
-        read = fill_polygon(points * size, *map(int, size))
-        outline = fill_polygon(label.polygon, *map(int, size))
-        mask = frame.whole(label)
-        if np.count_nonzero(read ^ mask) > np.count_nonzero(outline ^ mask) + _ROUNDED_PIXELS:
-            iou = np.count_nonzero(read & mask) / np.count_nonzero(read | mask)
-            yield f"instance {label.id}: its polygon does not give its mask back (IoU {iou:.4f})"
-        box = np.concatenate([points.min(axis=0), points.max(axis=0)]) * np.tile(size, 2)
-        if np.abs(box - label.box).max() > 0.05:
-            yield f"instance {label.id}: the box of its polygon is not that of its mask"
+    if len(values) < 6 or len(values) % 2:
+        yield f"instance {label.id}: a polygon must have three or more vertices (got {len(values)} numbers)"
+        return
+    points = np.array(values).reshape(-1, 2)
+    if points.min() < 0 or points.max() > 1:
+        yield f"instance {label.id}: its polygon leaves the image"
+    read = fill_polygon(points * size, *map(int, size))
+    outline = fill_polygon(label.polygon, *map(int, size))
+    mask = frame.whole(label)
+    if np.count_nonzero(read ^ mask) > np.count_nonzero(outline ^ mask) + _ROUNDED_PIXELS:
+        iou = np.count_nonzero(read & mask) / np.count_nonzero(read | mask)
+        yield f"instance {label.id}: its polygon does not give its mask back (IoU {iou:.4f})"
+    box = np.concatenate([points.min(axis=0), points.max(axis=0)]) * np.tile(size, 2)
+    if np.abs(box - label.box).max() > 0.05:
+        yield f"instance {label.id}: the box of its polygon is not that of its mask"
 
 
-def _check_boxes(frame: WrittenFrame, path: Path) -> Iterator[str]:
-    for row in _rows(frame, path):
-        if isinstance(row, str):
-            yield row
-        elif not _is_box(row[1][:4], row[0], frame.labels) or len(row[1]) != 4:
-            yield f"instance {row[0].id}: its line is not its box"
+def _check_box(frame: WrittenFrame, label: InstanceLabel, values: list[float]) -> Iterator[str]:
+    if len(values) != 4 or not _is_box(values, label, frame.labels):
+        yield f"instance {label.id}: its line is not its box"
 
 
-def _check_rotated(frame: WrittenFrame, path: Path) -> Iterator[str]:
+def _check_rotated(frame: WrittenFrame, label: InstanceLabel, values: list[float]) -> Iterator[str]:
     size = np.array([frame.labels.width, frame.labels.height])
-    for row in _rows(frame, path):
-        if isinstance(row, str):
-            yield row
-            continue
-        label, values = row
-        if len(values) != 8 or np.abs(np.array(values).reshape(4, 2) * size - rotated_box(label)).max() > _ROUNDED:
-            yield f"instance {label.id}: its line is not the smallest rectangle around its mask"
+    if len(values) != 8 or np.abs(np.array(values).reshape(4, 2) * size - rotated_box(label)).max() > _ROUNDED:
+        yield f"instance {label.id}: its line is not the smallest rectangle around its mask"
 
 
-def _check_pose(frame: WrittenFrame, path: Path) -> Iterator[str]:
-    size = np.array([frame.labels.width, frame.labels.height])
+def _check_pose(frame: WrittenFrame, label: InstanceLabel, values: list[float]) -> Iterator[str]:
     count = max(map(len, frame.content["keypoints"]), default=0)
-    for row in _rows(frame, path):
-        if isinstance(row, str):
-            yield row
-            continue
-        label, values = row
-        if len(values) != 4 + 3 * count or not _is_box(values[:4], label, frame.labels):
-            yield f"instance {label.id}: its line is not its box and {count} keypoints"
-            continue
-        points = np.array(values[4:]).reshape(-1, 3) * [*size, 1]
-        expected = np.concatenate([label.keypoints, np.zeros((count - len(label.keypoints), 3))])
-        if np.abs(points - expected).max() > _ROUNDED:
-            yield f"instance {label.id}: its keypoints are not those of the manifest"
+    if len(values) != 4 + 3 * count or not _is_box(values[:4], label, frame.labels):
+        yield f"instance {label.id}: its line is not its box and {count} keypoints"
+        return
+    points = np.array(values[4:]).reshape(-1, 3) * [frame.labels.width, frame.labels.height, 1]
+    expected = np.concatenate([label.keypoints, np.zeros((count - len(label.keypoints), 3))])
+    if np.abs(points - expected).max() > _ROUNDED:
+        yield f"instance {label.id}: its keypoints are not those of the manifest"
+
+
+def _check_voc(frame: WrittenFrame, path: Path) -> Iterator[str]:
+    try:
+        objects = ElementTree.parse(path).findall("object")
+    except ElementTree.ParseError as error:
+        yield f"cannot be read as XML ({error})"
+        return
+    if len(objects) != len(frame.labels.instances):
+        yield f"has {len(objects)} objects for {len(frame.labels.instances)} instances"
+        return
+    for label, entry in zip(frame.labels.instances, objects, strict=True):
+        if entry.findtext("name") != label.class_name:
+            yield f"instance {label.id}: class is {entry.findtext('name')}, not {label.class_name}"
+        box = [entry.findtext(f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")]
+        if box != [str(value) for value in np.add(label.box, (1, 1, 0, 0))]:
+            yield f"instance {label.id}: its box is not that of its mask"
+        if [entry.findtext(name) for name in ("truncated", "occluded")] != [str(int(flag)) for flag in flags(label)]:
+            yield f"instance {label.id}: its flags are not those of its masks"
 
 
 def _check_instances(frame: WrittenFrame, path: Path) -> Iterator[str]:
@@ -211,10 +219,11 @@ def _check_mask(expected: npt.NDArray[np.bool_], path: Path) -> Iterator[str]:
 
 
 CHECKS: dict[str, Callable[[WrittenFrame, Path], Iterator[str]]] = {
-    "labels/": _check_segments,
-    "yolo-detect/labels/": _check_boxes,
-    "yolo-obb/labels/": _check_rotated,
-    "yolo-pose/labels/": _check_pose,
+    "labels/": partial(_check_lines, _check_segment),
+    "yolo-detect/labels/": partial(_check_lines, _check_box),
+    "yolo-obb/labels/": partial(_check_lines, _check_rotated),
+    "yolo-pose/labels/": partial(_check_lines, _check_pose),
+    "voc/Annotations/": _check_voc,
     "instances/": _check_instances,
     "semantic/": _check_semantic,
     "panoptic/": _check_panoptic,

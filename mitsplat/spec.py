@@ -426,6 +426,7 @@ FormatName = Literal[
     "amodal",
     "panoptic",
     "poses",
+    "voc",
     "bop",
     "colmap",
     "depth",

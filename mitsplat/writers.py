@@ -7,6 +7,8 @@ file's ``output.formats``:
     See :mod:`mitsplat.yolo`.
 ``coco``, ``amodal``, ``panoptic``, ``poses``
     See :mod:`mitsplat.coco`.
+``voc``
+    See :mod:`mitsplat.voc`.
 ``bop``
     See :mod:`mitsplat.bop`; for cameras without lens distortion.
 ``colmap``
@@ -31,7 +33,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat import bop, coco, maps
+from mitsplat import bop, coco, maps, voc
 from mitsplat.colmap import write_colmap
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, link_file, write_file, write_text
@@ -50,6 +52,7 @@ __all__ = ["FOLDERS", "FORMATS", "Catalogue", "encode_image", "write_collection"
 FOLDERS = {
     **{task: f"{entry.folder}labels/" for task, entry in TASKS.items()},
     **{name: f"{name}/" for name in ("bop", "depth", "instances", "normals", "panoptic", "semantic")},
+    "voc": "voc/Annotations/",
     "exr": "layers/",
 }
 """Where every frame has a file, by format."""
@@ -152,6 +155,11 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         if folder:
             add(folder + image, lambda path: link_file(root / image, path))
         add(f"{folder}labels/{name}.txt", lambda path, text=text: path.write_text(text))  # type: ignore[misc]
+    if "voc" in formats:
+        number = f"{frame.index:06d}"
+        add(f"voc/JPEGImages/{number}.{output.image}", lambda path: link_file(root / image, path))
+        text = voc.annotation(labels, f"{number}.{output.image}")
+        add(f"voc/Annotations/{number}.xml", lambda path: path.write_bytes(text.encode()))
     if formats & {"instances", "panoptic"}:
         labelled = maps.instance_picture(labels)
         if "instances" in formats:
@@ -211,6 +219,8 @@ def write_collection(root: Path, records: Iterable[Record], catalogue: Catalogue
             for split in SPLITS:
                 content = describe_split(record for record in records if record["split"] == split)
                 write_text(root / f"annotations/{name}_{split}.json", json.dumps(content))
+    if "voc" in formats:
+        voc.write_splits(root, records)
     if "bop" in formats:
         bop.write_scenes(root, records)
         bop.write_models(root, catalogue.meshes)

@@ -170,6 +170,35 @@ def shift_segments(root: Path, records: list[Record]) -> None:
     cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), 3, axis=1))
 
 
+def name_another_class(root: Path, records: list[Record]) -> None:
+    path = root / "voc/Annotations/000000.xml"
+    name = first(records)["class"]
+    path.write_text(path.read_text().replace(f"<name>{name}</name>", "<name>screw</name>", 1))
+
+
+def count_from_zero(root: Path, records: list[Record]) -> None:
+    path = root / "voc/Annotations/000000.xml"
+    x0 = first(records)["box"][0]
+    path.write_text(path.read_text().replace(f"<xmin>{x0 + 1}</xmin>", f"<xmin>{x0}</xmin>", 1))
+
+
+def deny_occlusion(root: Path, records: list[Record]) -> None:
+    path = root / "voc/Annotations/000000.xml"
+    path.write_text(path.read_text().replace("<occluded>0</occluded>", "<occluded>1</occluded>", 1))
+
+
+def write_nan(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-obb/labels/train/000000.txt"
+    values = path.read_text().split(" ")
+    path.write_text(" ".join([values[0], "nan", *values[2:]]))
+
+
+def shorten_a_line(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-detect/labels/train/000000.txt"
+    head, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([" ".join(head.split()[:4]), *rest]) + "\n")
+
+
 def forget_a_depth(root: Path, records: list[Record]) -> None:
     del records[0]["files"]["depth/train/000000.png"]
 
@@ -208,6 +237,11 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     widen_a_box: ("yolo-detect/labels/train/000000.txt", "is not its box"),
     turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is not the smallest rectangle"),
     flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints are not"),
+    name_another_class: ("voc/Annotations/000000.xml", "class is screw"),
+    count_from_zero: ("voc/Annotations/000000.xml", "its box is not that of its mask"),
+    deny_occlusion: ("voc/Annotations/000000.xml", "its flags are not"),
+    write_nan: ("yolo-obb/labels/train/000000.txt", "not finite"),
+    shorten_a_line: ("yolo-detect/labels/train/000000.txt", "is not its box"),
     shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
     forget_a_depth: ("manifest.jsonl, frame 0", "lists no file of the format depth"),
     forget_a_bop_mask: ("bop/train/000000/mask/000000_000000.png", "is not listed in the manifest"),

@@ -1,4 +1,4 @@
-"""Settling, measured: ``python -m benchmarks.settle rate | faces | thin | bin | rest | worlds [--count N]``.
+"""Settling, measured: ``python -m benchmarks.settle rate | faces | thin | bin | rest | worlds | share [--count N]``.
 
 rate     layouts per minute of ten and of thirty objects, with both steppers, in one process and in two
 faces    faces that a box of 1 : 1 : 0.3 comes to rest on, with both steppers, compared by a chi-squared test
@@ -6,6 +6,7 @@ thin     random drops of a screw, a torus, a mug and a concave bracket, certifie
 bin      forty objects poured into a bin
 rest     ten objects, seed after seed: time to rest, and what moves in the five seconds after
 worlds   CPU time of several layouts in one simulation, per layout
+share    what settling adds to the images of the shipped workcell at 1280x720 with ten views of each layout
 
 Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless said otherwise.
 What is made once (convex pieces, compiled kernels) is made before the clock starts.
@@ -29,6 +30,7 @@ from trimesh.creation import annulus, box, cylinder, torus
 
 from mitsplat.assets import Asset
 from mitsplat.errors import InputError
+from mitsplat.frame import render_frame
 from mitsplat.mesh import convex_pieces
 from mitsplat.scene import Scene, load_scene
 from mitsplat.settle import Layout, settle_layout, settle_layouts, warp_settings
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     from mitsplat.settle import FloatArray
 
 STEPPERS = ("warp", "mujoco")
+WORKCELL = Path(__file__).resolve().parents[1] / "scenes/workcell.yaml"
 
 
 def at(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
@@ -282,6 +285,26 @@ def time_worlds(bodies: list[Body], colliders: list[Collider], starts: list[Floa
     return (time.process_time() - start) / 1.5 / len(starts)
 
 
+def measure_share(count: int) -> None:
+    """CPU seconds of settling and of rendering, layout by layout, so that other work on the machine slows both."""
+    scene = load_scene(WORKCELL, overrides={"output.layouts": count + 1, "output.views": 10})
+    settling, drawing, first = [], [], 0.0
+    for index in range(count + 1):
+        start = time.process_time()
+        layout = settle_layout(scene, index, cached=False)
+        settled = time.process_time()
+        frames = [render_frame(scene, 10 * index + view, layout=layout) for view in range(2)]
+        rendered = time.process_time()
+        if index:  # the first one makes what all share: parts and compiled kernels
+            settling.append(settled - start)
+            drawing.append((rendered - settled) / len(frames))
+        else:
+            first = settled - start
+    settle, draw = np.mean(settling), np.mean(drawing)
+    print(f"settling {settle:.2f} CPU s a layout, {first:.2f} the first; rendering {draw:.2f} CPU s an image")
+    print(f"settling adds {settle / 10 / draw:.1%} to an image at ten views of a layout")
+
+
 MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
     "rate": (measure_rate, 10),
     "faces": (measure_faces, 500),
@@ -289,6 +312,7 @@ MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
     "bin": (measure_bin, 3),
     "rest": (measure_rest, 20),
     "worlds": (measure_worlds, 8),
+    "share": (measure_share, 6),
 }
 
 

@@ -18,7 +18,7 @@ from mitsplat.mesh import contact_points, join_meshes
 
 FloatArray = NDArray[np.float64]
 
-_SAMPLES = 4000
+_SAMPLES, _BATCH = 4000, 256
 _FAR = 1e6  # farther than any inside point is from its surface [m]
 
 
@@ -127,11 +127,17 @@ def all_clearances(
 def standoff(surface: Surface, pieces: Sequence[trimesh.Trimesh]) -> float:
     """How far convex pieces stand off the mesh that they stand for [m]: the widest gap that they can leave at rest.
 
-    Measured at their vertices, edges and 4000 points of their faces.
+    Measured at their vertices, edges and 4000 points of their faces. Which side of a mesh a point is on costs ten times
+    what its distance does: the farthest points are asked first, and none after the first that is outside.
     """
     samples, _ = trimesh.sample.sample_surface(join_meshes(pieces), _SAMPLES, seed=0)
     points = np.concatenate([*(contact_points(piece) for piece in pieces), samples])
-    return max(0.0, float(surface.signed_distances(points).max()))
+    farthest_first = np.argsort(-surface.nearest(points)[2], kind="stable")
+    for start in range(0, len(points), _BATCH):
+        distance = float(surface.signed_distances(points[farthest_first[start : start + _BATCH]]).max())
+        if distance > 0:
+            return distance
+    return 0.0
 
 
 @wp.kernel(enable_backward=False, module="unique")

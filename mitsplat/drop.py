@@ -18,7 +18,7 @@ from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, run_to_rest
 from mitsplat.place import Item, draw_poses, fixed_pose
-from mitsplat.scene import Scene, bin_walls
+from mitsplat.scene import ENCLOSURE, Scene, bin_walls
 from mitsplat.settle import NOTHING_TO_REST, FloatArray, Instance, Layout, Progress, RestCertificate
 from mitsplat.spec import PILE_HEIGHT, Region
 
@@ -279,6 +279,9 @@ class Drop:
     ) -> str:
         """How a layout at rest is not arranged as asked for, or empty."""
         arrangement = self.scene.spec.settle.arrangement
+        for pair in clearances:
+            if pair.second.name.startswith(ENCLOSURE) and pair.distance < _WIDEST_GAP:
+                return f"{pair.first.name} rests against the enclosure"
         if arrangement == "scatter":
             for pair in clearances:
                 if pair.second not in self._obstacles and pair.distance < _NEAREST:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,6 +94,9 @@ _DRAWN = (
 )
 """What is drawn anew for every frame."""
 
+ENCLOSURE = "enclosure "
+"""How the names of the shapes begin that an enclosure is written out as."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -159,10 +162,6 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
     """
     path = Path(path)
     spec = load_yaml(path, SceneSpec, overrides=overrides)
-    if spec.enclosure is not None:
-        rise = PILE_HEIGHT if spec.settle.arrangement == "pile" else 0.0
-        walls = _enclosure_walls(spec.enclosure, spec.region, rise)
-        spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
     folder = path.parent
     for position, light in enumerate(spec.lights):
         if isinstance(light, EnvironmentLight) and light.image is not None and not (folder / light.image).is_file():
@@ -177,6 +176,13 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
     for position, shape in enumerate(spec.shapes):
         with _blaming(path, "shapes", position, "mesh"):
             shape_meshes.append(_shape_mesh(shape, folder))
+    if spec.enclosure is not None:
+        supports = [mesh for shape, mesh in zip(spec.shapes, shape_meshes, strict=True) if shape.collider]
+        if spec.environment_collides and environment is not None and environment.mesh is not None:
+            supports.append(environment.mesh)
+        walls = _enclosure_walls(spec.enclosure, spec, assets, supports)
+        shape_meshes += [_shape_mesh(wall, folder) for wall in walls]
+        spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
     return Scene(
         spec=spec,
         path=path,
@@ -227,10 +233,25 @@ def scene_json_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
 
 
-def _enclosure_walls(enclosure: Enclosure, region: Region, rise: float) -> list[Shape]:
-    """The enclosure as five invisible boxes: walls from its floor up to ``rise`` above the region, and a lid."""
-    low, high = np.array(region.min) - enclosure.margin, np.array(region.max) + enclosure.margin
-    low[2], high[2] = enclosure.floor, region.max[2] + rise
+def _enclosure_walls(
+    enclosure: Enclosure, spec: SceneSpec, assets: Sequence[Asset], supports: Sequence[trimesh.Trimesh]
+) -> list[Shape]:
+    """The enclosure as five invisible boxes: walls from its floor up to the region's top or a pile's, and a lid.
+
+    Without a margin of its own the largest object finds room between region and walls, but no wall stands where there
+    is nothing to lie on before it.
+    """
+    inner_low, inner_high = np.array(spec.region.min), np.array(spec.region.max)
+    if enclosure.margin is not None:
+        low, high = inner_low - enclosure.margin, inner_high + enclosure.margin
+    else:
+        margin = max((float(asset.mesh.extents.max()) for asset in assets if asset.mesh is not None), default=0.0)
+        bounds = np.array([mesh.bounds for mesh in supports] or [(inner_low, inner_high)])
+        low = np.minimum(inner_low, np.maximum(inner_low - margin, bounds[:, 0].min(axis=0)))
+        high = np.maximum(inner_high, np.minimum(inner_high + margin, bounds[:, 1].max(axis=0)))
+    low[2], high[2] = enclosure.floor, inner_high[2]
+    if spec.settle.arrangement == "pile":
+        high[2] += PILE_HEIGHT
     middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
     walls = []
     for name, axis, side in (("-x", 0, -1), ("+x", 0, 1), ("-y", 1, -1), ("+y", 1, 1), ("lid", 2, 1)):
@@ -240,7 +261,7 @@ def _enclosure_walls(enclosure: Enclosure, region: Region, rise: float) -> list[
         extents[axis] = thickness
         extents[2] = thickness if name == "lid" else size[2]
         box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
-        walls.append(Shape(name=f"enclosure {name}", box=box))
+        walls.append(Shape(name=f"{ENCLOSURE}{name}", box=box))
     return walls
 
 

@@ -125,9 +125,16 @@ class Region(StrictModel):
 
 
 class Enclosure(StrictModel):
-    """Four invisible walls around the drop region, and a lid on it, that keep objects in."""
+    """Four invisible walls around the drop region, and a lid on it, that keep objects in.
 
-    margin: NonNegativeFloat = Field(0.0, description="Distance of the walls outside the region's sides [m].")
+    A layout in which an object comes to rest against one of them is drawn again.
+    """
+
+    margin: NonNegativeFloat | None = Field(
+        None,
+        description="Distance of the walls outside the region's sides [m]; if absent the size of the largest object, "
+        "as far as there are colliders to lie on.",
+    )
     floor: float = Field(0.0, description="Height of the walls' lower edge [m].")
     thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")
 

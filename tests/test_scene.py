@@ -105,6 +105,22 @@ def test_enclosure_leaves_exactly_the_region_free(scene_data: SceneData, write_s
         assert in_walls(leaving).all()
 
 
+def test_an_enclosure_leaves_room_for_the_largest_object_if_there_is_something_to_lie_on(
+    scene_data: SceneData, write_scene: WriteScene
+) -> None:
+    """The bolt is 50 mm long; the table ends 20 mm beyond the region along x, and far beyond it along y."""
+    scene_data["enclosure"] = {}
+    scene_data["shapes"][0]["box"] = {"size": [0.44, 1, 0.1], "position": [0, 0, -0.05]}
+    scene = load_scene(write_scene(scene_data))
+    bounds = {shape.name: mesh.bounds for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True)}
+    inner = [bounds["enclosure -x"][1, 0], bounds["enclosure +x"][0, 0]]
+    inner += [bounds["enclosure -y"][1, 1], bounds["enclosure +y"][0, 1]]
+    np.testing.assert_allclose(inner, [-0.22, 0.22, -0.25, 0.25])
+    scene_data["shapes"][0]["box"]["size"] = [0.3, 1, 0.1]  # narrower than the region, which the walls never cut
+    scene = load_scene(write_scene(scene_data))
+    assert scene.shape_meshes[2].bounds[0, 0] == pytest.approx(0.2)
+
+
 # Refusals
 
 

@@ -202,6 +202,20 @@ def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):
     assert all(certificate.attempts == len(certificate.refused) + 1 for certificate in certificates)
 
 
+@pytest.mark.parametrize(("distance", "settles"), [(3e-4, False), (3e-3, True)])
+def test_what_rests_against_the_enclosure_is_drawn_again(distance, settles, scene_data, write_scene):
+    """A nut of 20 x 30 x 10 mm is put down flat, its face as far from the wall at x = 0.2 m as said."""
+    scene_data["enclosure"] = {"margin": 0}
+    scene_data["objects"] = [{"asset": "assets/nut", "poses": [{"position": [0.19 - distance, 0, 0.005]}]}]
+    scene_data["settle"] = {"attempts": 2, "stepper": "mujoco"}
+    scene = load_scene(write_scene(scene_data))
+    if settles:
+        assert settle_layout(scene, 0, cached=False).certificate.refused == ()
+    else:
+        with pytest.raises(InputError, match=r"got 2 x nut rests against the enclosure"):
+            settle_layout(scene, 0, cached=False)
+
+
 def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
     scene_data["settle"] = {"max_time": 0.05, "attempts": 3}
     with pytest.raises(InputError, match=r"layout 0 must come to rest .*3 x not at rest within 0\.05 s"):
@@ -382,6 +396,22 @@ def test_standoff_of_a_hull():
     assert standoff(surface, [floor, wall]) < 1e-5
     # The middle of the hull's long face, from (20, 0) to (0, 20) mm, is 10 mm from both plates.
     assert standoff(surface, [bracket.convex_hull]) == pytest.approx(0.01, abs=2e-4)
+
+
+def test_standoff_is_the_largest_signed_distance_of_all_points():
+    """What is deep inside is farther from the surface than what stands off, and must not count."""
+    from mitsplat.clearance import _SAMPLES, Surface, standoff
+    from mitsplat.mesh import contact_points
+
+    surface = Surface(trimesh.creation.box((0.04, 0.04, 0.04)))
+    inside = trimesh.creation.icosphere(3, 0.005)
+    bump = trimesh.creation.icosphere(2, 0.002).apply_translation((0.02, 0.003, 0.001))
+    assert standoff(surface, [inside]) == 0
+    samples, _ = trimesh.sample.sample_surface(trimesh.util.concatenate([inside, bump]), _SAMPLES, seed=0)
+    points = np.concatenate([contact_points(inside), contact_points(bump), samples])
+    found = standoff(surface, [inside, bump])
+    assert found == pytest.approx(0.002, rel=0.05)
+    assert found == surface.signed_distances(points).max()
 
 
 def test_no_objects_make_an_empty_layout(scene_data, write_scene):

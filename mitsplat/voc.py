@@ -2,11 +2,12 @@
 
 ::
 
-    voc/Annotations/000003.xml, voc/JPEGImages/000003.jpg, voc/ImageSets/Main/train.txt, val.txt
+    voc/Annotations/000003.xml, voc/JPEGImages/000003.jpg, voc/ImageSets/Main/train.txt, val.txt, voc/labelmap.txt
 
-Pixels count from 1, and boxes include their last (VOC2012 development kit, ``PASemptyobject``, ``VOCevaldet``). The
-flags follow the 2009 annotation guidelines: an object is *truncated* if more than 15 % of it lies outside the box of
-what is visible, *occluded* if more than 5 % of what lies in that box is hidden. Both are exact here.
+``labelmap.txt`` names the classes to CVAT, which knows VOC's own twenty otherwise. Pixels count from 1, and boxes
+include their last (VOC2012 development kit, ``VOCevaldet``). The flags follow the 2009 annotation guidelines: an object
+is *truncated* if more than 15 % of it lies outside the box of what is visible, *occluded* if more than 5 % of what lies
+in that box is hidden. Both are exact here.
 """
 
 from __future__ import annotations
@@ -52,13 +53,15 @@ def flags(label: InstanceLabel) -> tuple[bool, bool]:
     return 1 - boxed / label.silhouette_area > TRUNCATED, 1 - label.area / boxed > OCCLUDED
 
 
-def write_splits(root: Path, records: Iterable[Record]) -> None:
-    """Write which images belong to which split."""
+def write_description(root: Path, records: Iterable[Record], class_names: Iterable[str]) -> None:
+    """Write which images belong to which split, and what classes there are."""
     names: dict[str, list[str]] = {split: [] for split in SPLITS}
     for record in records:
         names[record["split"]].append(f"{record['index']:06d}\n")
     for split, lines in names.items():
         write_text(root / f"voc/ImageSets/Main/{split}.txt", "".join(lines))
+    lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in ("background", *class_names))]
+    write_text(root / "voc/labelmap.txt", "".join(lines))
 
 
 def _add(parent: ElementTree.Element, name: str, value: object) -> None:

@@ -220,7 +220,7 @@ def write_collection(root: Path, records: Iterable[Record], catalogue: Catalogue
                 content = describe_split(record for record in records if record["split"] == split)
                 write_text(root / f"annotations/{name}_{split}.json", json.dumps(content))
     if "voc" in formats:
-        voc.write_splits(root, records)
+        voc.write_description(root, records, classes)
     if "bop" in formats:
         bop.write_scenes(root, records)
         bop.write_models(root, catalogue.meshes)

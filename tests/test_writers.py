@@ -376,10 +376,12 @@ class TestVoc:
         assert flags_of("cut in two", 0) == ("0", "1")
         assert flags_of("two of a class touch", 1) == ("0", "0")
 
-    def test_splits(self, written: Written) -> None:
+    def test_splits_and_classes(self, written: Written) -> None:
         for split in ("train", "val"):
             names = (written.root / f"voc/ImageSets/Main/{split}.txt").read_text().split()
             assert names == [f"{r['index']:06d}" for r in written.records if r["split"] == split]
+        classes = (written.root / "voc/labelmap.txt").read_text().splitlines()[1:]
+        assert classes == ["background:::", "bolt:::", "nut:::"]
 
 
 class TestBop:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.assets import Asset
+from mitsplat.cache import cache_folder
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
 from mitsplat.dataset import write_dataset
 from mitsplat.scene import load_scene
+from mitsplat.settle import warp_settings
 from mitsplat.spec import FORMATS
 from mitsplat.splats import Splats
 
@@ -35,6 +38,23 @@ def box_asset(name: str, size: tuple[float, float, float] = (0.02, 0.03, 0.01), 
         sh=np.zeros((12, 1, 3), dtype=np.float32),
     )
     return Asset(name=name, class_name=class_name or name, splats=splats, mesh=mesh, pieces=(mesh,))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Layouts and pieces are kept for the session alone; Warp's kernels, slow to compile, stay where they are."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "WARP_CACHE_PATH" not in os.environ:
+            patch.setenv("WARP_CACHE_PATH", str(cache_folder().parent / "warp"))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def physics() -> Iterator[None]:
+    """Every world of a module is made under the settings that layouts are settled with."""
+    with warp_settings():
+        yield
 
 
 @pytest.fixture

@@ -5,21 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from bodies import STEPPERS, lowest, pose_at
 from scipy.spatial.transform import Rotation
 
 from mitsplat.mesh import convex_pieces, mass_properties
-from mitsplat.settle import warp_settings
 
 GRAVITY = 9.81
-STEPPERS = ("warp", "mujoco")
+pytestmark = pytest.mark.usefixtures("physics")
 EVERYWHERE = np.full(3, -1e3), np.full(3, 1e3)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def physics():
-    """Every world of a module is made under the settings that layouts are settled with."""
-    with warp_settings():
-        yield
 
 
 def body_of(mesh, friction=0.5, density=3000.0):
@@ -47,21 +40,9 @@ def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0)
     return world
 
 
-def pose_at(position, rotation=None):
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    if rotation is not None:
-        pose[:3, :3] = rotation.as_matrix()
-    return pose
-
-
 def run_until(world, time):
     while world.time < time - 1e-9:
         world.advance()
-
-
-def lowest(mesh, pose):
-    return float((mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())
 
 
 def centres(world):

@@ -12,33 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from bodies import STEPPERS, lowest, pose_at
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from mitsplat.errors import InputError
 from mitsplat.scene import load_scene
-from mitsplat.settle import Layout, replay_layout, settle_layout, settle_layouts, warp_settings
+from mitsplat.settle import Layout, replay_layout, settle_layout, settle_layouts
 
-STEPPERS = ("warp", "mujoco")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def physics():
-    """Every world of a module is made under the settings that layouts are settled with."""
-    with warp_settings():
-        yield
-
-
-def pose_at(position, rotation=None):
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    if rotation is not None:
-        pose[:3, :3] = rotation.as_matrix()
-    return pose
-
-
-def lowest(mesh, pose):
-    return float((mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())
+pytestmark = pytest.mark.usefixtures("physics")
 
 
 def test_clearance_of_boxes():

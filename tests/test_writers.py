@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 from pycocotools import mask as coco_mask
@@ -458,14 +459,21 @@ class TestMaps:
         assert picture[0, 0].tolist() == [environment["id"], 0, 0]
 
     def test_depth_and_normals(self, written: Written) -> None:
-        frame, record = written.pairs[0]
-        name = f"{record['split']}/{frame.index:06d}.png"
-        depth = png(written.root / "depth" / name)
-        assert record["depth_scale"] == 0.1
-        assert set(np.unique(depth)) == {8000, 10000}
-        normals = png(written.root / "normals" / name)
-        assert normals[60, 120].tolist() == [32768, 13107, 58982]
-        assert normals[0, 0].tolist() == [0, 0, 0]
+        for frame, record in written.pairs:
+            name = f"{record['split']}/{frame.index:06d}.png"
+            assert record["depth_scale"] == 0.1
+            np.testing.assert_array_equal(png(written.root / "depth" / name), np.where(frame.instance > 0, 8000, 10000))
+            normals = png(written.root / "normals" / name)
+            assert (normals[frame.instance > 0] == [32768, 13107, 58982]).all()
+            assert (normals[frame.instance == 0] == 0).all()
+
+    def test_layers(self, written: Written) -> None:
+        for frame, record in written.pairs:
+            path = written.root / f"layers/{record['split']}/{frame.index:06d}.exr"
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                pixels = {name: channel.pixels for name, channel in file.channels().items()}
+            np.testing.assert_array_equal(pixels["instance"], frame.instance)
+            np.testing.assert_array_equal(pixels["Z"], frame.depth)
 
     @pytest.mark.parametrize(("farthest", "scale"), [(6.5, 0.1), (6.6, 1.0), (70.0, 10.0), (9e9, 100.0)])
     def test_the_unit_of_depth_fits_the_farthest(self, farthest: float, scale: float) -> None:
@@ -475,11 +483,11 @@ class TestMaps:
 
     def test_flow_of_a_plane_before_a_camera_that_moves_sideways(self, written: Written) -> None:
         """A camera that moves by b across a plane at depth z shifts its picture by -f b / z."""
-        frame, record = written.pairs[0]
-        flow = cv2.readOpticalFlow(str(written.root / f"flow/{record['split']}/{frame.index:06d}.flo"))
-        assert flow.shape == (HEIGHT, WIDTH, 2)
-        np.testing.assert_allclose(flow[..., 0], -CAMERA.fx * 0.05 / frame.depth, rtol=1e-4)
-        np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
+        for frame, record in written.pairs:
+            flow = cv2.readOpticalFlow(str(written.root / f"flow/{record['split']}/{frame.index:06d}.flo"))
+            assert flow.shape == (HEIGHT, WIDTH, 2)
+            np.testing.assert_allclose(flow[..., 0], -CAMERA.fx * 0.05 / frame.depth, rtol=1e-4)
+            np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
     def test_flow_is_unknown_where_nothing_is(self) -> None:
         flow = maps.optical_flow(np.array([[0.0, 1.0]]), CAMERA.resized(2, 1), CAMERA.resized(2, 1))

@@ -197,19 +197,40 @@ def march_backward(lists: TileLists, view: View, quality: Quality, image: Any, g
 def _sum_shares(shares: Any, lists: TileLists) -> Any:
     """Sum of the gradients that each record has from the columns of its tiles.
 
-    They are added in a fixed order, so that every run gives the same bits, which additions by atomics do not.
+    They are added in a fixed order, so that every run gives the same bits, which additions by atomics do not. A record
+    that covers many tiles is summed by several lanes, for which the others would have to wait.
     """
     record = dr.arange(mi.UInt32, lists.visible)
-    start = dr.gather(mi.UInt32, lists.first, record) * TILE
-    stop = dr.gather(mi.UInt32, lists.first, record + 1) * TILE
+    first = dr.gather(mi.UInt32, lists.first, record)
+    pairs = dr.gather(mi.UInt32, lists.first, record + 1) - first
+    runs = dr.maximum((pairs + (_RUN - 1)) // _RUN, 1)
+    begin = dr.prefix_sum(runs)
+    lanes = lists.visible + lists.pairs // _RUN  # no fewer than there are runs; what is left over finds nothing to add
+    marks = dr.zeros(mi.UInt32, lanes)
+    dr.scatter(marks, mi.UInt32(1), begin, begin > 0)
+    owner = dr.cumsum(marks)
+    run = dr.arange(mi.UInt32, lanes) - dr.gather(mi.UInt32, begin, owner)
+    start = dr.gather(mi.UInt32, first, owner) + run * _RUN
+    stop = dr.minimum(start + _RUN, dr.gather(mi.UInt32, lists.first, owner + 1))
+    partial = _sum_rows(shares, start * TILE, stop * TILE)
+    return _sum_rows(partial, begin, begin + runs)
+
+
+_RUN = 32
+"""Tiles whose gradients one lane adds."""
+
+
+def _sum_rows(rows: Any, start: Any, stop: Any) -> Any:
+    """Sums of the rows of :data:`RECORD` floats from ``start`` up to ``stop``, as such rows."""
+    width = dr.width(start)
 
     def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        share = dr.gather(mi.ArrayXf, shares, i, shape=(RECORD, dr.width(i)))
-        return i + 1, [total + own for total, own in zip(sums, share, strict=True)]
+        row = dr.gather(mi.ArrayXf, rows, i, shape=(RECORD, dr.width(i)))
+        return i + 1, [total + own for total, own in zip(sums, row, strict=True)]
 
     zeros = [mi.Float(0) for _ in range(RECORD)]
-    _, sums = dr.while_loop((start, zeros), lambda i, sums: i < stop, add, label="sum shares")
-    result = dr.empty(mi.Float, RECORD * lists.visible)
-    dr.scatter(result, mi.ArrayXf(sums), record)
+    _, sums = dr.while_loop((start, zeros), lambda i, sums: i < stop, add, label="sum rows")
+    result = dr.empty(mi.Float, RECORD * width)
+    dr.scatter(result, mi.ArrayXf(sums), dr.arange(mi.UInt32, width))
     dr.eval(result)
     return result

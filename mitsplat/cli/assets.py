@@ -96,7 +96,7 @@ def fit(
         typer.Option(help="Fit only what masks show, ignore what they leave out, or do not read them."),
     ] = "alpha",
     background: Annotated[Literal["random", "black"], typer.Option(help="Colour behind the splats.")] = "random",
-    depth: Annotated[float, typer.Option(help="Weight of the depths of the capture's points.")] = 0.0,
+    depth: Annotated[float, typer.Option(help="Weight of the depths of the capture's points.")] = 0.5,
     exposure: Annotated[
         bool, typer.Option("--exposure/--no-exposure", help="Give each photo a colour correction of its own.")
     ] = False,

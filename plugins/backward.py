@@ -114,7 +114,9 @@ class _March(dr.CustomOp):
     def eval(self, records: Any, context: Callable[[], tuple[TileLists, View, Quality]]) -> tuple[Any, ...]:
         lists, view, quality = context()
         self.lists, self.view, self.quality = replace(lists, records=records), view, quality
-        image = march(self.lists, view, quality)
+        # Backward needs them again, and to undo a lens's distortion takes longer than a march.
+        self.slopes = Lanes(lists, view).centre_slopes()
+        image = march(self.lists, view, quality, slopes=self.slopes)
         dr.eval(image.rgb, image.alpha)
         self.image = image
         return (*image.rgb, image.alpha)
@@ -122,18 +124,26 @@ class _March(dr.CustomOp):
     def backward(self) -> None:
         gradient = [dr.zeros(mi.Float, dr.width(self.image.alpha)) + g for g in self.grad_out()]
         dr.eval(gradient)
-        self.set_grad_in("records", march_backward(self.lists, self.view, self.quality, self.image, gradient))
+        found = march_backward(self.lists, self.view, self.quality, self.image, gradient, self.slopes)
+        self.set_grad_in("records", found)
 
     def name(self) -> str:
         return "march"
 
 
-def march_backward(lists: TileLists, view: View, quality: Quality, image: Any, gradient: list[Any]) -> Any:
+def march_backward(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    image: Any,
+    gradient: list[Any],
+    slopes: tuple[list[Any], list[Any]],
+) -> Any:
     """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha."""
     if lists.pairs == 0:
         return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
     lanes = Lanes(lists, view)
-    us, vs = lanes.slopes(0.5, 0.5)
+    us, vs = slopes
     column = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * TILE) % TILE
     shares = dr.zeros(mi.Float, RECORD * TILE * lists.pairs)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))

@@ -157,6 +157,17 @@ class Lanes:
         self.start = dr.gather(mi.UInt32, lists.start, own)
         self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, own), self.start)
 
+    def centre_slopes(self) -> tuple[list[Any], list[Any]]:
+        """Slopes u and v of the rays through the pixels' centres; those of a distorted view are in memory."""
+        if not self.view.distortion:
+            return self.slopes(0.5, 0.5)
+        number = dr.arange(mi.UInt32, self.view.width * self.view.height)
+        row = number // self.view.width
+        u, v = self.view.slopes(mi.Float(number - row * self.view.width) + 0.5, mi.Float(row) + 0.5)
+        dr.eval(u, v)
+        places = list(zip(self.pixel, self.inside, strict=True))
+        return [dr.gather(mi.Float, u, p, m) for p, m in places], [dr.gather(mi.Float, v, p, m) for p, m in places]
+
     def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
         """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
         pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(TILE)]
@@ -193,7 +204,14 @@ def trace(
     return Image.joined(parts)
 
 
-def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None = None) -> Image:
+def march(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    *,
+    z_max: Any | None = None,
+    slopes: tuple[list[Any], list[Any]] | None = None,
+) -> Image:
     """Blend every ray of a view front to back, and average the rays of each pixel.
 
     Args:
@@ -201,6 +219,7 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
         view: Camera.
         quality: Order, cut-off and early end.
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
+        slopes: Those of the rays, where they are known already; for one sample per pixel.
     """
     n = view.samples
     lanes = Lanes(lists, view)
@@ -218,7 +237,7 @@ def march(lists: TileLists, view: View, quality: Quality, *, z_max: Any | None =
     passes = []
     for i in range(n * n):
         dx, dy = dr.opaque(mi.Float, (i % n + 0.5) / n), dr.opaque(mi.Float, (i // n + 0.5) / n)
-        us, vs = lanes.slopes(dx, dy)
+        us, vs = lanes.slopes(dx, dy) if slopes is None else slopes
         respond = partial(respond_along, lists=lists, us=us, vs=vs, shared_column=not view.distortion, cap=cap)
         pixels = walk(lists, lanes.start, lanes.stop, respond, far, view.near_plane, cut, end)
         passes.append(_collect(pixels, lanes, lists.instance))

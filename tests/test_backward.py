@@ -81,15 +81,16 @@ def test_gradients_equal_finite_differences_of_the_twin(bands: int) -> None:
             assert got == pytest.approx(expected, rel=1e-2, abs=1e-2), name
 
 
-def test_image_is_that_of_the_plain_march() -> None:
+@pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
+def test_image_is_that_of_the_plain_march(distortion: tuple[float, ...]) -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.render import render_splats
 
-    splats = make_splats(40, 33)
+    splats, camera = make_splats(40, 33), replace(CAMERA, distortion=distortion)
     inputs = [mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS]
-    rgb, alpha = backward.render_differentiable(backward.pack_cloud(*inputs, 16), view_of(make_sensor(CAMERA)), QUALITY)
-    plain = render_splats(splats, CAMERA, quality=QUALITY)
+    rgb, alpha = backward.render_differentiable(backward.pack_cloud(*inputs, 16), view_of(make_sensor(camera)), QUALITY)
+    plain = render_splats(splats, camera, quality=QUALITY)
     np.testing.assert_allclose(np.array(alpha).reshape(24, 32), plain.alpha, atol=2e-5)
     assert np.array(rgb[0]).max() > 0.1
 

@@ -2,15 +2,16 @@
 
 The hull (Laurentini 1994) is the set of points that every mask shows as object; it closes the surface where no
 photograph looks, and knows nothing of hollows. Depth that the splats are rendered to is fused into a truncated signed
-distance (Curless and Levoy 1996), which cuts the hollows out. Both are distances on one grid, positive inside: their
-minimum is the intersection, and marching cubes (Lorensen and Cline 1987) takes its zero for the surface.
+distance (Curless and Levoy 1996), which cuts the hollows out, and only as deep as the views agree on. Both are
+distances on one grid, positive inside: their minimum is the intersection, and marching cubes (Lorensen and Cline 1987)
+takes its zero for the surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import drjit as dr
@@ -31,14 +32,17 @@ FloatArray = npt.NDArray[np.float64]
 
 _OPAQUE = 0.5
 """Alpha from which a pixel shows the splats' surface."""
-_SMALLEST_PART = 0.01
-"""Share of the volume below which a part of the surface is debris."""
 _BULK = 0.002
 """Share of the Gaussians at either end of an axis that do not decide where the grid is."""
 _MARGIN = 0.08
 """Room around the bulk of the Gaussians, as a share of its longest extent."""
 _SEEN_BY = 0.035
 """Share of the views that look towards a cell which must see it: a few look through gaps between Gaussians."""
+_BEHIND = 2.0
+"""Truncations behind the seen surface up to which a view says that a cell is inside. With one, errors of depth draw the
+surface inwards, because all of the space in front counts; without a limit, hollows close that some views miss."""
+_DOUBT = 0.5
+"""Standard deviations between views by which depth must exceed the hull to cut it: masks err less than depths."""
 _FAR = 1e6
 
 
@@ -50,14 +54,14 @@ class SurfaceSettings:
         voxels: Grid cells along the longest extent.
         truncation: Depth behind the surface that one view speaks for, in cells.
         blur: Standard deviation of the smoothing of the distances, in cells.
-        dissent: Views that may show a point as background and be overruled, which masks with errors need.
+        dissent: Views that may show a point as background and be overruled: there are errors in masks.
         faces: Most faces of the result.
     """
 
     voxels: int = 192
     truncation: float = 3.0
     blur: float = 0.5
-    dissent: int = 0
+    dissent: int = 1
     faces: int = 10_000
 
     def __post_init__(self) -> None:
@@ -113,7 +117,9 @@ def reconstruct_surface(
             "no surface lies inside the masks of all views: do masks, cameras and splats belong together?"
         ) from None
     surface = trimesh.Trimesh(grid.low + (vertices - 0.5) * grid.cell, faces)
-    return simplify_surface(_without_debris(surface) if masked else surface, settings.faces)
+    if not masked:
+        return simplify_surface(surface, settings.faces)
+    return _outer_shell(simplify_surface(_outer_shell(surface), settings.faces))
 
 
 def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
@@ -131,19 +137,15 @@ def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     tolerance = 1e-4 * surface.scale
     while solid.num_tri() > faces and tolerance < 0.1 * surface.scale:
         solid = solid.simplify(tolerance)
-        tolerance *= 1.3
+        tolerance *= 1.1
     mesh = solid.to_mesh()
     return trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
 
 
-def _without_debris(surface: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The solid parts of a closed surface that are no crumbs, without cavities, which nobody has seen."""
-    parts = [part for part in surface.split(only_watertight=True) if part.volume > 0]
-    if not parts:
-        return surface
-    largest = max(part.volume for part in parts)
-    kept = [part for part in parts if part.volume > _SMALLEST_PART * largest]
-    return cast(trimesh.Trimesh, trimesh.util.concatenate(kept))
+def _outer_shell(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The largest closed part: without crumbs beside the object and cavities inside, which nobody has seen."""
+    parts = surface.split(only_watertight=True)
+    return max(parts, key=lambda part: float(part.volume), default=surface)
 
 
 @dataclass(eq=False)
@@ -153,12 +155,14 @@ class _State:
     Attributes:
         hull: The smallest distances to silhouettes found so far [m], ascending; empty without masks.
         total: Sum of the truncated distances behind the seen surface [m].
-        count: Number of views in it.
+        squares: Sum of their squares [m^2].
+        count: Number of views in these.
         towards: Number of views that see a surface in the cell's direction.
     """
 
     hull: list[Any]
     total: Any
+    squares: Any
     count: Any
     towards: Any
 
@@ -195,7 +199,7 @@ class _Grid:
     def start(self, silhouettes: int) -> _State:
         ensure_variant()
         nothing = dr.zeros(mi.Float, self.count)
-        return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], nothing, nothing, nothing)
+        return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], *[nothing] * 4)
 
     def fuse(self, state: _State, splats: Splats, camera: Camera, mask: npt.NDArray[np.float32] | None) -> None:
         """Add what one view says."""
@@ -223,19 +227,23 @@ class _Grid:
         seen, low, high = _bilinear(depth, camera, pixel, ahead)
         # Between a surface and what lies behind its edge nothing is interpolated.
         behind = z - seen
-        valid = ahead & (low > 0) & (high - low < span) & (behind < span)
-        state.total = state.total + dr.select(valid, dr.maximum(behind, -span), 0)
+        valid = ahead & (low > 0) & (high - low < span) & (behind < _BEHIND * span)
+        behind = dr.select(valid, dr.clip(behind, -span, span), 0)
+        state.total = state.total + behind
+        state.squares = state.squares + dr.square(behind)
         state.count = state.count + dr.select(valid, 1, 0)
         state.towards = state.towards + dr.select(ahead & (low > 0), 1, 0)
-        dr.eval(state.total, state.count, state.towards)
+        dr.eval(state.total, state.squares, state.count, state.towards)
 
     def combine(self, state: _State, blur: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
         """Distance to the surface of every cell [m], positive inside, and whether it is known, of shape ``shape``."""
-        total, count = np.array(state.total), np.array(state.count)
+        count = np.array(state.count)
+        mean, squares = (np.array(sums) / np.maximum(count, 1) for sums in (state.total, state.squares))
         # What nobody looked at is inside the object as far as the hull reaches.
         known = count > (_SEEN_BY * np.array(state.towards) if state.hull else 0)
-        distance = np.where(known, total / np.maximum(count, 1), self.truncation)
+        distance = np.where(known, mean, self.truncation)
         if state.hull:
+            distance = distance + _DOUBT * np.sqrt(np.maximum(squares - mean * mean, 0))
             distance = np.minimum(distance, np.clip(np.array(state.hull[-1]), -self.truncation, self.truncation))
             known = np.ones_like(known)
         # Marching cubes looks at all eight corners, and the blur at neighbours.

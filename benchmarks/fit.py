@@ -42,6 +42,8 @@ def main() -> None:
         masks="off",
         background="black",
         coarse=0.0,
+        opacity_weight=0.01,
+        depth_weight=0.0,
     )
     print(f"{len(capture.photos)} photos, {args.gaussians} Gaussians, {args.iterations} iterations, {args.edge} px")
     print("fit                  s      PSNR    SSIM   Gaussians")

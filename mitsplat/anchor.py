@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -26,6 +26,12 @@ MAX_ERROR = 3.0
 
 MAX_CONTRADICTION = 0.01
 """Reprojection error of the fitted board from which a camera is wrong, as a share of its image's width."""
+
+PRINT_ERROR = 1e-4
+"""Standard error with which a user measures the edge of a printed square or tag [m]."""
+
+_GROUPS = 6
+"""Groups of images that are left out in turn to see how much the scale depends on them."""
 
 _Views = dict[int, dict[str, tuple[Camera, FloatArray]]]
 
@@ -82,21 +88,33 @@ def find_anchor(
         InputError: If ``scale_from`` names places that do not exist.
     """
     views, tag_views = _find_targets(model, images, board)
-    corners = {index: point for index, seen in views.items() if (point := triangulate(list(seen.values()))) is not None}
-    tags = _triangulate_tags(tag_views)
+    corners = _triangulate_corners(views, set(model.cameras))
+    tags = _triangulate_tags(tag_views, set(model.cameras))
     wrong: dict[str, float] = {}
     scale: tuple[float, float | None] | None = None
     plane: tuple[FloatArray, FloatArray] | None = None
     source = ""
     axes: FloatArray | None = None
     if fitted := _fit_board(corners, board):
-        pose, factor, error = fitted
+        pose, factor = fitted
         wrong = _contradicted(views, board.corners / factor @ pose[:3, :3].T + pose[:3, 3])
+
+        def board_scale(names: set[str]) -> float | None:
+            fitted = _fit_board(_triangulate_corners(views, names), board)
+            return None if fitted is None else fitted[1]
+
+        error = _scale_error(factor, board_scale, list(model.cameras), board.square)
         scale, plane, axes = (factor, error), (pose[:3, 2], pose[:3, 3]), pose[:3, :3]
         source = f"a ChArUco board ({len(corners)} corners)"
     elif tags and tag is not None:
-        edges = np.concatenate([np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1) for quad in tags.values()])
-        scale = (tag / float(edges.mean()), float(edges.std() / edges.mean() / np.sqrt(len(edges))))
+
+        def tag_scale(names: set[str]) -> float | None:
+            quads = _triangulate_tags(tag_views, names).values()
+            edges = [np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1) for quad in quads]
+            return tag / float(np.mean(edges)) if edges else None
+
+        factor = tag_scale(set(model.cameras)) or np.nan
+        scale = factor, _scale_error(factor, tag_scale, list(model.cameras), tag)
         source = f"{len(tags)} AprilTag{'s' if len(tags) > 1 else ''}"
         plane = _plane_of_tags(tags)
     if scale_from is not None and scale is None:
@@ -329,11 +347,36 @@ def _find_targets(model: Model, images: Mapping[str, Path], board: Board) -> tup
     return corners, tags
 
 
-def _triangulate_tags(views: _Views) -> dict[int, FloatArray]:
-    """Corners (4, 3) in the model of the tags that enough images show, by id."""
+def _scale_error(scale: float, measure: Callable[[set[str]], float | None], images: list[str], edge: float) -> float:
+    """Relative standard error of a scale: that of the print, and by a jackknife over groups of images (Tukey 1958).
+
+    Corners that lie as they should say little: what bends or stretches a whole model moves them together. So the scale
+    is measured without every sixth image in turn, which also brings another mix of cameras.
+
+    Args:
+        scale: From all images.
+        measure: The scale from some of the images, if they suffice.
+        images: Names of all of them.
+        edge: What the user measured [m].
+    """
+    found = [measure(set(images) - set(images[first::_GROUPS])) for first in range(_GROUPS)]
+    scales = np.array([value for value in found if value is not None])
+    drawn = float(np.sqrt((len(scales) - 1) * scales.var())) / scale if len(scales) > 1 else 0.0
+    return float(np.hypot(drawn, PRINT_ERROR / edge))
+
+
+def _triangulate_corners(views: _Views, names: set[str]) -> dict[int, FloatArray]:
+    """Corners (3,) of the board that enough of the named images show, by index."""
+    found = {i: triangulate([view for name, view in seen.items() if name in names]) for i, seen in views.items()}
+    return {index: point for index, point in found.items() if point is not None}
+
+
+def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, FloatArray]:
+    """Corners (4, 3) in the model of the tags that enough of the named images show, by id."""
     tags = {}
     for number, seen in views.items():
-        points = (triangulate([(camera, quad[corner]) for camera, quad in seen.values()]) for corner in range(4))
+        shown = [view for name, view in seen.items() if name in names]
+        points = (triangulate([(camera, quad[corner]) for camera, quad in shown]) for corner in range(4))
         found = [point for point in points if point is not None]
         if len(found) == 4:
             tags[number] = np.array(found)
@@ -356,8 +399,8 @@ def _contradicted(views: _Views, corners: FloatArray) -> dict[str, float]:
     return {name: error for name, error in medians.items() if error > MAX_CONTRADICTION * widths[name]}
 
 
-def _fit_board(corners: Mapping[int, FloatArray], board: Board) -> tuple[FloatArray, float, float] | None:
-    """Pose of the board in the model (4, 4), metres per unit of the model, and the relative standard error of that.
+def _fit_board(corners: Mapping[int, FloatArray], board: Board) -> tuple[FloatArray, float] | None:
+    """Pose of the board in the model (4, 4), and metres per unit of the model.
 
     None without enough corners, or where they do not lie as the board's do.
     """
@@ -373,7 +416,7 @@ def _fit_board(corners: Mapping[int, FloatArray], board: Board) -> tuple[FloatAr
         return None
     pose = matrix.copy()
     pose[:3, :3] /= scale
-    return pose, 1 / scale, rms / (spread * np.sqrt(len(ids)))
+    return pose, 1 / scale
 
 
 def _plane_of_tags(tags: Mapping[int, FloatArray]) -> tuple[FloatArray, FloatArray] | None:

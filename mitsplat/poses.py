@@ -121,16 +121,21 @@ def _match_names(content: _Transforms, photos: Mapping[str, Prepared]) -> dict[s
 
 def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Camera:
     """The OpenCV camera of a frame: its y and z axes are OpenGL's turned about."""
-    if lens.camera_model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        raise ValueError(f"camera_model must be OPENCV or PINHOLE (got {lens.camera_model}): undistort the photos")
+    if lens.camera_model not in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        raise ValueError(
+            f"camera_model must be OPENCV, OPENCV_FISHEYE or PINHOLE (got {lens.camera_model}): undistort the photos"
+        )
     focal = lens.fl_x
     if focal is None:
         if lens.camera_angle_x is None:
             raise ValueError("needs fl_x or camera_angle_x")
         focal = 0.5 * width / np.tan(0.5 * lens.camera_angle_x)
-    if lens.k4:
-        raise ValueError("k4 belongs to fisheye lenses, which are not supported: undistort the photos")
+    fisheye = lens.camera_model == "OPENCV_FISHEYE"
+    if lens.k4 and not fisheye:
+        raise ValueError(f"k4 belongs to camera_model OPENCV_FISHEYE (got {lens.camera_model})")
     distortion = (lens.k1, lens.k2, lens.p1, lens.p2) + ((lens.k3,) if lens.k3 else ())
+    if fisheye:
+        distortion = (lens.k1, lens.k2, lens.k3, lens.k4)
     pose = pose.copy()
     pose[:3, :3] @= np.diag([1.0, -1.0, -1.0])
     return Camera(
@@ -141,7 +146,8 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
         cx=0.5 * width if lens.cx is None else lens.cx,
         cy=0.5 * height if lens.cy is None else lens.cy,
         world_from_camera=pose,
-        distortion=distortion if any(distortion) else (),
+        distortion=distortion if fisheye or any(distortion) else (),
+        lens="fisheye" if fisheye else "opencv",
     )
 
 

@@ -41,6 +41,7 @@ _MODELS: Mapping[str, tuple[int, ...]] = {
     "RADIAL": (0, 0, 1, 2, 3, 4, -1, -1),
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
+    "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),  # k1, k2, k3, k4
 }
 
 
@@ -120,7 +121,10 @@ def find_points(
         name: {
             "width": camera.width,
             "height": camera.height,
-            "params": [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion, *[0.0] * 8][:12],
+            "model": "OPENCV_FISHEYE" if camera.lens == "fisheye" else "FULL_OPENCV",
+            "params": [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion, *[0.0] * 8][
+                : 8 if camera.lens == "fisheye" else 12
+            ],
             "camera_from_world": camera.camera_from_world[:3].tolist(),
         }
         for name, camera in cameras.items()
@@ -153,7 +157,7 @@ def opencv_camera(model: str, width: int, height: int, params: npt.ArrayLike, ca
     """The camera with COLMAP's parameters; both put pixel centres at +0.5.
 
     Raises:
-        InputError: If the lens model is not one of OpenCV's polynomial ones.
+        InputError: If the lens model is not one of OpenCV's, or shows more than it can.
     """
     if model not in _MODELS:
         raise InputError(
@@ -166,7 +170,15 @@ def opencv_camera(model: str, width: int, height: int, params: npt.ArrayLike, ca
     pose = np.eye(4)
     pose[:3, :3] = (u @ vt).T
     pose[:3, 3] = -pose[:3, :3] @ camera_from_world[:3, 3]
-    return Camera(int(width), int(height), fx, fy, cx, cy, pose, tuple(distortion) if any(distortion) else ())
+    fisheye = model == "OPENCV_FISHEYE"
+    try:
+        return Camera(
+            *(int(width), int(height), fx, fy, cx, cy, pose),
+            distortion=tuple(distortion) if fisheye or any(distortion) else (),
+            lens="fisheye" if fisheye else "opencv",
+        )
+    except ValueError as error:
+        raise InputError(f"a camera of lens model {model} cannot be used: {error}") from error
 
 
 def _job(photos: Sequence[Prepared]) -> dict[str, Any]:

@@ -159,7 +159,7 @@ def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.
     """A model without points.
 
     Args:
-        cameras: Per photo ``width``, ``height``, ``params`` of a FULL_OPENCV camera, ``camera_from_world`` (3, 4).
+        cameras: Per photo ``width``, ``height``, COLMAP's ``model`` and ``params``, ``camera_from_world`` (3, 4).
         database: Whose ids it takes.
     """
     model = pycolmap.Reconstruction()
@@ -170,7 +170,7 @@ def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.
             continue
         known = cameras[image.name]
         camera = pycolmap.Camera(
-            model="FULL_OPENCV",
+            model=known["model"],
             width=known["width"],
             height=known["height"],
             params=known["params"],

@@ -61,7 +61,7 @@ class SurfaceSettings:
     voxels: int = 192
     truncation: float = 3.0
     blur: float = 0.5
-    dissent: int = 1
+    dissent: int = 2
     faces: int = 10_000
 
     def __post_init__(self) -> None:

@@ -50,6 +50,7 @@ _ADVICE = {
     "psnr": "use even light, fixed exposure and sharp photos, and fit longer",
     "splat_iou": "check the masks in the report, and give better ones",
     "mesh_iou": "check the masks in the report, and photograph the object from more heights",
+    "watertight": "photograph the object from all sides, or import a closed mesh",
     "offset": "fit longer, or check the frame and scale of an imported mesh",
     "scale_error": "measure a longer distance, or put a board beside the object that more photos see",
     "lost": "check whether masks leave parts of the object out",
@@ -100,6 +101,7 @@ class Verdict:
         gaussians: Number of Gaussians.
         faces: Number of faces of the mesh.
         watertight: Whether the mesh encloses a volume.
+        solid: Whether it must, as that of an object.
     """
 
     photos: int
@@ -116,6 +118,7 @@ class Verdict:
     gaussians: int
     faces: int
     watertight: bool
+    solid: bool
 
     @property
     def registered(self) -> float:
@@ -142,6 +145,8 @@ class Verdict:
                 if value is not None and sign * value < sign * limit:
                     rule = "at least" if sign > 0 else "at most"
                     found.append(f"{sentence} ({rule} {limit:g} is wanted): {_ADVICE[name]}")
+        if self.solid and not self.watertight:
+            found.append(f"the mesh is open (a closed one is wanted): {_ADVICE['watertight']}")
         return tuple(found)
 
 
@@ -211,6 +216,7 @@ def judge(
         gaussians=len(splats),
         faces=0 if mesh is None else len(mesh.faces),
         watertight=mesh is not None and bool(mesh.is_watertight),
+        solid=isolation is not None,
     )
 
 

@@ -435,7 +435,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 def finished(folder: Path, **changes: Any) -> Finished:
     figures = Verdict(
         photos=9, rejected=1, psnr=27.0, psnr_object=26.0, splat_iou=0.97, mesh_iou=0.96, offset=0.001, spread=0.001,
-        lost=0.0, scale_error=None, units="metre", gaussians=12, faces=99, watertight=True,
+        lost=0.0, scale_error=None, units="metre", gaussians=12, faces=99, watertight=True, solid=True,
     )  # fmt: skip
     return Finished(folder, replace(figures, **changes), kept=False)
 

@@ -27,7 +27,7 @@ from mitsplat.verdict import Verdict
 SETTINGS = ReconstructSettings(surface=SurfaceSettings(voxels=96, faces=4000), view_size=160, verdict_size=160)
 GOOD = Verdict(
     photos=32, rejected=0, psnr=30.0, psnr_object=29.0, splat_iou=0.98, mesh_iou=0.97, offset=1e-3, spread=1e-3,
-    lost=0.01, scale_error=1e-3, units="metre", gaussians=9, faces=9, watertight=True,
+    lost=0.01, scale_error=1e-3, units="metre", gaussians=9, faces=9, watertight=True, solid=True,
 )  # fmt: skip
 
 
@@ -171,6 +171,7 @@ def test_surroundings_need_no_masks_and_get_an_open_mesh(known_object: KnownObje
         ({"mesh_iou": 0.5}, "the mesh meets held-out masks"),
         ({"offset": 0.02}, "2.00% of the diagonal apart"),
         ({"scale_error": 0.05}, "known to 5.0% only"),
+        ({"watertight": False}, "the mesh is open"),
         ({"lost": 0.5}, "removed 50.0% of the object"),
     ],
 )

@@ -17,7 +17,7 @@ import rendered
 from PIL import Image
 from test_cli import run
 
-from mitsplat import sfm, take
+from mitsplat import poses, sfm, take
 from mitsplat.anchor import fit_similarity
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture
@@ -314,8 +314,32 @@ def test_photos_of_two_things_end_with_status_4(
 
 
 def test_lenses_of_other_models_are_refused() -> None:
-    with pytest.raises(InputError, match="lens model OPENCV_FISHEYE is not supported: use one of SIMPLE_PINHOLE, "):
-        sfm.opencv_camera("OPENCV_FISHEYE", 4, 3, [1] * 8, np.eye(4)[:3])
+    with pytest.raises(InputError, match="lens model FOV is not supported: use one of SIMPLE_PINHOLE, "):
+        sfm.opencv_camera("FOV", 4, 3, [1] * 5, np.eye(4)[:3])
+    with pytest.raises(InputError, match="a camera of lens model OPENCV_FISHEYE cannot be used: a fisheye must show"):
+        sfm.opencv_camera("OPENCV_FISHEYE", 4000, 3000, [300, 300, 2000, 1500, 0, 0, 0, 0], np.eye(4)[:3])
+
+
+def test_fisheyes_are_read(tmp_path: Path) -> None:
+    """From a COLMAP model and from a transforms.json: the angle to the axis grows as OpenCV's polynomial says."""
+    values = 300.0, 301.0, 160.0, 120.0, 0.02, -0.01, 0.003, 0.001
+    angle = 0.4
+    shown = angle * (1 + 0.02 * angle**2 - 0.01 * angle**4 + 0.003 * angle**6 + 0.001 * angle**8)
+    pixel = [[160 + 300 * shown, 120]]
+    given = tmp_path / "model"
+    given.mkdir()
+    (given / "cameras.txt").write_text(f"1 OPENCV_FISHEYE 320 240 {' '.join(map(str, values))}\n")
+    (given / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n")
+    (given / "points3D.txt").write_text("")
+    colmap = sfm.read_model(given, tmp_path / "work").cameras["a.png"]
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
+    frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
+    lens = dict(zip(names, values, strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV_FISHEYE"}
+    (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": [frame]}))
+    nerf = poses._read_transforms(tmp_path / "transforms.json", {}).cameras["a.png"]
+    for camera in (colmap, nerf):
+        assert camera.lens == "fisheye"
+        np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
 
 
 @pytest.mark.parametrize(

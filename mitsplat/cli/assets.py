@@ -225,7 +225,7 @@ def mesh(
     kind: Kind = "object",
     faces: Faces = 10000,
     voxels: Annotated[int, typer.Option(help="Cells of the grid along the longest extent.")] = 192,
-    dissent: Annotated[int, typer.Option(help="Masks that may leave a point out and be overruled, 0 to 3.")] = 1,
+    dissent: Annotated[int, typer.Option(help="Masks that may leave a point out and be overruled, 0 to 3.")] = 2,
     size: Size = None,
     take: Annotated[
         Path | None, typer.Option("--import", metavar="MESH", help="Take this mesh instead; it is registered.")

@@ -215,9 +215,16 @@ def judge(
         units=capture.units,
         gaussians=len(splats),
         faces=0 if mesh is None else len(mesh.faces),
-        watertight=mesh is not None and bool(mesh.is_watertight),
+        watertight=mesh is not None and _closed(mesh),
         solid=isolation is not None,
     )
+
+
+def _closed(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh is watertight also where readers weld vertices that lie on each other."""
+    welded = mesh.copy()
+    welded.merge_vertices(merge_tex=True, merge_norm=True)
+    return bool(welded.is_watertight)
 
 
 def iou(one: npt.NDArray[np.bool_], other: npt.NDArray[np.bool_]) -> float:

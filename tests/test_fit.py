@@ -13,11 +13,11 @@ import pytest
 from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
-from test_refine import encode
 
 from mitsplat import fit
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
+from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.fit import FitProgress, FitSettings, fit_capture
 from mitsplat.render import ensure_variant, render_splats
@@ -56,7 +56,7 @@ def photograph(folder: Path, *, gains: np.ndarray | None = None) -> Capture:
     for number in range(VIEWS):
         camera = look(rng.normal(size=3) * (1, 1, 0.5))
         layers = render_splats(truth, camera, quality=fit.QUALITY)
-        colour = encode(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
+        colour = encode_srgb(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
         colour += rng.random((HEIGHT, WIDTH, 3)) * (1 - layers.alpha[..., None])
         if gains is not None:
             colour *= gains[number]

@@ -1,9 +1,14 @@
-"""Files of one JSON record per line that only grow while a dataset is made."""
+"""Files of one JSON record per line that only grow while a dataset is made.
+
+Every line of a manifest ends in a checksum of the rest of it, ``"check"``: the first 64 bits of its SHA-256.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,16 +17,19 @@ from mitsplat.errors import InputError
 from mitsplat.files import Record, write_file
 
 
+_CHECKED = re.compile(rb'(\{.*),"check":"([0-9a-f]{16})"\}')
+
+
 class Manifest:
     """The records of a dataset's frames, on disk; only their places in the file are held in memory.
 
     Iteration is by ascending frame index. Where two lines have one index, the later counts.
 
     Args:
-        path: The file; made if missing, cut behind its last whole line if torn.
+        path: The file; made if missing. A last line that is not whole is cut off: whoever wrote it was stopped.
 
     Raises:
-        InputError: If a whole line is not a record of a frame.
+        InputError: If any other line is not as it was written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -29,13 +37,23 @@ class Manifest:
         self._places: dict[int, int] = {}
         cut_torn_line(path)
         place = 0
+        torn: InputError | None = None
         with path.open("rb") as file:
             for number, line in enumerate(file, start=1):
+                if torn is not None:
+                    raise torn
                 try:
-                    self._places[json.loads(line)["index"]] = place
-                except (ValueError, KeyError, TypeError) as error:
-                    raise InputError(f"{path}, line {number}: must be the record of a frame ({error!r})") from error
-                place += len(line)
+                    self._places[parse_line(line)["index"]] = place
+                except ValueError as error:
+                    torn = InputError(
+                        f"{path}, line {number}: must be the record of a frame ({error}); "
+                        "without that line its frame is made again"
+                    )
+                    torn.__cause__ = error
+                else:
+                    place += len(line)
+        if torn is not None:
+            os.truncate(path, place)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -47,12 +65,11 @@ class Manifest:
         with self.path.open("rb") as file:
             for index in sorted(self._places):
                 file.seek(self._places[index])
-                record: Record = json.loads(file.readline())
-                yield record
+                yield parse_line(file.readline())
 
     def append(self, record: Record) -> None:
         """Add a record; it is on disk when this returns."""
-        self._places[record["index"]] = append_line(self.path, record)
+        self._places[record["index"]] = _append(self.path, encode_line(record))
 
     def forget(self, index: int) -> None:
         """Act as if the file had no record of this frame."""
@@ -73,11 +90,42 @@ class Manifest:
         self._places = places
 
 
-def append_line(path: Path, record: Mapping[str, Any]) -> int:
-    """Append a record; it is on disk when this returns its place in the file."""
+def encode_line(record: Record) -> bytes:
+    """The line of a frame's record, with its checksum."""
+    text = json.dumps(record, separators=(",", ":")).encode()
+    return text[:-1] + f',"check":"{_checksum(text)}"}}\n'.encode()
+
+
+def parse_line(line: bytes) -> Record:
+    """The record of a line, without its checksum.
+
+    Raises:
+        ValueError: If it is not as it was written.
+    """
+    found = _CHECKED.fullmatch(line.rstrip(b"\n"))
+    if found is None:
+        raise ValueError("it has no checksum")
+    text = found[1] + b"}"
+    if _checksum(text) != found[2].decode():
+        raise ValueError(f"its checksum must be {_checksum(text)} (got {found[2].decode()})")
+    record: Record = json.loads(text)
+    return record
+
+
+def append_line(path: Path, record: Mapping[str, Any]) -> None:
+    """Append a record without a checksum; it is on disk when this returns."""
+    _append(path, json.dumps(record, separators=(",", ":")).encode() + b"\n")
+
+
+def _checksum(text: bytes) -> str:
+    return hashlib.sha256(text).hexdigest()[:16]
+
+
+def _append(path: Path, line: bytes) -> int:
+    """Append a line; it is on disk when this returns its place in the file."""
     with path.open("ab") as file:
         place = file.tell()
-        file.write(json.dumps(record, separators=(",", ":")).encode() + b"\n")
+        file.write(line)
         file.flush()
         os.fsync(file.fileno())
     return place

@@ -16,6 +16,7 @@ from mitsplat.camera import Lens
 from mitsplat.coco import camera_of
 from mitsplat.errors import InputError
 from mitsplat.files import Record
+from mitsplat.manifest import parse_line
 from mitsplat.masks import encode_mask
 from mitsplat.spec import Labelling, Output
 
@@ -139,7 +140,7 @@ def read_records(root: Path, content: dict[str, Any]) -> tuple[list[Record], lis
     for number, line in enumerate((root / "manifest.jsonl").read_bytes().splitlines(), start=1):
         try:
             _Record.model_validate_json(line)
-            record = json.loads(line)
+            record = parse_line(line)
             _check_record(record, content)
         except ValidationError as error:
             violations.append(("manifest.jsonl", f"line {number} is not the record of a frame ({_first(error)})"))

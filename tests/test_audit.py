@@ -19,10 +19,11 @@ from test_cli import run
 from mitsplat.audit import audit_dataset
 from mitsplat.errors import InputError
 from mitsplat.files import Record
+from mitsplat.manifest import encode_line, parse_line
 
 
 def records_of(root: Path) -> list[Record]:
-    return [json.loads(line) for line in (root / "manifest.jsonl").read_text().splitlines()]
+    return [parse_line(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
 
 
 def store(root: Path, records: list[Record], *, describe: bool = True) -> None:
@@ -30,7 +31,7 @@ def store(root: Path, records: list[Record], *, describe: bool = True) -> None:
     for record in records:
         for file in record["files"]:
             record["files"][file] = hashlib.sha256((root / file).read_bytes()).hexdigest()
-    (root / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    (root / "manifest.jsonl").write_bytes(b"".join(map(encode_line, records)))
     if describe:
         from mitsplat.writers import Catalogue, write_collection
 
@@ -341,7 +342,7 @@ def test_a_record_that_nothing_can_rely_on_is_one_violation(
     for key in keys[:-1]:
         place = place[key]
     place[keys[-1]] = value
-    (dataset / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    (dataset / "manifest.jsonl").write_bytes(b"".join(map(encode_line, records)))
     found = [said for file, said in audit_dataset(dataset).violations if file == "manifest.jsonl"]
     assert len(found) == 1 and found[0].startswith("line 1 is not the record of a frame (") and text in found[0]
 

@@ -28,6 +28,7 @@ from ruamel.yaml import YAML
 from scipy.spatial import QhullError
 
 from mitsplat.errors import InputError
+from mitsplat.files import file_inside
 from mitsplat.splats import FloatArray, Splats
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
@@ -149,19 +150,19 @@ class Asset:
         """
         folder = Path(folder)
         spec = load_yaml(folder / _FILE, AssetSpec)
-        splats = Splats.load(_file_inside(folder, "splats", spec.splats))
+        splats = Splats.load(_named_file(folder, "splats", spec.splats))
         if spec.mesh is None:
             mesh = None
         elif spec.mesh == "hull":
             mesh = _hull(_opaque_core(splats), key_place(folder / _FILE, ("mesh",)))
         else:
-            mesh = read_mesh(_file_inside(folder, "mesh", spec.mesh))
+            mesh = read_mesh(_named_file(folder, "mesh", spec.mesh))
         asset = cls(
             name=spec.name,
             class_name=spec.class_name or spec.name,
             splats=splats,
             mesh=mesh,
-            pieces=() if spec.pieces is None else _read_pieces(_file_inside(folder, "pieces", spec.pieces)),
+            pieces=() if spec.pieces is None else _read_pieces(_named_file(folder, "pieces", spec.pieces)),
             kind=spec.kind,
             density=1000.0 if spec.density is None else spec.density,
             mass=spec.mass,
@@ -334,14 +335,12 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
     return mesh
 
 
-def _file_inside(folder: Path, key: str, name: str) -> Path:
-    """The named file, which must be in ``folder`` also after links and ``..`` are followed."""
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{key_place(folder / _FILE, (key,))}: must be a file inside the asset's folder (got {name})")
-    if not path.is_file():
-        raise InputError(f"{key_place(folder / _FILE, (key,))}: no such file (got {name})")
-    return path
+def _named_file(folder: Path, key: str, name: str) -> Path:
+    """A file that ``asset.yaml`` names, see :func:`mitsplat.files.file_inside`."""
+    try:
+        return file_inside(folder, name)
+    except InputError as error:
+        raise InputError(f"{key_place(folder / _FILE, (key,))}: {error}") from error
 
 
 def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.camera import Camera, Lens
 from mitsplat.errors import InputError
-from mitsplat.files import write_file, write_text
+from mitsplat.files import file_inside, write_file, write_text
 from mitsplat.yaml_input import load_yaml
 
 FloatArray = npt.NDArray[np.float64]
@@ -277,8 +277,8 @@ class Capture:
                 camera = Camera(**{**entry.camera.model_dump(), "world_from_camera": entry.camera.world_from_camera})
             except ValueError as error:
                 raise InputError(f"{folder / _FILE}: {entry.name}: {error}") from error
-            file = _inside(folder, entry.file)
-            mask = None if entry.mask is None else _inside(folder, entry.mask)
+            file = _named_file(folder, entry.file)
+            mask = None if entry.mask is None else _named_file(folder, entry.mask)
             photos.append(Photo(entry.name, file, camera, mask, indices))
         try:
             return cls(tuple(photos), points, colours, spec.units, spec.up, spec.rejected, spec.scale_error)
@@ -304,14 +304,12 @@ def _kept(source: Path, target: Path) -> Path:
     return target
 
 
-def _inside(folder: Path, name: str) -> Path:
-    """The file of this name, which must exist in the folder."""
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{folder / _FILE}: must name files inside its folder (got {name})")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    return path
+def _named_file(folder: Path, name: str) -> Path:
+    """A file that ``capture.json`` names, see :func:`mitsplat.files.file_inside`."""
+    try:
+        return file_inside(folder, name)
+    except InputError as error:
+        raise InputError(f"{folder / _FILE}: {error}") from error
 
 
 def _photo_spec(photo: Photo, folder: Path) -> PhotoSpec:

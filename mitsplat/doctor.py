@@ -7,13 +7,17 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from mitsplat.llvm import OLDEST_USABLE, VARIABLE
 
 NEEDED_MEMORY = 4.0
 """Peak of the default scene [GiB]."""
+
+_CGROUP = Path("/sys/fs/cgroup")
 
 TRIAL = """
 import mitsuba as mi, drjit as dr
@@ -76,8 +80,20 @@ def _warp() -> Finding:
     return Finding("warp", True, f"{version('warp-lang')} on {devices}")
 
 
+def unused_memory() -> float:
+    """Memory that programs can still have [GiB], within what a container is limited to."""
+    free = {"MemAvailable": os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30}
+    with suppress(OSError):
+        lines = (line.split() for line in Path("/proc/meminfo").read_text().splitlines())
+        free |= {words[0].rstrip(":"): int(words[1]) / 2**20 for words in lines}
+    with suppress(OSError, ValueError):  # no limit is "max", which is no number
+        limit, used = (int((_CGROUP / name).read_text()) for name in ("memory.max", "memory.current"))
+        return min(free["MemAvailable"], (limit - used) / 2**30)
+    return free["MemAvailable"]
+
+
 def _memory() -> Finding:
-    available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
+    available = unused_memory()
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     remedy = f"have {NEEDED_MEMORY:g} GiB for each worker: close programs, or render with fewer workers"
     return Finding("memory", total >= NEEDED_MEMORY, f"{available:.1f} of {total:.1f} GiB unused", remedy)

@@ -13,3 +13,14 @@ class MissingResourceError(RuntimeError):
 
 class PartialResultError(RuntimeError):
     """A result was written, but it misses a threshold; the sentence says which, and what would help. Exit status 4."""
+
+
+def exit_status(error: BaseException) -> int | None:
+    """Status with which the command line exits for an error that is no bug of ours, else None."""
+    if isinstance(error, MissingResourceError):
+        return 3
+    if isinstance(error, PartialResultError):
+        return 4
+    if isinstance(error, KeyboardInterrupt):
+        return 130
+    return 2 if isinstance(error, InputError | OSError) else None

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from mitsplat.errors import InputError, MissingResourceError
 
 Record = dict[str, Any]
 """The line of one frame in ``manifest.jsonl``."""
 
 SPLITS = ("train", "val")
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> str:
@@ -34,6 +40,49 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
 def write_text(path: Path, text: str) -> str:
     """Write UTF-8 text by :func:`write_file`."""
     return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))
+
+
+def file_inside(folder: Path, name: str) -> Path:
+    """The file of this name, which must be in ``folder`` also after links and ``..`` are followed.
+
+    Raises:
+        InputError: With the rule alone, if it is outside or missing: the caller knows where the name is from.
+    """
+    path = folder / name
+    try:
+        inside, found = path.resolve().is_relative_to(folder.resolve()), path.is_file()
+    except (OSError, ValueError) as error:  # a name too long, a loop of links, a zero byte
+        raise InputError(f"must be the name of a file ({error})") from error
+    if not inside:
+        raise InputError(f"must be a file inside {folder} (got {name})")
+    if not found:
+        raise InputError(f"no such file (got {name})")
+    return path
+
+
+def storage_error(path: Path, said: str) -> OSError:
+    """The error of a library that puts the system's words, but not its number, into what it says."""
+    number = next((number for number in _FULL if os.strerror(number) in said), errno.EIO)
+    return OSError(number, os.strerror(number), str(path))
+
+
+@contextmanager
+def storage_errors(folder: Path) -> Iterator[None]:
+    """Tell what prevents writing into a folder in one sentence.
+
+    Raises:
+        MissingResourceError: If there is no room.
+        InputError: If something else is wrong with a file.
+    """
+    try:
+        yield
+    except OSError as error:
+        place = error.filename or folder
+        if error.errno in _FULL:
+            raise MissingResourceError(
+                f"{place}: {error.strerror}: make room and run again; what is finished is kept"
+            ) from error
+        raise InputError(f"{place}: cannot be written or read ({error.strerror or error})") from error
 
 
 def link_file(source: Path, target: Path) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 from mitsplat.errors import InputError
 from mitsplat.files import Record, write_file
 
-
 _CHECKED = re.compile(rb'(\{.*),"check":"([0-9a-f]{16})"\}')
 
 
@@ -54,6 +53,7 @@ class Manifest:
                     place += len(line)
         if torn is not None:
             os.truncate(path, place)
+        self._end = place
 
     def __len__(self) -> int:
         return len(self._places)
@@ -67,9 +67,26 @@ class Manifest:
                 file.seek(self._places[index])
                 yield parse_line(file.readline())
 
+    @property
+    def indices(self) -> list[int]:
+        """Indices of the frames, ascending."""
+        return sorted(self._places)
+
     def append(self, record: Record) -> None:
-        """Add a record; it is on disk when this returns."""
-        self._places[record["index"]] = _append(self.path, encode_line(record))
+        """Add a record; it is on disk when this returns.
+
+        Raises:
+            InputError: If someone else changed or removed the file.
+        """
+        line = encode_line(record)
+        place = _append(self.path, line)
+        if place != self._end:
+            raise InputError(
+                f"{self.path}: must not be changed or removed while it is written (it had {self._end} bytes, "
+                f"then {place}); run again"
+            )
+        self._places[record["index"]] = place
+        self._end = place + len(line)
 
     def forget(self, index: int) -> None:
         """Act as if the file had no record of this frame."""
@@ -87,7 +104,7 @@ class Manifest:
 
         places: dict[int, int] = {}
         write_file(self.path, write)
-        self._places = places
+        self._places, self._end = places, self.path.stat().st_size
 
 
 def encode_line(record: Record) -> bytes:

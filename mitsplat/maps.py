@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
+from mitsplat.files import storage_error
 from mitsplat.label import Labels
 from mitsplat.masks import BoolArray, Box
 
@@ -45,7 +46,10 @@ def write_exr(path: Path, frame: Frame) -> None:
     contiguous = {name: np.ascontiguousarray(c, dtype=kinds[c.dtype.kind]) for name, c in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, contiguous) as file:
-        file.write(str(path))
+        try:
+            file.write(str(path))
+        except RuntimeError as error:
+            raise storage_error(path, str(error)) from error
 
 
 def encode_png(picture: npt.NDArray[Any]) -> bytes:

@@ -122,8 +122,8 @@ def edit(folder: Path, **changes: object) -> None:
         ({"photos__3__camera__fx": -1.0}, "view 3.png: focal lengths must be finite and > 0"),
         ({"photos__3__camera__width": "wide"}, "photos[3].camera.width: must be a whole number"),
         ({"photos__3__camera__world_from_camera__0": [9.0, 0.0, 0.0, 0.0]}, "view 3.png: world_from_camera must be"),
-        ({"photos__3__file": "../given/view 3.png"}, "must name files inside its folder (got ../given/view 3.png)"),
-        ({"photos__3__mask": "masks/gone.png"}, "masks/gone.png: no such file"),
+        ({"photos__3__file": "../given/view 3.png"}, "(got ../given/view 3.png)"),
+        ({"photos__3__mask": "masks/gone.png"}, "no such file (got masks/gone.png)"),
         ({"photos__3__name": "view 4.png"}, "names of photos must be unique (got view 4.png twice)"),
     ],
 )

@@ -92,7 +92,7 @@ def test_render_passes_every_option_on(
     assert scene.spec.output.formats == ("yolo", "coco")
     assert (scene.spec.seed, scene.spec.quality) == (9, "fast")
     write_dataset.kwargs.pop("progress")
-    assert write_dataset.kwargs == {"frames": 3, "workers": 2, "overwrite": True}
+    assert write_dataset.kwargs == {"frames": 3, "shard": None, "workers": 2, "cluster": None, "overwrite": True}
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"dataset: {tmp_path / 'out'} (2 train, 1 val; 9 labelled instances)"
     assert lines[1] == "not labelled: 2 small; marked: 1 occluded"
@@ -105,7 +105,9 @@ def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_d
     assert out == Path("out/scene")
     assert (scene.spec.output.width, scene.spec.seed, scene.spec.quality) == (64, 7, "balanced")
     write_dataset.kwargs.pop("progress")
-    assert write_dataset.kwargs == {"frames": None, "workers": 1, "overwrite": False}
+    assert write_dataset.kwargs == {
+        "frames": None, "shard": None, "workers": None, "cluster": None, "overwrite": False,
+    }  # fmt: skip
 
 
 def test_render_chooses_the_preset_within_a_tolerance(

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import os
 import shutil
+import socket
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -13,10 +15,10 @@ import pytest
 from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
-from mitsplat import dataset
+from mitsplat import folder
 from mitsplat.dataset import write_dataset
 from mitsplat.engine import FrameError
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.files import SPLITS
 from mitsplat.label import LabelRules, Labels, Truth, label_instances
 from mitsplat.manifest import Manifest
@@ -244,7 +246,7 @@ class TestSameBytes:
         def fail(*args):
             raise OSError(28, "No space left on device")
 
-        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        with monkeypatch.context() as patch, pytest.raises(MissingResourceError, match=r"No space .*: make room"):
             patch.setattr("mitsplat.writers.yolo_lines", fail)
             write(scene, out)
         assert (out / "images/train/000000.png").is_file()
@@ -368,7 +370,9 @@ class TestRefusals:
         out = tmp_path / "out"
 
         def second(*args, **options):
-            self.refuse(scene, out, r"being written by another run \(process \d+\)")
+            self.refuse(
+                scene, out, rf"being written by another run \(process {os.getpid()} on {socket.gethostname()}\)"
+            )
             return render(*args, **options)
 
         write(scene, out, frames=1, render=second)
@@ -384,8 +388,8 @@ class TestRefusals:
         def denied(*args, **options):
             raise PermissionError(13, "Permission denied", "out")
 
-        monkeypatch.setattr(dataset, "write_text", denied)
-        self.refuse(scene, tmp_path / "out", "cannot write into .*: Permission denied")
+        monkeypatch.setattr(folder, "write_text", denied)
+        self.refuse(scene, tmp_path / "out", r"out: cannot be written or read \(Permission denied\)")
 
     def test_a_damaged_manifest(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=3)

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -9,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from mitsplat.engine import FrameError, run_frames
+from mitsplat import engine
+from mitsplat.engine import Finished, FrameError, LostWorkersError, run_frames, run_pool
 from mitsplat.errors import InputError
 
 LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
@@ -87,9 +90,125 @@ def test_any_other_failure_names_the_frame_and_has_the_trace():
 
 
 @pytest.mark.parametrize(("how", "words"), [("killed", "was killed by SIGKILL"), ("exits", "ended with status 3")])
-def test_a_dead_worker_is_reported_with_its_frame(how, words):
-    with pytest.raises(FrameError, match=f"making frame 4 {words}"):
+def test_a_frame_that_ends_every_process_is_reported(how, words):
+    with pytest.raises(LostWorkersError, match=f"making frame 4 {words}, 3 times"):
         run(Make(fail_at=4, how=how), 2)
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_frames_of_lost_workers_are_made_again(tmp_path, workers):
+    """Two frames kill the process that tries them first; every frame is made, once, and the losses are told."""
+    notes = []
+    made = run(KillOnce(tmp_path, (1, 7)), workers, note=notes.append)
+    assert sorted(made) == list(range(9))
+    told = [note for note in notes if "made again" in note]
+    assert sorted(told) == [f"the process making frame {i} was killed by SIGKILL: it is made again" for i in (1, 7)]
+
+
+@dataclass(frozen=True)
+class KillOnce:
+    """Kills its process at some frames, unless it has done so."""
+
+    folder: Path
+    frames: tuple[int, ...]
+
+    def __call__(self, index, note, /):
+        mark = self.folder / str(index)
+        if index in self.frames and not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return index
+
+
+def test_workers_end_with_their_parent(tmp_path):
+    """A parent that is killed leaves no process behind that could still write."""
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path; from test_engine import Linger; from mitsplat.engine import run_frames\n"
+        "if __name__ == '__main__':\n"
+        "    list(run_frames(Linger(Path(sys.argv[2])), {0: [0, 1]}, workers=2, note=print))\n"
+    )
+    (tmp_path / "parent.py").write_text(script)
+    folder = tmp_path / "pids"
+    folder.mkdir()
+    parent = subprocess.Popen([sys.executable, tmp_path / "parent.py", str(Path(__file__).parent), str(folder)])
+    wait_for(lambda: len(list(folder.iterdir())) == 2)
+    parent.kill()
+    parent.wait()
+    for path in folder.iterdir():
+        wait_for(lambda path=path: not Path("/proc", path.name).exists() or "Z" in state_of(path.name))
+
+
+def state_of(process):
+    return Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0]
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@dataclass(frozen=True)
+class Linger:
+    """Says who it is and stays."""
+
+    folder: Path
+
+    def __call__(self, index, note, /):
+        (self.folder / str(os.getpid())).touch()
+        time.sleep(300)
+
+
+class Scripted:
+    """A pool whose workers take given times, one after the other on a clock of its own, for the growth of a staff."""
+
+    def __init__(self, seconds):
+        self.seconds, self.clock, self.most = seconds, 0.0, 0
+        self.due: dict[int, tuple[float, int]] = {}
+        self.alive: set[int] = set()
+        self.hired = 0
+
+    def hire(self):
+        self.alive.add(self.hired)
+        self.hired += 1
+        self.most = max(self.most, len(self.alive))
+        return self.hired - 1
+
+    def dismiss(self, worker):
+        self.alive.remove(worker)
+
+    def give(self, worker, frame, layout):
+        self.due[worker] = self.clock + self.seconds(len(self.alive)), frame
+
+    def wait(self):
+        worker = min(self.due, key=self.due.__getitem__)
+        self.clock, frame = self.due.pop(worker)
+        yield worker, Finished(frame)
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("seconds", "settled_at", "most"),
+    [
+        (lambda count: 1.0, 4, 4),  # every worker adds its full speed
+        (lambda count: float(count), 1, 2),  # they share one core: the second is dismissed
+        (lambda count: 1.0 if count <= 2 else 0.6 * count, 2, 3),  # the third does not pay
+    ],
+)
+def test_as_many_workers_as_pay(monkeypatch, seconds, settled_at, most):
+    pool = Scripted(seconds)
+    monkeypatch.setattr(engine.time, "monotonic", lambda: pool.clock)
+    made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
+    assert sorted(made) == list(range(400))
+    assert (len(pool.alive), pool.most) == (settled_at, most)
+
+
+def test_few_frames_start_no_process():
+    assert run(Make(), None) == [(index, os.getpid()) for index in range(9)]
 
 
 def test_closing_stops_the_workers_at_once():

@@ -1,7 +1,7 @@
 """The command ``mitsplat``: arguments to calls, and errors in one sentence instead of a traceback.
 
 Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 3 something is missing on the machine,
-4 a result was written that misses a threshold, 130 interrupted.
+4 a result was written that is not whole or misses a threshold, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import typer
 
 from mitsplat import __version__
 from mitsplat.cli import assets, datasets
-from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from mitsplat.cli.options import sentence_of
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError, exit_status
 
 app = typer.Typer(
     help="Labelled training images of settled objects, from Gaussian splats, physics and traced light.",
@@ -26,6 +27,7 @@ app = typer.Typer(
 
 for _command in (
     datasets.render,
+    datasets.merge,
     datasets.chart,
     datasets.audit,
     datasets.report,
@@ -52,14 +54,9 @@ def main(args: Sequence[str] | None = None) -> None:
     """
     try:
         app(args)
-    except InputError as error:
-        _fail(str(error))
-    except MissingResourceError as error:
-        _fail(str(error), status=3)
-    except PartialResultError as error:
-        _fail(str(error), status=4)
-    except OSError as error:
-        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (InputError, MissingResourceError, PartialResultError, OSError) as error:
+        typer.echo(f"mitsplat: {sentence_of(error)}", err=True)
+        sys.exit(exit_status(error))
 
 
 def _show_version(wanted: bool) -> None:
@@ -75,8 +72,3 @@ def _common(
     ] = False,
 ) -> None:
     pass
-
-
-def _fail(sentence: str, *, status: int = 2) -> None:
-    typer.echo(f"mitsplat: {sentence}", err=True)
-    sys.exit(status)

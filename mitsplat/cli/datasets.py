@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from mitsplat.cli.options import progress_bar
+from mitsplat.cli.options import JsonLog, progress_bar, progress_of
 from mitsplat.errors import InputError
 from mitsplat.quality import PresetName
+
+if TYPE_CHECKING:
+    from mitsplat.dataset import DatasetSummary
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -36,7 +39,22 @@ def render(
         float | None,
         typer.Option(help="Choose the cheapest preset within this error (RMSE of encoded colours), as `chart` does."),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Processes that make images.")] = 1,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that make images; as many as turn out to pay if absent.")
+    ] = None,
+    engine: Annotated[
+        Literal["local", "ray"], typer.Option(help="Make images on this machine, or on a Ray cluster.")
+    ] = "local",
+    address: Annotated[
+        str | None, typer.Option(help="Of the cluster, or auto; Ray is started on this machine if absent.")
+    ] = None,
+    resources: Annotated[
+        str, typer.Option(metavar="NAME=AMOUNT,...", help="What a worker on the cluster reserves, such as CPU=4,GPU=1.")
+    ] = "CPU=2",
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, which `merge` joins; I counts from 1.")
+    ] = None,
+    json_log: JsonLog = False,
     formats: Annotated[
         str | None,
         typer.Option("--format", metavar="NAMES", help="Label formats as in output.formats, separated by commas."),
@@ -52,17 +70,21 @@ def render(
     """
     overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
     if out is None:
-        out = Path("out") / scene.stem
+        out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
     if scene.suffix == ".xml":
-        if overrides or frames is not None or tolerance is not None:
+        if overrides or frames is not None or tolerance is not None or shard is not None:
             raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
         from mitsplat.xml_scene import render_xml
 
         typer.echo(f"picture: {render_xml(scene, out)}")
         return
+    from mitsplat.cluster import Cluster
     from mitsplat.dataset import write_dataset
+    from mitsplat.folder import Shard
     from mitsplat.scene import load_scene
 
+    part = None if shard is None else Shard.parse(shard)
+    cluster = Cluster(address, Cluster.parse_resources(resources)) if engine == "ray" else None
     loaded = load_scene(scene, overrides=overrides)
     if tolerance is not None:
         if quality is not None:
@@ -73,8 +95,41 @@ def render(
             best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
         typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
         loaded = load_scene(scene, overrides=overrides | {"quality": best.name})
-    with progress_bar() as progress:
-        summary = write_dataset(loaded, out, frames=frames, workers=workers, overwrite=overwrite, progress=progress)
+    with progress_of(json_log, "render") as progress:
+        summary = write_dataset(
+            loaded,
+            out,
+            frames=frames,
+            shard=part,
+            workers=workers,
+            cluster=cluster,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    _tell_dataset(summary)
+
+
+def merge(
+    shards: Annotated[list[Path], typer.Argument(metavar="SHARDS...", help="Dataset folders, all shards of one.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Dataset folder to write.")],
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite/--resume", help="Replace the dataset in the folder, or keep what is finished of it."),
+    ] = False,
+    json_log: JsonLog = False,
+) -> None:
+    """Join SHARDS, the parts of a dataset that were made apart.
+
+    Every file is checked against its hash, and no frame may be missing. The result is that of a single run.
+    """
+    from mitsplat.merge import merge_shards
+
+    with progress_of(json_log, "merge") as progress:
+        summary = merge_shards(shards, out, overwrite=overwrite, progress=progress)
+    _tell_dataset(summary)
+
+
+def _tell_dataset(summary: DatasetSummary) -> None:
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
     typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")

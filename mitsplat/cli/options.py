@@ -1,18 +1,62 @@
-"""What commands share: the seed, and the bar that shows how far they are."""
+"""What commands share: the seed, the bar or log that shows how far they are, and how errors read."""
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Annotated
+from contextlib import AbstractContextManager, contextmanager
+from typing import Annotated, Any
 
 import typer
 
+from mitsplat.errors import exit_status
+
+Progress = Callable[[int, int, str], None]
+
 Seed = Annotated[int, typer.Option(help="Decides everything that is random.")]
+
+JsonLog = Annotated[
+    bool,
+    typer.Option("--json", help="Log to stderr for machines: an event a line, as a JSON object, instead of a bar."),
+]
+
+
+def sentence_of(error: BaseException) -> str:
+    """What to tell of an error."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def progress_of(json_log: bool, command: str) -> AbstractContextManager[Progress]:
+    """The bar, or the log for machines."""
+    return _json_log(command) if json_log else progress_bar()
 
 
 @contextmanager
-def progress_bar(unit: str = "images/s") -> Iterator[Callable[[int, int, str], None]]:
+def _json_log(command: str) -> Iterator[Progress]:
+    """Events on stderr: started, progress, then finished, or failed with exit status and sentence."""
+
+    def tell(event: str, **details: Any) -> None:
+        line = json.dumps({"time": round(time.time(), 3), "command": command, "event": event, **details})
+        typer.echo(line, err=True)
+
+    tell("started")
+    try:
+        yield lambda done, total, doing: tell("progress", done=done, total=total, doing=doing)
+    except BaseException as error:
+        status = exit_status(error)
+        sentence = "interrupted: run again to go on" if status == 130 else sentence_of(error)
+        tell("failed", status=1 if status is None else status, error=type(error).__name__, message=sentence)
+        if status is None or status == 130:
+            raise
+        raise typer.Exit(status) from error
+    tell("finished", status=0)
+
+
+@contextmanager
+def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
     """A bar on stderr with speed and the time left."""
     from rich.console import Console
     from rich.progress import (

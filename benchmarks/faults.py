@@ -1,0 +1,129 @@
+"""Kill real renderings at random moments, resume them, and compare every byte with an undisturbed run.
+
+    python -m benchmarks.faults [--kills 50] [--seed 0] [--scene scenes/workcell.yaml]
+
+Each run has 1 or 2 worker processes, at random. Of three kills (SIGKILL), two hit the whole run and one a worker, whose
+frame the run must make again. A moment is drawn anew each time: mostly while frames are written, sometimes before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FREE = ("timings.jsonl", "runs.jsonl", ".lock")
+"""What may differ: times, commands, and who held the lock."""
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file, partial ones included."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in FREE)
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def start(scene: Path, out: Path, frames: int, workers: int) -> subprocess.Popen[bytes]:
+    command = [
+        sys.executable,
+        "-c",
+        "from mitsplat.cli import main; main()",
+        "render",
+        str(scene),
+        "-o",
+        str(out),
+        "-n",
+        str(frames),
+    ]
+    command += ["--size", "96x54", "--workers", str(workers), "--format", "yolo,coco,exr", "--json"]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def workers_of(process: int) -> list[int]:
+    """Worker processes of a run: its children that have multiprocessing's mark."""
+    found = []
+    for text in Path(f"/proc/{process}/task/{process}/children").read_text().split():
+        try:
+            command = Path("/proc", text, "cmdline").read_bytes()
+        except OSError:
+            continue
+        if b"spawn_main" in command:
+            found.append(int(text))
+    return found
+
+
+def lines(out: Path) -> int:
+    path = out / "manifest.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def await_moment(process: subprocess.Popen[bytes], out: Path, rng: random.Random) -> bool:
+    """Wait for the moment to kill; false if the run was finished before."""
+    if rng.random() < 0.2:
+        end = time.monotonic() + rng.uniform(0, 6)
+    else:
+        before, wanted = lines(out), rng.randint(1, 3)
+        while process.poll() is None and lines(out) < before + wanted:
+            time.sleep(0.005)
+        end = time.monotonic() + rng.uniform(0, 0.5)
+    while process.poll() is None and time.monotonic() < end:
+        time.sleep(0.001)
+    return process.poll() is None
+
+
+def main() -> None:
+    """Kill, resume, compare, and print the counts."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--scene", type=Path, default=ROOT / "scenes/workcell.yaml")
+    options = parser.parse_args()
+    rng = random.Random(options.seed)
+    counts: Counter[str] = Counter()
+    differing: set[str] = set()
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        whole, out = Path(folder) / "undisturbed", Path(folder) / "out"
+        if start(options.scene, whole, options.frames, 1).wait():
+            sys.exit("the undisturbed run failed")
+        expected = hashes(whole)
+        while counts["kills"] < options.kills or out.exists():
+            process = start(options.scene, out, options.frames, rng.choice((1, 2)))
+            counts["runs"] += 1
+            while counts["kills"] < options.kills and await_moment(process, out, rng):
+                workers = workers_of(process.pid) if rng.random() < 1 / 3 else []
+                os.kill(rng.choice(workers) if workers else process.pid, signal.SIGKILL)
+                counts["kills"] += 1
+                counts["kills of a worker" if workers else "kills of the run"] += 1
+                if not workers:
+                    break
+            status = process.wait()
+            if status == -signal.SIGKILL:
+                counts["partial files left"] += len(list(out.rglob(".*.part")))
+                manifest = out / "manifest.jsonl"
+                counts["torn lines left"] += manifest.exists() and not manifest.read_bytes().endswith((b"\n", b""))
+                continue
+            counts[f"runs that ended with status {status}"] += 1
+            if status == 0:
+                counts["datasets finished"] += 1
+                found = hashes(out)
+                differing |= {file for file in {*found, *expected} if found.get(file) != expected.get(file)}
+                shutil.rmtree(out)
+    for name, count in sorted(counts.items()):
+        print(f"{name}: {count}")
+    print(f"files of a dataset: {len(expected)}; differing after resumption: {len(differing)} {sorted(differing)[:5]}")
+    print(f"minutes: {(time.monotonic() - begun) / 60:.1f}; load: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+if __name__ == "__main__":
+    main()

@@ -37,6 +37,8 @@ def merge_shards(
             frame; nothing is written then, but for files whose content turns out not to be what was written.
     """
     folders, out = [Path(shard) for shard in shards], Path(out)
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError(f"each shard must be given once (got {', '.join(map(str, folders))})")
     if out.resolve() in [folder.resolve() for folder in folders]:
         raise InputError(f"{out}: must not be one of the shards")
     content = _common_content(folders)

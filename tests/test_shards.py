@@ -1,0 +1,263 @@
+"""Datasets made in parts, on Ray or by other numbers of workers are the same bytes as one run's."""
+
+import json
+import os
+import shutil
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import pytest
+from test_cli import run
+from test_dataset import contents, render, settle, write
+from test_faults import KilledOnce
+
+from mitsplat.audit import audit_dataset
+from mitsplat.cluster import Cluster
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.folder import Shard
+from mitsplat.manifest import Manifest, encode_line
+from mitsplat.merge import merge_shards
+from mitsplat.scene import load_scene
+from mitsplat.spec import FORMATS
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    from dataclasses import replace
+
+    from conftest import box_asset
+    from ruamel.yaml import YAML
+
+    folder = tmp_path_factory.mktemp("scene")
+    for name in ("nut", "bolt"):
+        replace(box_asset(name), keypoints={"top": (0, 0, 0.005)}).save(folder / name)
+    data = {
+        "name": "small",
+        "objects": [{"asset": "nut"}, {"asset": "bolt"}],
+        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+        "output": {"width": 64, "height": 48, "layouts": 3, "views": 4, "formats": list(FORMATS)},
+    }
+    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
+    return load_scene(folder / "scene.yaml")
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    write(scene, folder)
+    return contents(folder)
+
+
+def write_shards(scene, folder, count, **options):
+    shards = [folder / f"{number}" for number in range(1, count + 1)]
+    for number, shard in enumerate(shards, start=1):
+        write(scene, shard, shard=Shard(number, count), **options)
+    return shards
+
+
+class TestSameBytes:
+    @pytest.mark.parametrize("workers", [2, 7])
+    def test_of_several_workers(self, scene, tmp_path, whole, workers):
+        write(scene, tmp_path / "out", workers=workers)
+        assert contents(tmp_path / "out") == whole
+
+    @pytest.mark.parametrize("count", [1, 2, 3, 5])
+    def test_of_merged_shards_in_any_order(self, scene, tmp_path, whole, count):
+        shards = write_shards(scene, tmp_path / "shards", count)
+        assert merge_shards(shards[::-1], tmp_path / "out").frames == 12
+        assert contents(tmp_path / "out") == whole
+        assert len((tmp_path / "out/timings.jsonl").read_text().splitlines()) == 12
+        assert audit_dataset(tmp_path / "out").violations == ()
+
+    def test_of_a_merge_that_was_stopped(self, scene, tmp_path, whole):
+        shards = write_shards(scene, tmp_path / "shards", 3)
+
+        def stop(done, total, text):
+            if done == 5:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            merge_shards(shards, tmp_path / "out", progress=stop)
+        assert len(Manifest(tmp_path / "out/manifest.jsonl")) == 5
+        merge_shards(shards, tmp_path / "out")
+        assert contents(tmp_path / "out") == whole
+
+    def test_a_shard_can_be_resumed(self, scene, tmp_path, whole):
+        shards = write_shards(scene, tmp_path / "shards", 2)
+        next(shards[1].rglob("000011.txt")).unlink()
+        assert write(scene, shards[1], shard=Shard(2, 2)).rendered == 1
+        merge_shards(shards, tmp_path / "out")
+        assert contents(tmp_path / "out") == whole
+
+
+@pytest.mark.parametrize(("total", "views", "count"), [(12, 4, 3), (12, 4, 5), (10, 4, 3), (1, 4, 1), (1000, 1, 7)])
+def test_shards_divide_the_frames(total, views, count):
+    parts = [list(Shard(number, count).frames(total, views)) for number in range(1, count + 1)]
+    assert list(chain(*parts)) == list(range(total))
+    assert all(parts)
+    if -(-total // views) >= count:  # whole layouts
+        assert all(part[0] % views == 0 for part in parts)
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "1", "a/b", "1/0", "-1/2", ""])
+def test_a_shard_that_is_none(text):
+    with pytest.raises(InputError, match=r"a shard must be I/N"):
+        Shard.parse(text)
+
+
+class TestRefusals:
+    @pytest.fixture
+    def shards(self, scene, tmp_path):
+        return write_shards(scene, tmp_path / "shards", 3)
+
+    def refuse(self, shards, out, message):
+        with pytest.raises(InputError, match=message):
+            merge_shards(shards, out)
+
+    def test_a_missing_shard(self, shards, tmp_path):
+        self.refuse(shards[:2], tmp_path / "out", r"each of the 3 shards must be given once \(missing: \[3\]\)")
+        self.refuse([*shards, shards[0]], tmp_path / "out", "each shard must be given once")
+        assert not (tmp_path / "out").exists()
+
+    def test_an_unfinished_shard(self, shards, tmp_path):
+        manifest = shards[1] / "manifest.jsonl"
+        manifest.write_bytes(b"".join(manifest.read_bytes().splitlines(keepends=True)[:-1]))
+        self.refuse(
+            shards, tmp_path / "out", r"1 of 12 frames are in no shard, the first is 7: finish the shards first"
+        )
+
+    def test_a_damaged_file(self, shards, tmp_path):
+        picture = next((shards[1] / "images").rglob("000005.png"))
+        data = bytearray(picture.read_bytes())
+        data[-20] ^= 1
+        picture.write_bytes(data)
+        self.refuse(shards, tmp_path / "out", rf"{picture}: must have the SHA-256 [0-9a-f]+, as its manifest states")
+        assert not (tmp_path / "out" / picture.relative_to(shards[1])).exists()
+
+    def test_a_damaged_manifest(self, shards, tmp_path):
+        manifest = shards[2] / "manifest.jsonl"
+        data = bytearray(manifest.read_bytes())
+        data[100] ^= 1
+        manifest.write_bytes(data)
+        self.refuse(shards, tmp_path / "out", r"manifest\.jsonl, line 1: must be the record of a frame \(its checksum")
+
+    def test_another_scene(self, scene, shards, tmp_path):
+        other = load_scene(scene.path, overrides={"seed": 8})
+        write(other, shards[1], shard=Shard(2, 3), overwrite=True)
+        self.refuse(shards, tmp_path / "out", r"are not of one dataset: scene\.seed is 0 in the first, 8 in the second")
+
+    def test_another_division(self, scene, shards, tmp_path):
+        write(scene, tmp_path / "whole")
+        self.refuse([*shards, tmp_path / "whole"], tmp_path / "out", "must be of one division of one dataset")
+        with pytest.raises(InputError, match="cannot be resumed: it was shard 1/3 and is shard 2/3"):
+            write(scene, shards[0], shard=Shard(2, 3))
+        with pytest.raises(InputError, match="cannot be resumed: it was shard 1/3 and is a whole dataset"):
+            write(scene, shards[0])
+
+    def test_another_layout(self, shards, tmp_path):
+        shutil.copy(shards[0] / "layouts/0000.json", shards[1] / "layouts/0000.json")
+        with (shards[1] / "layouts/0000.json").open("a") as file:
+            file.write(" ")
+        self.refuse(shards, tmp_path / "out", "must be the same: one layout was settled in two ways")
+
+    def test_files_outside(self, shards, tmp_path):
+        """A manifest that names files elsewhere, with a checksum that fits."""
+        manifest = shards[0] / "manifest.jsonl"
+        records = list(Manifest(manifest))
+        (tmp_path / "secret").write_text("")
+        for name in ("../../secret", "../1/images/train/000000.png", "/etc/passwd"):
+            records[0]["files"] = {name: "0" * 64}
+            manifest.write_bytes(b"".join(map(encode_line, records)))
+            self.refuse(shards, tmp_path / "out", r"frame 0: (must be a file inside|files must not be named by \.\.)")
+
+    def test_itself(self, shards):
+        self.refuse(shards, shards[0], "must not be one of the shards")
+
+    def test_a_shard_that_is_being_written(self, scene, shards, tmp_path):
+        def merge(*args, **options):
+            self.refuse(shards, tmp_path / "out", f"is being written by another run \\(process {os.getpid()}")
+            return render(*args, **options)
+
+        next(shards[1].rglob("000006.txt")).unlink()
+        write(scene, shards[1], shard=Shard(2, 3), render=merge)
+
+
+def test_the_command(scene, tmp_path, whole, capsys):
+    shards = write_shards(scene, tmp_path / "shards", 2)
+    assert run("merge", *shards, "-o", tmp_path / "out", "--json") == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"dataset: {tmp_path / 'out'} (")
+    events = [json.loads(line) for line in err.splitlines()]
+    assert [event["event"] for event in events] == ["started", *["progress"] * 12, "finished"]
+    assert contents(tmp_path / "out") == whole
+    assert run("merge", shards[0], "-o", tmp_path / "other", "--json") == 2
+    event = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert (event["event"], event["status"], event["error"]) == ("failed", 2, "InputError")
+    assert event["message"].startswith("each of the 2 shards must be given once")
+
+
+class TestRay:
+    @pytest.fixture(scope="class", autouse=True)
+    def ray(self):
+        """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
+        ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
+        os.environ["PYTHONPATH"] = str(Path(__file__).parent)
+        ray.init(num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
+        yield ray
+        ray.shutdown()
+        del os.environ["PYTHONPATH"]
+
+    def test_same_bytes(self, scene, tmp_path, whole):
+        told = []
+        write(scene, tmp_path / "out", cluster=Cluster(), workers=None, progress=lambda *event: told.append(event))
+        assert contents(tmp_path / "out") == whole
+        assert told[-1] == (12, 12, "frame 11") or told[-1][:2] == (12, 12)
+
+    def test_resumed_on_ray_and_back(self, scene, tmp_path, whole):
+        write(scene, tmp_path / "out", frames=3)
+        write(scene, tmp_path / "out", frames=7, cluster=Cluster(), settle=partial(only_later, 1))
+        write(scene, tmp_path / "out", workers=2)
+        assert contents(tmp_path / "out") == whole
+
+    def test_frames_of_a_lost_worker_are_made_again(self, scene, tmp_path, whole):
+        told = []
+        killer = KilledOnce(tmp_path, 6)
+        write(scene, tmp_path / "out", cluster=Cluster(), render=killer, progress=lambda *event: told.append(event[2]))
+        assert any(text.startswith("the process making frame 6 was lost") for text in told)
+        assert contents(tmp_path / "out") == whole
+
+    def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
+        with pytest.raises(InputError, match=r"^no frame 5$"):
+            write(scene, tmp_path / "out", cluster=Cluster(), render=refuse_5)
+
+    def test_workers_take_resources(self, scene, tmp_path):
+        summary = write(scene, tmp_path / "out", frames=2, cluster=Cluster(resources={"camera": 1, "CPU": 1}))
+        assert summary.rendered == 2
+        with pytest.raises(MissingResourceError, match=r"no node of the Ray cluster has CPU=1, camera=2 for a worker"):
+            write(scene, tmp_path / "other", cluster=Cluster(resources={"CPU": 1, "camera": 2}))
+
+
+def only_later(first, scene, index, *, progress):
+    """Settles, but no layout that was settled before."""
+    assert index >= first
+    return settle(scene, index, progress=progress)
+
+
+def refuse_5(scene, index, *, layout):
+    if index == 5:
+        raise InputError("no frame 5")
+    return render(scene, index, layout=layout)
+
+
+@pytest.mark.parametrize("text", ["CPU", "CPU=0", "=3", "CPU=x", "CPU=nan", "CPU=2,,"])
+def test_resources_that_are_none(text):
+    with pytest.raises(InputError, match=r"resources must be NAME=AMOUNT"):
+        Cluster.parse_resources(text)
+
+
+def test_without_ray(scene, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(MissingResourceError, match=r"needs Ray: pip install 'mitsplat\[cluster\]'"):
+        write(scene, tmp_path / "out", cluster=Cluster())

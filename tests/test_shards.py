@@ -198,39 +198,33 @@ def test_the_command(scene, tmp_path, whole, capsys):
     assert event["message"].startswith("each of the 2 shards must be given once")
 
 
+@pytest.fixture(scope="module")
+def ray():
+    """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)
+    ray.init(num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
+    yield ray
+    ray.shutdown()
+    del os.environ["PYTHONPATH"]
+
+
+@pytest.mark.usefixtures("ray")
 class TestRay:
-    @pytest.fixture(scope="class", autouse=True)
-    def ray(self):
-        """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
-        ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
-        os.environ["PYTHONPATH"] = str(Path(__file__).parent)
-        ray.init(num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
-        yield ray
-        ray.shutdown()
-        del os.environ["PYTHONPATH"]
-
     def test_same_bytes(self, scene, tmp_path, whole):
+        """Begun here, gone on with on Ray, where a worker is killed: no layout is settled twice, no frame is lost."""
         told = []
-        write(scene, tmp_path / "out", cluster=Cluster(), workers=None, progress=lambda *event: told.append(event))
-        assert contents(tmp_path / "out") == whole
-        assert told[-1] == (12, 12, "frame 11") or told[-1][:2] == (12, 12)
-
-    def test_resumed_on_ray_and_back(self, scene, tmp_path, whole):
         write(scene, tmp_path / "out", frames=3)
-        write(scene, tmp_path / "out", frames=7, cluster=Cluster(), settle=partial(only_later, 1))
-        write(scene, tmp_path / "out", workers=2)
-        assert contents(tmp_path / "out") == whole
-
-    def test_frames_of_a_lost_worker_are_made_again(self, scene, tmp_path, whole):
-        told = []
-        killer = KilledOnce(tmp_path, 6)
-        write(scene, tmp_path / "out", cluster=Cluster(), render=killer, progress=lambda *event: told.append(event[2]))
-        assert any(text.startswith("the process making frame 6 was lost") for text in told)
+        options = {"render": KilledOnce(tmp_path, 6), "settle": partial(only_later, 1), "workers": None}
+        progress = lambda *event: told.append(event)  # noqa: E731
+        assert write(scene, tmp_path / "out", cluster=Cluster(), progress=progress, **options).rendered == 9
+        assert any(text.startswith("the process making frame 6 was lost") for *_, text in told)
+        assert told[-1][:2] == (12, 12)
         assert contents(tmp_path / "out") == whole
 
     def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
         with pytest.raises(InputError, match=r"^no frame 5$"):
-            write(scene, tmp_path / "out", cluster=Cluster(), render=refuse_5)
+            write(scene, tmp_path / "out", cluster=Cluster(), workers=1, render=refuse_5)
 
     def test_workers_take_resources(self, scene, tmp_path):
         summary = write(scene, tmp_path / "out", frames=2, cluster=Cluster(resources={"camera": 1, "CPU": 1}))

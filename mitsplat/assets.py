@@ -50,9 +50,10 @@ _SPZ_UNITS = 1e-3
 
 _MESH_ERRORS = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, RuntimeError),
-    *(MemoryError, EOFError, ImportError, struct.error),
+    *(MemoryError, EOFError, ImportError, NameError, struct.error),
 )
-"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish."""
+"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish,
+NameError where a branch that rubbish does not take sets a variable."""
 
 _OPAQUE = 0.5
 _OFF_BY = 0.05

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.camera import Camera, Lens
 from mitsplat.errors import InputError
-from mitsplat.files import file_inside, write_file, write_text
+from mitsplat.files import IMAGE_ERRORS, file_inside, write_file, write_text
 from mitsplat.yaml_input import load_yaml
 
 FloatArray = npt.NDArray[np.float64]
@@ -117,7 +117,7 @@ class Photo:
                 pixels = image.convert(mode)
         except FileNotFoundError:
             raise InputError(f"{path}: no such file") from None
-        except (OSError, SyntaxError) as error:
+        except IMAGE_ERRORS as error:
             raise InputError(f"{path}: not a readable image ({error})") from error
         size = (self.camera.width, self.camera.height)
         if pixels.size != size:

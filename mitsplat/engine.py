@@ -160,6 +160,16 @@ def run_frames(
         yield from found
 
 
+def run_apart(make: MakeFrame[Result]) -> Generator[Result]:
+    """The result of ``make`` for frame 0, in a process of its own.
+
+    Raises:
+        InputError, FrameError, LostWorkersError: As :func:`run_frames`.
+    """
+    with closing(_Processes(make)) as pool:
+        yield from run_pool(pool, {0: [0]}, 1, lambda text: None)
+
+
 def affordable_workers() -> int:
     """Most worker processes that this machine has cores and unused memory for, at least 1."""
     from mitsplat.doctor import NEEDED_MEMORY, unused_memory

@@ -6,10 +6,13 @@ import errno
 import hashlib
 import os
 import shutil
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 from mitsplat.errors import InputError, MissingResourceError
 
@@ -17,6 +20,9 @@ Record = dict[str, Any]
 """The line of one frame in ``manifest.jsonl``."""
 
 SPLITS = ("train", "val")
+
+IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError)
+"""What Pillow raises on damaged images, and on those of more pixels than a file should hold."""
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -42,19 +48,27 @@ def write_text(path: Path, text: str) -> str:
     return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))
 
 
+def is_inside(folder: Path, name: str) -> bool:
+    """Whether a path, relative to ``folder`` or absolute, is in it also after links and ``..`` are followed."""
+    try:
+        return (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # too long, a zero byte, a loop of links
+        return False
+
+
 def file_inside(folder: Path, name: str) -> Path:
     """The file of this name, which must be in ``folder`` also after links and ``..`` are followed.
 
     Raises:
         InputError: With the rule alone, if it is outside or missing: the caller knows where the name is from.
     """
+    if not is_inside(folder, name):
+        raise InputError(f"must be a file inside {folder} (got {name})")
     path = folder / name
     try:
-        inside, found = path.resolve().is_relative_to(folder.resolve()), path.is_file()
-    except (OSError, ValueError) as error:  # a name too long, a loop of links, a zero byte
-        raise InputError(f"must be the name of a file ({error})") from error
-    if not inside:
-        raise InputError(f"must be a file inside {folder} (got {name})")
+        found = path.is_file()
+    except OSError:  # a name that no file can have
+        found = False
     if not found:
         raise InputError(f"no such file (got {name})")
     return path

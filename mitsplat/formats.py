@@ -20,9 +20,13 @@ others are decoded by gaussforge, which trusts its input: it runs in a process o
 from __future__ import annotations
 
 import gzip
+import io
 import re
+import struct
 import subprocess
 import sys
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +47,9 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 _MAX_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
+_MAX_SWELL = 100
+"""Real files grow by a factor of 1.1 to 3 when they are unpacked."""
+_MAX_ENTRIES = 64
 _LOGIT_LIMIT = 110.0
 """sigmoid(+-110) is exactly 1 and 0 in float32, so that both survive a file without infinities."""
 
@@ -81,6 +88,8 @@ def read_splats(path: Path) -> Splats:
             f"{path}: splats must be .ply, .compressed.ply, .splat, .ksplat, .spz or .sog (got suffix {suffix!r})"
         )
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: must be a file")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
@@ -274,11 +283,56 @@ def _convert(data: bytes, source: str, target: str) -> bytes:
 
     Its decoders do not check every count against the size of the input, so a damaged file can crash the process.
     """
+    if source == "spz":
+        _check_gzip(data)
+    elif source == "sog":
+        _check_zip(data)
     memory = (4 << 30) + 64 * len(data)
+    seconds = 60 + len(data) / 1e6
     command = [sys.executable, "-P", "-c", _CONVERTER, source, target, str(memory)]
-    result = subprocess.run(command, input=data, capture_output=True, check=False)
+    try:
+        result = subprocess.run(command, input=data, capture_output=True, check=False, timeout=seconds)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"not a valid {source} file (its decoder did not end within {seconds:.0f} s)") from None
     if result.returncode == 0:
         return result.stdout
     lines = result.stderr.decode("utf-8", "replace").strip().splitlines()
     reason = lines[-1] if lines and result.returncode > 0 else f"its decoder stopped with status {result.returncode}"
     raise InputError(f"not a valid {source} file ({reason})")
+
+
+def _check_gzip(data: bytes) -> None:
+    """Refuse what swells beyond what splats can; nothing of it is kept."""
+    limit, size, rest = _swollen(len(data)), 0, data
+    decoder = zlib.decompressobj(wbits=31)
+    try:
+        while rest and not decoder.eof:
+            size += len(decoder.decompress(rest, 1 << 20))
+            rest = decoder.unconsumed_tail
+            if size > limit:
+                raise InputError(f"{len(data)} bytes must not hold more than {limit} (got more)")
+    except zlib.error as error:
+        raise InputError(f"not a valid spz file ({error})") from None
+
+
+def _check_zip(data: bytes) -> None:
+    """Refuse an archive whose entries lie outside of it or swell beyond what splats can."""
+    limit = _swollen(len(data))
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, struct.error) as error:
+        raise InputError(f"not a valid sog file ({error})") from None
+    for entry in entries:
+        if entry.filename.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", entry.filename):
+            raise InputError(f"an archive must not hold files outside of it (got {entry.filename!r})")
+    size = sum(entry.file_size for entry in entries)
+    if size > limit or len(entries) > _MAX_ENTRIES:
+        raise InputError(
+            f"{len(data)} bytes must not hold more than {limit} in {_MAX_ENTRIES} files (got {size} in {len(entries)})"
+        )
+
+
+def _swollen(size: int) -> int:
+    """Most bytes that compressed splats of ``size`` bytes may become."""
+    return _MAX_SWELL * size + (16 << 20)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, FloatArray, Photo, mask_name
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.files import write_file
+from mitsplat.files import IMAGE_ERRORS, write_file
 from mitsplat.masks import BoolArray
 from mitsplat.photos import Prepared, Progress
 
@@ -99,7 +99,7 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
             with Image.open(path) as image:
                 upright = ImageOps.exif_transpose(image)
                 mask = upright.getchannel("A") if "A" in upright.getbands() else upright.convert("L")
-        except (OSError, SyntaxError) as error:
+        except IMAGE_ERRORS as error:
             raise InputError(f"{path}: not a readable image ({error})") from error
         size = (photo.camera.width, photo.camera.height)
         if _differ(mask.size, size) and not _differ(mask.size[::-1], size):

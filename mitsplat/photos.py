@@ -17,7 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture import Photo, stored_name
 from mitsplat.errors import InputError
-from mitsplat.files import write_file
+from mitsplat.files import IMAGE_ERRORS, write_file
 
 Progress = Callable[[int, int, str], None]
 """Told how much of how much is done, and what is being done."""
@@ -130,7 +130,7 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
             orientation = int(exif.get(ExifTags.Base.Orientation, 1)) if upright else 1
             turned = ImageOps.exif_transpose(image) if upright else image
             lossy, kept = image.format in _LOSSY, image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
-    except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:
+    except IMAGE_ERRORS as error:
         return f"it cannot be read ({error})"
     kept &= max(turned.size) <= max_size and orientation == 1
     suffix = path.suffix if kept else ".jpg" if lossy else ".png"

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.assets import Asset, read_mesh
 from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
+from mitsplat.files import is_inside
 from mitsplat.spec import (
     PILE_HEIGHT,
     AreaLight,
@@ -150,18 +151,21 @@ class FramePlan:
     seed: int
 
 
-def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
     """Read a scene file and every asset and mesh that it names.
 
     Args:
         path: The YAML file.
         overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+        allow_outside: Whether it may name assets, meshes and images outside of its folder.
 
     Raises:
         InputError: If the file or something that it names is missing or breaks a rule.
     """
     path = Path(path)
     spec = load_yaml(path, SceneSpec, overrides=overrides)
+    if not allow_outside:
+        _confine(spec, path)
     folder = path.parent
     for position, light in enumerate(spec.lights):
         if isinstance(light, EnvironmentLight) and light.image is not None and not (folder / light.image).is_file():
@@ -191,6 +195,18 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
         shape_meshes=tuple(shape_meshes),
         class_names=tuple(sorted({asset.class_name for asset in assets})),
     )
+
+
+def _confine(spec: SceneSpec, path: Path) -> None:
+    """Refuse what is named outside of the scene's folder."""
+    named: list[tuple[tuple[str | int, ...], str | None]] = [(("environment",), spec.environment)]
+    named += [(("objects", position, "asset"), entry.asset) for position, entry in enumerate(spec.objects)]
+    named += [(("shapes", position, "mesh"), shape.mesh) for position, shape in enumerate(spec.shapes)]
+    named += [(("lights", i, "image"), getattr(light, "image", None)) for i, light in enumerate(spec.lights)]
+    for keys, name in named:
+        if name is not None and not is_inside(path.parent, name):
+            with _blaming(path, *keys):
+                raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
 
 
 def layout_of(scene: Scene, index: int) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,14 @@ from mitsplat.assets import Asset
 from mitsplat.cad import emitter_dict
 from mitsplat.colour import decode_srgb
 from mitsplat.composite import develop
+from mitsplat.engine import LostWorkersError, Note, run_apart
 from mitsplat.errors import InputError
 from mitsplat.frame import light_properties
 from mitsplat.render import describe_sensor, ensure_variant
 from mitsplat.scene import Scene, layout_of, plan_frame
 from mitsplat.settle import settle_layout
 from mitsplat.spec import Shape
+from mitsplat.xml_check import check_xml
 
 
 def export_xml(scene: Scene, index: int, path: str | Path) -> None:
@@ -64,12 +68,13 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     mi.parser.write_file(state, str(path))
 
 
-def render_xml(path: str | Path, out: str | Path) -> Path:
+def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:
     """Render a Mitsuba scene with the integrator, sensor and size that it states.
 
     Args:
         path: The ``.xml`` file.
         out: Picture to write (``.png``, ``.jpg`` or ``.exr``), or a folder, which gets ``picture.png``.
+        allow_outside: Whether it may name files outside of its folder, see :mod:`mitsplat.xml_check`.
 
     Returns:
         Path of the picture.
@@ -79,8 +84,7 @@ def render_xml(path: str | Path, out: str | Path) -> Path:
     """
     ensure_variant()
     path, out = Path(path), Path(out)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    check_xml(path, allow_outside=allow_outside)
     picture = out if out.suffix.lower() in (".png", ".jpg", ".exr") else out / "picture.png"
     picture.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -95,6 +99,30 @@ def render_xml(path: str | Path, out: str | Path) -> Path:
         return picture
     mi.Bitmap(develop(image[..., :3], {})).write(str(picture))
     return picture
+
+
+def render_apart(path: Path, out: Path, *, allow_outside: bool = False) -> Path:
+    """As :func:`render_xml`, in a process of its own: a damaged mesh or image can end the one that Mitsuba runs in.
+
+    Raises:
+        InputError: Also if that process is ended.
+    """
+    job = _RenderOne(path, out, allow_outside)
+    with closing(run_apart(job)) as results:
+        try:
+            return next(results)
+        except LostWorkersError as error:
+            raise InputError(f"{path}: something that it names ends Mitsuba's process ({error})") from error
+
+
+@dataclass(frozen=True)
+class _RenderOne:
+    path: Path
+    out: Path
+    allow_outside: bool
+
+    def __call__(self, index: int, note: Note, /) -> Path:
+        return render_xml(self.path, self.out, allow_outside=self.allow_outside)
 
 
 def _last_sentence(error: RuntimeError) -> str:

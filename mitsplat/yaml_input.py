@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,6 +23,9 @@ KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
 """What nests deeper is hostile, or an alias that contains itself."""
+MAX_BYTES = 64 << 20
+MAX_VALUES = 2_000_000
+"""What has more values than this is hostile: aliases of aliases multiply."""
 
 RULES = {
     "missing": "is required",
@@ -83,7 +87,7 @@ def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, A
     path = Path(path)
     tree = _parse(path)
     overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
-    data = _plain(tree, (), tree, path)
+    data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
         _set(data, keys, value)
     try:
@@ -104,6 +108,10 @@ def key_place(path: str | Path, keys: KeyPath) -> str:
 def _parse(path: Path) -> CommentedMap:
     """The file's mapping, still with line numbers."""
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: must be a file")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise InputError(f"{path}: must have at most {MAX_BYTES >> 20} MiB (got {size} bytes)")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
@@ -129,10 +137,12 @@ def _parse(path: Path) -> CommentedMap:
     return tree
 
 
-def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path) -> Any:
+def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Iterator[int]) -> Any:
     """The node as built-in dicts, lists and scalars; refuses what JSON cannot hold."""
     if len(keys) > MAX_DEPTH:
         raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels")
+    if next(values) > MAX_VALUES:
+        raise InputError(f"{path}: must not hold more than {MAX_VALUES} values")
     tag = getattr(node, "tag", None)
     if isinstance(node, TaggedScalar) or (tag is not None and tag.value is not None):
         raise InputError(_sentence(path, _line(tree, keys), keys, f"must not have a YAML tag (got {tag})"))
@@ -140,9 +150,9 @@ def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path) -> Any:
         for key in node:
             if not isinstance(key, str):
                 raise InputError(_sentence(path, _line(tree, keys), keys, f"keys must be text (got {_shown(key)})"))
-        return {str(key): _plain(value, (*keys, key), tree, path) for key, value in node.items()}
+        return {str(key): _plain(value, (*keys, key), tree, path, values) for key, value in node.items()}
     if isinstance(node, list):
-        return [_plain(value, (*keys, position), tree, path) for position, value in enumerate(node)]
+        return [_plain(value, (*keys, position), tree, path, values) for position, value in enumerate(node)]
     if node is None or isinstance(node, bool):
         return node
     for scalar in (int, float, str):

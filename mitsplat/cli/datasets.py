@@ -22,7 +22,8 @@ DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset 
 FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, from 0.")]
 FrameSize = Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")]
 SceneSeed = Annotated[int | None, typer.Option(help="Decides everything that is random.")]
-Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset.")]
+AllowOutside = Annotated[bool, typer.Option("--allow-outside", help="Let SCENE name files outside of its folder.")]
+Preset = Annotated[Literal["fast", "balanced", "exact"] | None, typer.Option(help="Rendering preset.")]
 
 
 def render(
@@ -63,6 +64,7 @@ def render(
         bool,
         typer.Option("--overwrite/--resume", help="Replace the dataset in the folder, or keep what is finished of it."),
     ] = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write the labelled dataset that SCENE describes.
 
@@ -74,9 +76,9 @@ def render(
     if scene.suffix == ".xml":
         if overrides or frames is not None or tolerance is not None or shard is not None:
             raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
-        from mitsplat.xml_scene import render_xml
+        from mitsplat.xml_scene import render_apart
 
-        typer.echo(f"picture: {render_xml(scene, out)}")
+        typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside)}")
         return
     from mitsplat.cluster import Cluster
     from mitsplat.dataset import write_dataset
@@ -85,7 +87,7 @@ def render(
 
     part = None if shard is None else Shard.parse(shard)
     cluster = Cluster(address, Cluster.parse_resources(resources)) if engine == "ray" else None
-    loaded = load_scene(scene, overrides=overrides)
+    loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
     if tolerance is not None:
         if quality is not None:
             raise InputError("--quality and --tolerance both choose the preset: give one of them")
@@ -94,7 +96,7 @@ def render(
         with progress_bar() as progress:
             best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
         typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
-        loaded = load_scene(scene, overrides=overrides | {"quality": best.name})
+        loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
     with progress_of(json_log, "render") as progress:
         summary = write_dataset(
             loaded,
@@ -216,6 +218,7 @@ def preview(
     layers: Annotated[
         bool, typer.Option("--layers/--no-layers", help="Show ids, depth, light and highlight beside the picture.")
     ] = True,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Render one frame of SCENE to a picture, with its layers side by side."""
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
@@ -228,7 +231,7 @@ def preview(
     from mitsplat.scene import load_scene
     from mitsplat.sheet import layer_sheet
 
-    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality))
+    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
     rendered = render_frame(loaded, frame)
     Image.fromarray(layer_sheet(rendered) if layers else rendered.image).save(out)
     typer.echo(f"picture: {out}")
@@ -242,6 +245,7 @@ def settle(
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the GIF [px].")] = "480x270",
     seed: SceneSeed = None,
     workers: Annotated[int, typer.Option(help="Processes that settle layouts.")] = 1,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Settle the layouts of SCENE and print their rest certificates.
 
@@ -257,7 +261,7 @@ def settle(
     from mitsplat.scene import load_scene
     from mitsplat.settle import settle_layouts
 
-    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed))
+    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed), allow_outside=allow_outside)
     wanted = loaded.spec.output.layouts if layouts is None else layouts
     if not 1 <= wanted <= loaded.spec.output.layouts:
         raise InputError(
@@ -276,6 +280,7 @@ def export(
     scene: SceneFile,
     frame: FrameIndex = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Mitsuba scene to write (.xml).")] = Path("scene.xml"),
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write one frame of SCENE as a Mitsuba scene.
 
@@ -284,7 +289,7 @@ def export(
     from mitsplat.scene import load_scene
     from mitsplat.xml_scene import export_xml
 
-    export_xml(load_scene(scene), frame, out)
+    export_xml(load_scene(scene, allow_outside=allow_outside), frame, out)
     typer.echo(f"scene: {out}")
 
 

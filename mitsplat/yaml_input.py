@@ -23,8 +23,8 @@ KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
 """What nests deeper is hostile, or an alias that contains itself."""
-MAX_BYTES = 64 << 20
-MAX_VALUES = 2_000_000
+MAX_BYTES = 8 << 20
+MAX_VALUES = 200_000
 """What has more values than this is hostile: aliases of aliases multiply."""
 
 RULES = {

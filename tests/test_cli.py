@@ -141,7 +141,7 @@ def test_progress_bar_tells_images_and_rate(
 def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "one.png"
     calls = Calls(picture)
-    monkeypatch.setattr(xml_scene, "render_xml", calls)
+    monkeypatch.setattr(xml_scene, "render_apart", calls)
     assert run("render", "one.xml", "-o", tmp_path) == 0
     assert calls.args == (Path("one.xml"), tmp_path)
     assert str(picture) in capsys.readouterr().out

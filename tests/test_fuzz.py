@@ -1,0 +1,65 @@
+"""Damaged files are read, or refused in one sentence that names them; nothing else may come of them.
+
+A few inputs of each reader; ``python -m benchmarks.fuzz`` tries as many as time allows, each in a process of its own.
+"""
+
+import random
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from benchmarks.fuzz import READERS, attempt, make_samples, mutate
+
+SETTINGS = {
+    "deadline": None,
+    "derandomize": True,
+    "phases": (Phase.generate,),
+    "suppress_health_check": list(HealthCheck),
+}
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("samples")
+    make_samples(folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_samples_are_read(samples, name):
+    assert attempt(READERS[name], samples) == "read"
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files(samples, name):
+    """Slow readers, which start a process, get three inputs; the others 40."""
+    reader = READERS[name]
+    path = samples / reader.file
+    sample = path.read_bytes()
+
+    @settings(max_examples=3 if reader.slow else 40, **SETTINGS)
+    @given(st.integers(0, 2**32))
+    def check(seed):
+        path.write_bytes(mutate(sample, random.Random(seed)))
+        found = attempt(reader, samples)
+        assert found in ("read", "refused"), f"mutate with seed {seed}: {found}"
+
+    try:
+        check()
+    finally:
+        path.write_bytes(sample)
+
+
+@pytest.mark.parametrize("name", [name for name, reader in READERS.items() if not reader.slow])
+@pytest.mark.parametrize("data", [b"", b"\0", b"\0" * 4096, b"ply\n", b"{" * 2000, b"[" * 2000, b"\xff\xfe" * 50])
+def test_rubbish(samples, name, data):
+    reader = READERS[name]
+    path = samples / reader.file
+    sample = path.read_bytes()
+    try:
+        path.write_bytes(data)
+        assert attempt(reader, samples) in ("read", "refused")
+    finally:
+        path.write_bytes(sample)

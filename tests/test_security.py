@@ -1,0 +1,209 @@
+"""Hostile scenes and archives: nothing outside is read, nothing swells, no code is run."""
+
+import gzip
+import os
+import resource
+import zipfile
+
+import pytest
+from conftest import box_asset
+from test_cli import run
+
+from mitsplat import xml_scene
+from mitsplat.assets import Asset
+from mitsplat.errors import InputError
+from mitsplat.scene import load_scene
+from mitsplat.splats import Splats
+from mitsplat.xml_check import check_xml
+
+
+class TestScenes:
+    @pytest.mark.parametrize(
+        "name", ["../elsewhere", "{folder}", "assets/link", "assets/../../elsewhere", "assets/loop"]
+    )
+    @pytest.mark.parametrize("key", ["environment", "objects", "shapes", "lights"])
+    def test_what_is_outside_is_refused(self, scene_data, write_scene, tmp_path, name, key):
+        elsewhere = tmp_path.with_name(f"{tmp_path.name}-elsewhere")
+        box_asset("nut").save(elsewhere)
+        path = write_scene(scene_data)
+        name = name.replace("../elsewhere", f"../{elsewhere.name}").replace("{folder}", str(elsewhere))
+        (tmp_path / "assets/link").symlink_to(elsewhere)
+        (tmp_path / "assets/loop").symlink_to(tmp_path / "assets/loop")
+        if key == "objects":
+            scene_data["objects"] = [{"asset": name}]
+        elif key == "shapes":
+            scene_data["shapes"] = [{"name": "a", "mesh": name}]
+        elif key == "lights":
+            scene_data["lights"] = [{"kind": "environment", "image": name}]
+        else:
+            scene_data["environment"] = name
+        path = write_scene(scene_data)
+        place = {"objects": r"objects\[0\]\.asset", "shapes": r"shapes\[0\]\.mesh", "lights": r"lights\[0\]\.image"}
+        with pytest.raises(
+            InputError, match=rf"scene\.yaml:\d+: {place.get(key, key)}: must be inside the scene's folder"
+        ):
+            load_scene(path)
+        if key == "objects" and "loop" not in name:
+            assert load_scene(path, allow_outside=True).assets[0].name == "nut"
+
+    def test_an_asset_never_names_files_outside(self, tmp_path):
+        box_asset("nut").save(tmp_path / "nut")
+        (tmp_path / "secret.ply").write_bytes((tmp_path / "nut/splats.ply").read_bytes())
+        text = (tmp_path / "nut/asset.yaml").read_text()
+        (tmp_path / "nut/asset.yaml").write_text(text.replace("splats.ply", "../secret.ply"))
+        with pytest.raises(InputError, match=r"asset\.yaml:\d+: splats: must be a file inside .*nut \(got \.\./secret"):
+            Asset.load(tmp_path / "nut")
+
+    def test_aliases_do_not_multiply(self, tmp_path):
+        """The billion laughs: ten levels of ten aliases each."""
+        levels = ["a0: &a0 [x]\n"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)]
+        (tmp_path / "scene.yaml").write_text("".join(levels))
+        with pytest.raises(InputError, match=r"scene\.yaml: must not hold more than 200000 values"):
+            load_scene(tmp_path / "scene.yaml")
+
+    @pytest.mark.parametrize(
+        "text", ["name: !!python/object/apply:os.system ['touch pwned']", "name: !!python/name:os"]
+    )
+    def test_no_code_is_run(self, tmp_path, text, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "scene.yaml").write_text(text)
+        with pytest.raises(InputError, match="must not have a YAML tag"):
+            load_scene(tmp_path / "scene.yaml")
+        assert not (tmp_path / "pwned").exists()
+
+    def test_a_pipe_is_no_file(self, tmp_path):
+        """Opening it would wait for ever."""
+        for name in ("scene.yaml", "a.ply", "a.xml"):
+            os.mkfifo(tmp_path / name)
+        for read in (lambda: load_scene(tmp_path / "scene.yaml"), lambda: Splats.load(tmp_path / "a.ply"),
+                     lambda: check_xml(tmp_path / "a.xml")):  # fmt: skip
+            with pytest.raises(InputError, match="must be a file"):
+                read()
+
+
+XML = '<scene version="3.9.0">{}</scene>'
+
+
+class TestXml:
+    @pytest.fixture
+    def scene(self, tmp_path):
+        (tmp_path / "in").mkdir()
+        (tmp_path / "in/mesh.ply").write_text("")
+        (tmp_path / "secret.xml").write_text(XML.format(""))
+        (tmp_path / "in/link.xml").symlink_to(tmp_path / "secret.xml")
+        return tmp_path / "in/scene.xml"
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            (
+                '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>' + XML.format("&b;"),
+                "must not have a document type",
+            ),
+            (
+                '<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;">]>' + XML.format("&c;"),
+                "must not have a document type",
+            ),
+            (XML.format('<include filename="../secret.xml"/>'), "include must be inside the scene's folder"),
+            (XML.format('<include filename="link.xml"/>'), "include must be inside the scene's folder"),
+            (XML.format('<include filename="/etc/passwd"/>'), "include must be inside the scene's folder"),
+            (XML.format('<include filename="$file"/>'), "include must not be a parameter"),
+            (XML.format('<path value=".."/>'), "path must be inside the scene's folder"),
+            (
+                XML.format('<shape type="ply"><string name="filename" value="../secret.xml"/></shape>'),
+                "must not name a file",
+            ),
+            (XML.format('<shape type="x"><string name="other" value="/etc/passwd"/></shape>'), "must not name a file"),
+            (
+                XML.format('<default name="f" value="/etc/passwd"/><string name="a" value="$f"/>'),
+                "must not name a file",
+            ),
+            (
+                XML.format('<default name="f" value="/etc"/><string name="a" value="$f/passwd"/>'),
+                "(put together|name a file)",
+            ),
+            (
+                XML.format('<default name="d" value=".."/><string name="a" value="$d/secret.xml"/>'),
+                "(put together|name a file)",
+            ),
+            (XML.format("<a>" * 100 + "</a>" * 100), "must not nest deeper than 64"),
+            (XML.format("<a>"), "not XML"),
+            ("", "not XML"),
+        ],
+    )
+    def test_hostile_files(self, scene, text, message):
+        scene.write_text(text)
+        with pytest.raises(InputError, match=rf"scene\.xml:\d+: .*{message}"):
+            check_xml(scene)
+
+    def test_includes_are_checked_too_and_may_go_round(self, scene):
+        scene.write_text(XML.format('<include filename="b.xml"/>'))
+        (scene.parent / "b.xml").write_text(XML.format('<include filename="scene.xml"/><string value="mesh.ply"/>'))
+        check_xml(scene)
+        (scene.parent / "b.xml").write_text(XML.format('<include filename="../secret.xml"/>'))
+        with pytest.raises(InputError, match=r"b\.xml:1: include must be inside"):
+            check_xml(scene)
+        check_xml(scene, allow_outside=True)
+
+    def test_the_command_checks_first(self, scene, capsys, monkeypatch):
+        monkeypatch.setattr(xml_scene, "run_apart", None)
+        scene.write_text('<!DOCTYPE a><scene version="3.9.0"/>')
+        with pytest.raises(InputError, match="must not have a document type"):
+            xml_scene.render_xml(scene, scene.parent / "out.png")
+
+    def test_what_ends_mitsubas_process_is_a_sentence(self, scene, capsys, monkeypatch):
+        """A native reader that crashes, in its stead a process that is killed."""
+        monkeypatch.setattr(xml_scene, "_RenderOne", Dies)
+        assert run("render", scene) == 2
+        assert "scene.xml: something that it names ends Mitsuba's process" in capsys.readouterr().err
+
+
+class Dies:
+    def __init__(self, *args):
+        pass
+
+    def __call__(self, index, note, /):
+        os.abort()
+
+
+class TestArchives:
+    """Compressed files that swell; the peak of this process says that nothing was allocated for them."""
+
+    @pytest.fixture(autouse=True)
+    def peak(self):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        yield
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300e3
+
+    def test_a_bomb_of_spz(self, tmp_path):
+        with gzip.open(tmp_path / "a.spz", "wb") as file:
+            for _ in range(100):
+                file.write(bytes(1 << 20))
+        with pytest.raises(InputError, match=r"a\.spz: \d+ bytes must not hold more than \d+ \(got more\)"):
+            Splats.load(tmp_path / "a.spz")
+
+    @pytest.mark.parametrize("name", ["../a", "/etc/a", "x/../../a", "..\\a"])
+    def test_a_path_that_leaves_sog(self, tmp_path, name):
+        with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+            archive.writestr(name, b"x")
+        with pytest.raises(InputError, match=r"a\.sog: an archive must not hold files outside of it"):
+            Splats.load(tmp_path / "a.sog")
+
+    def test_a_bomb_of_sog(self, tmp_path):
+        with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("meta.json", bytes(64 << 20))
+        with pytest.raises(InputError, match=r"a\.sog: \d+ bytes must not hold more than \d+ in 64 files"):
+            Splats.load(tmp_path / "a.sog")
+
+    def test_an_archive_that_is_none(self, tmp_path):
+        for name, data in (("a.sog", b"PK\3\4rubbish"), ("a.spz", b"\x1f\x8b rubbish")):
+            (tmp_path / name).write_bytes(data)
+            with pytest.raises(InputError, match=rf"{name}: not a valid"):
+                Splats.load(tmp_path / name)
+
+    def test_a_header_that_promises_billions(self, tmp_path):
+        box_asset("nut").splats.save(tmp_path / "a.ply")
+        data = (tmp_path / "a.ply").read_bytes()
+        (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 12\n", b"vertex 99999999999\n"))
+        with pytest.raises(InputError, match="the header promises 99999999999 Gaussians"):
+            Splats.load(tmp_path / "a.ply")

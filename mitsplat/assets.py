@@ -155,7 +155,7 @@ class Asset:
         if spec.mesh is None:
             mesh = None
         elif spec.mesh == "hull":
-            mesh = _hull(_opaque_core(splats), key_place(folder / _FILE, ("mesh",)))
+            mesh = _hull(opaque_core(splats), key_place(folder / _FILE, ("mesh",)))
         else:
             mesh = read_mesh(_named_file(folder, "mesh", spec.mesh))
         asset = cls(
@@ -270,7 +270,7 @@ class Asset:
         Raises:
             InputError: If it has no extent.
         """
-        points = _opaque_core(self.splats) if self.mesh is None else self.mesh.vertices
+        points = opaque_core(self.splats) if self.mesh is None else self.mesh.vertices
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
         if not extent > 0:
             raise InputError(
@@ -298,7 +298,7 @@ class Asset:
             findings.append("the mesh is not watertight: mass and inertia come from its convex pieces")
         size = float(self.mesh.extents.max())
         bounds = {"pieces": [piece.bounds for piece in self.pieces]}
-        core = _opaque_core(self.splats)
+        core = opaque_core(self.splats)
         bounds["splats"] = [np.stack([core.min(axis=0), core.max(axis=0)])] if len(core) else []
         for what, boxes in bounds.items():
             if boxes:
@@ -351,7 +351,7 @@ def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:
     return spec.units if isinstance(spec.units, float) else 1.0
 
 
-def _opaque_core(splats: Splats) -> FloatArray:
+def opaque_core(splats: Splats) -> FloatArray:
     """Centres (M, 3) of opaque Gaussians, less the floaters: those far outside the bulk of 98 % along an axis."""
     centres = splats.means[splats.opacities > _OPAQUE]
     if not len(centres):

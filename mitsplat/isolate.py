@@ -128,7 +128,7 @@ def isolate_object(
     inside = seen & (weights[:, 0] >= INSIDE * total)
     needles = inside & _needles(splats, views)
     body = np.flatnonzero(inside & ~needles)
-    floating = body[_floaters(splats.select(body), weights[body, 0])]
+    floating = body[find_floaters(splats.select(body), weights[body, 0])]
     kept = inside & ~needles
     kept[floating] = False
     if not kept.any():
@@ -202,8 +202,8 @@ def sample_nearest(
     return values
 
 
-def _floaters(splats: Splats, weight: FloatArray) -> npt.NDArray[np.int64]:
-    """Gaussians in groups that touch no other and have little of the visible weight (N,)."""
+def find_floaters(splats: Splats, weight: FloatArray) -> npt.NDArray[np.int64]:
+    """Indices of Gaussians in groups that touch no other and have little of the visible weight (N,)."""
     count = len(splats)
     if count < 2:
         return np.zeros(0, dtype=np.int64)

@@ -41,6 +41,7 @@ for _command in (
     assets.mesh,
     assets.asset,
     datasets.schema,
+    datasets.check,
     datasets.doctor,
 ):
     app.command()(_command)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
@@ -14,6 +14,7 @@ from mitsplat.quality import PresetName
 
 if TYPE_CHECKING:
     from mitsplat.dataset import DatasetSummary
+    from mitsplat.findings import Finding
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -23,7 +24,7 @@ FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, fr
 FrameSize = Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")]
 SceneSeed = Annotated[int | None, typer.Option(help="Decides everything that is random.")]
 AllowOutside = Annotated[bool, typer.Option("--allow-outside", help="Let SCENE name files outside of its folder.")]
-Preset = Annotated[Literal["fast", "balanced", "exact"] | None, typer.Option(help="Rendering preset.")]
+Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset.")]
 
 
 def render(
@@ -305,17 +306,36 @@ def schema() -> None:
 def doctor() -> None:
     """Check that this machine has what is needed.
 
-    Python, Mitsuba, LLVM, Warp and memory, and what to do about what is missing.
+    Python, Mitsuba, processor, LLVM, GPU, Warp, memory, disk and cache, and what to do about what is missing.
     """
     from mitsplat.doctor import examine
 
-    healthy = True
-    for finding in examine():
-        healthy &= finding.ok
-        typer.echo(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name}: {finding.text}")
+    _tell_findings(examine(), "FAIL")
+
+
+def check(
+    path: Annotated[Path, typer.Argument(metavar="ASSET|SCENE", help="Asset folder, or scene file (.yaml).")],
+    allow_outside: AllowOutside = False,
+) -> None:
+    """Look for what is questionable about an asset or a scene.
+
+    Units, up axis, needles, floaters, mesh against splats, mass, colliders, room, sight and light, and what to do about
+    each. If there is anything, the exit status is 1.
+    """
+    from mitsplat.preflight import check_path
+
+    _tell_findings(check_path(path, allow_outside=allow_outside), "look")
+
+
+def _tell_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
+    """One line for each, with what to do where something is wrong; then status 0 or 1."""
+    good = True
+    for finding in findings:
+        good &= finding.ok
+        typer.echo(f"{'ok  ' if finding.ok else mark}  {finding.name}: {finding.text}")
         if not finding.ok:
             typer.echo(f"      to do: {finding.remedy}")
-    raise typer.Exit(0 if healthy else 1)
+    raise typer.Exit(0 if good else 1)
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -1,4 +1,4 @@
-"""Images per second against workers and against the size of the scene, memory over many frames, and what 10^6 images cost.
+"""Images per second against workers and size of the scene, memory over many frames, and what 10^6 images cost.
 
     python -m benchmarks.scale workers [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale scene [--frames 6] [--size 320x180]
@@ -52,11 +52,13 @@ class Clock:
         self.times: list[float] = []
 
     def __call__(self, done: int, total: int, text: str) -> None:
+        """Hear of progress."""
         if text.startswith("frame "):
             self.times.append(time.monotonic())
 
     @property
     def speed(self) -> float:
+        """Images per second."""
         kept = self.times[2 * self.workers - 1 :]
         return (len(kept) - 1) / (kept[-1] - kept[0])
 
@@ -124,8 +126,11 @@ def measure_memory(frames: int) -> None:
         write_dataset(load_scene(path, allow_outside=True), Path(folder) / "out", frames=frames, progress=hear)
     kept = np.array(rows[len(rows) // 4 :])
     slope = float(np.polyfit(kept[:, 0], kept[:, 1], 1)[0])
-    print(f"{frames} frames of 64x48 in {-(-frames // 50)} layouts: {rows[0][1]:.0f} MiB at frame {rows[0][0]}, "
-          f"{kept[0, 1]:.0f} at {kept[0, 0]:.0f}, {rows[-1][1]:.0f} at {rows[-1][0]}; slope {1e3 * slope:.1f} KiB a frame")  # fmt: skip
+    layouts = -(-frames // 50)
+    print(
+        f"{frames} frames of 64x48, {layouts} layouts: {1024 * slope:.1f} KiB a frame, from frame {kept[0, 0]:.0f} on"
+    )
+    print("MiB at frame:")
     print(json.dumps([(done, round(size)) for done, size in rows[:: max(1, len(rows) // 20)]]))
 
 
@@ -140,9 +145,8 @@ def project(seconds: float, size: float, settle: float, views: int) -> None:
         speed = min(workers / each, limit)
         mark = " saturated" if speed == limit else ""
         hours = workers * images / speed / 3600
-        print(
-            f"{workers:7d}  {speed:8.2f}  {images / speed / 86400:6.2f}  {hours:12.0f}  {images * size / 1e12:.2f}{mark}"
-        )
+        days, stored = images / speed / 86400, images * size / 1e12
+        print(f"{workers:7d}  {speed:8.2f}  {days:6.2f}  {hours:12.0f}  {stored:.2f}{mark}")
     print(f"one writer saturates at {limit:.0f} images/s, {limit * each:.0f} workers; shards have a writer each")
 
 

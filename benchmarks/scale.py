@@ -1,6 +1,6 @@
 """Images per second against workers and size of the scene, memory over many frames, and what 10^6 images cost.
 
-    python -m benchmarks.scale workers [--workers 1 2 3] [--frames 12] [--size 320x180]
+    python -m benchmarks.scale workers [--scene scenes/workcell.yaml] [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale scene [--frames 6] [--size 320x180]
     python -m benchmarks.scale memory [--frames 2000]
     python -m benchmarks.scale project --seconds 1.6 --bytes 1.9e6 [--settle 3] [--views 12]
@@ -63,9 +63,10 @@ class Clock:
         return (len(kept) - 1) / (kept[-1] - kept[0])
 
 
-def measure_workers(counts: list[int], frames: int, size: str) -> None:
+def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> None:
     """Local workers, Ray and shards: speed, and whether the bytes are the same."""
-    scene = load_scene(WORKCELL, overrides=overrides(size, **{"output.formats": ["yolo", "coco"]}))
+    changes = overrides(size, **{"output.formats": ["yolo", "coco"]})
+    scene = load_scene(path, overrides=changes, allow_outside=True)
     print(f"{len(scene.assets)} assets, {size}, {frames} frames; load before: {os.getloadavg()[0]:.1f}")
     found = set()
     with tempfile.TemporaryDirectory() as folder:
@@ -156,6 +157,7 @@ def main() -> None:
     parser.add_argument("what", choices=("workers", "scene", "memory", "project"))
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--frames", type=int)
+    parser.add_argument("--scene", type=Path, default=WORKCELL)
     parser.add_argument("--size", default="320x180")
     parser.add_argument("--seconds", type=float, default=1.6)
     parser.add_argument("--bytes", type=float, default=1.9e6)
@@ -163,7 +165,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=12)
     options = parser.parse_args()
     if options.what == "workers":
-        measure_workers(options.workers, options.frames or 12, options.size)
+        measure_workers(options.scene, options.workers, options.frames or 12, options.size)
     elif options.what == "scene":
         measure_scene(options.frames or 6, options.size)
     elif options.what == "memory":

@@ -191,7 +191,7 @@ def _sight(scene: Scene, extent: FloatArray) -> Finding:
     blind = []
     for index in views:
         camera = plan_frame(scene, index).camera
-        (x, y), depth = camera.project(middle[None])[0][0], camera.project(middle[None])[1][0]
+        ((x, y),), (depth,) = camera.project(middle[None])
         if not (depth > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):
             blind.append(index)
     text = f"{len(views) - len(blind)} of {len(views)} views show the middle of the region"

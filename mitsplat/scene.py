@@ -23,6 +23,7 @@ from mitsplat.assets import Asset, read_mesh
 from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.files import is_inside
+from mitsplat.image_check import check_image
 from mitsplat.spec import (
     PILE_HEIGHT,
     AreaLight,
@@ -168,9 +169,11 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         _confine(spec, path)
     folder = path.parent
     for position, light in enumerate(spec.lights):
-        if isinstance(light, EnvironmentLight) and light.image is not None and not (folder / light.image).is_file():
+        if isinstance(light, EnvironmentLight) and light.image is not None:
             with _blaming(path, "lights", position, "image"):
-                raise InputError(f"{folder / light.image}: no such file")
+                if not (folder / light.image).is_file():
+                    raise InputError(f"{folder / light.image}: no such file")
+                check_image(folder / light.image)
     environment = None
     if spec.environment is not None:
         with _blaming(path, "environment"):

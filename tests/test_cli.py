@@ -365,6 +365,31 @@ def test_our_own_bugs_keep_their_traceback(scene_path: Path, write_dataset: Call
         main(["render", str(scene_path)])
 
 
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (InputError("a.ply: broken"), 2),
+        (MissingResourceError("disk full"), 3),
+        (PartialResultError("half"), 4),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_a_log_for_machines_holds_the_error(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: BaseException, status: int
+) -> None:
+    write_dataset.error = error
+    assert run("render", scene_path, "--json") == status
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")]
+    assert [event["event"] for event in events] == ["started", "failed"]
+    assert (events[-1]["status"], events[-1]["error"]) == (status, type(error).__name__)
+
+
+def test_a_log_for_machines_holds_bad_scenes_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("render", "gone.yaml", "--json") == 2
+    event = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert (event["command"], event["status"], event["message"]) == ("render", 2, "gone.yaml: no such file")
+
+
 def test_interrupt_ends_with_130(scene_path: Path, write_dataset: Calls) -> None:
     write_dataset.error = KeyboardInterrupt()
     assert run("render", scene_path) == 130

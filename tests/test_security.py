@@ -3,6 +3,7 @@
 import gzip
 import os
 import resource
+import struct
 import zipfile
 
 import pytest
@@ -164,6 +165,45 @@ class Dies:
 
     def __call__(self, index, note, /):
         os.abort()
+
+
+class TestImages:
+    """Images of environment lights are read by Mitsuba, in a process of its own first."""
+
+    @pytest.fixture
+    def scene(self, scene_data, write_scene, tmp_path):
+        import mitsuba as mi
+        import numpy as np
+
+        mi.set_variant("llvm_ad_rgb")
+        mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(str(tmp_path / "sky.exr"))
+        scene_data["lights"] = [{"kind": "environment", "image": "sky.exr"}]
+        return write_scene(scene_data)
+
+    def test_a_good_one(self, scene):
+        load_scene(scene)
+
+    @pytest.mark.parametrize(
+        "damage", [lambda data: data[:200], lambda data: b"", lambda data: data.replace(b"channels", b"chan")]
+    )
+    def test_a_damaged_one(self, scene, tmp_path, damage):
+        path = tmp_path / "sky.exr"
+        path.write_bytes(damage(path.read_bytes()))
+        with pytest.raises(
+            InputError, match=r"scene\.yaml:\d+: lights\[0\]\.image: .*sky\.exr: not a readable image \("
+        ) as caught:
+            load_scene(scene)
+        assert "\n" not in str(caught.value)
+
+    def test_one_that_promises_too_much(self, scene, tmp_path):
+        """An EXR whose window is 2^30 pixels wide and 2^20 high."""
+        path = tmp_path / "sky.exr"
+        data = path.read_bytes()
+        window = struct.pack("<iiii", 0, 0, 15, 7)
+        assert data.count(window) >= 1
+        path.write_bytes(data.replace(window, struct.pack("<iiii", 0, 0, (1 << 30) - 1, (1 << 20) - 1)))
+        with pytest.raises(InputError, match="not a readable image"):
+            load_scene(scene)
 
 
 class TestArchives:

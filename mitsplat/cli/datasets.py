@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
-from mitsplat.cli.options import JsonLog, progress_bar, progress_of
+from mitsplat.cli.options import JsonLog, command_log, progress_bar
 from mitsplat.errors import InputError
 from mitsplat.quality import PresetName
 
@@ -71,45 +71,46 @@ def render(
 
     Options replace what the file says. A Mitsuba scene (.xml) gives one picture.
     """
-    overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
-    if out is None:
-        out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
-    if scene.suffix == ".xml":
-        if overrides or frames is not None or tolerance is not None or shard is not None:
-            raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
-        from mitsplat.xml_scene import render_apart
+    with command_log(json_log, "render") as progress_bars:
+        overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
+        if out is None:
+            out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
+        if scene.suffix == ".xml":
+            if overrides or frames is not None or tolerance is not None or shard is not None:
+                raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
+            from mitsplat.xml_scene import render_apart
 
-        typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside)}")
-        return
-    from mitsplat.cluster import Cluster
-    from mitsplat.dataset import write_dataset
-    from mitsplat.folder import Shard
-    from mitsplat.scene import load_scene
+            typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside)}")
+            return
+        from mitsplat.cluster import Cluster
+        from mitsplat.dataset import write_dataset
+        from mitsplat.folder import Shard
+        from mitsplat.scene import load_scene
 
-    part = None if shard is None else Shard.parse(shard)
-    cluster = Cluster(address, Cluster.parse_resources(resources)) if engine == "ray" else None
-    loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
-    if tolerance is not None:
-        if quality is not None:
-            raise InputError("--quality and --tolerance both choose the preset: give one of them")
-        from mitsplat.chart import choose_preset
+        part = None if shard is None else Shard.parse(shard)
+        cluster = Cluster(address, Cluster.parse_resources(resources)) if engine == "ray" else None
+        loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
+        if tolerance is not None:
+            if quality is not None:
+                raise InputError("--quality and --tolerance both choose the preset: give one of them")
+            from mitsplat.chart import choose_preset
 
-        with progress_bar() as progress:
-            best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
-        typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
-        loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
-    with progress_of(json_log, "render") as progress:
-        summary = write_dataset(
-            loaded,
-            out,
-            frames=frames,
-            shard=part,
-            workers=workers,
-            cluster=cluster,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    _tell_dataset(summary)
+            with progress_bars() as progress:
+                best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
+            typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
+            loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
+        with progress_bars() as progress:
+            summary = write_dataset(
+                loaded,
+                out,
+                frames=frames,
+                shard=part,
+                workers=workers,
+                cluster=cluster,
+                overwrite=overwrite,
+                progress=progress,
+            )
+        _tell_dataset(summary)
 
 
 def merge(
@@ -127,7 +128,7 @@ def merge(
     """
     from mitsplat.merge import merge_shards
 
-    with progress_of(json_log, "merge") as progress:
+    with command_log(json_log, "merge") as progress_bars, progress_bars() as progress:
         summary = merge_shards(shards, out, overwrite=overwrite, progress=progress)
     _tell_dataset(summary)
 

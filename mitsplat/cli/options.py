@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Annotated, Any
 
 import typer
@@ -29,22 +29,26 @@ def sentence_of(error: BaseException) -> str:
     return str(error)
 
 
-def progress_of(json_log: bool, command: str) -> AbstractContextManager[Progress]:
-    """The bar, or the log for machines."""
-    return _json_log(command) if json_log else progress_bar()
-
-
 @contextmanager
-def _json_log(command: str) -> Iterator[Progress]:
-    """Events on stderr: started, progress, then finished, or failed with exit status and sentence."""
+def command_log(json_log: bool, command: str) -> Iterator[Callable[[], AbstractContextManager[Progress]]]:
+    """How a command shows its progress: by bars, or as a log for machines, which then holds its errors too.
+
+    The log's events are started, progress, then finished, or failed with the exit status and a sentence.
+    """
+    if not json_log:
+        yield progress_bar
+        return
 
     def tell(event: str, **details: Any) -> None:
         line = json.dumps({"time": round(time.time(), 3), "command": command, "event": event, **details})
         typer.echo(line, err=True)
 
+    def progress(done: int, total: int, doing: str) -> None:
+        tell("progress", done=done, total=total, doing=doing)
+
     tell("started")
     try:
-        yield lambda done, total, doing: tell("progress", done=done, total=total, doing=doing)
+        yield lambda: nullcontext(progress)
     except BaseException as error:
         status = exit_status(error)
         sentence = "interrupted: run again to go on" if status == 130 else sentence_of(error)

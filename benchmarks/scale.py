@@ -3,7 +3,7 @@
     python -m benchmarks.scale workers [--scene scenes/workcell.yaml] [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale scene [--frames 6] [--size 320x180]
     python -m benchmarks.scale memory [--frames 2000]
-    python -m benchmarks.scale project --seconds 1.6 --bytes 1.9e6 [--settle 3] [--views 12]
+    python -m benchmarks.scale project --seconds 1.55 --bytes 2.5e5 [--settle 3] [--views 12]
 
 ``workers`` also compares the manifests' SHA-256. ``project`` prints a table from figures that the others measured; its
 model is in ``docs/reliability.md``.
@@ -58,9 +58,9 @@ class Clock:
 
     @property
     def speed(self) -> float:
-        """Images per second."""
+        """Images per second, nan where there are too few."""
         kept = self.times[2 * self.workers - 1 :]
-        return (len(kept) - 1) / (kept[-1] - kept[0])
+        return (len(kept) - 1) / (kept[-1] - kept[0]) if len(kept) > 1 else float("nan")
 
 
 def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> None:
@@ -159,8 +159,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--scene", type=Path, default=WORKCELL)
     parser.add_argument("--size", default="320x180")
-    parser.add_argument("--seconds", type=float, default=1.6)
-    parser.add_argument("--bytes", type=float, default=1.9e6)
+    parser.add_argument("--seconds", type=float, default=1.55)
+    parser.add_argument("--bytes", type=float, default=2.5e5)
     parser.add_argument("--settle", type=float, default=3.0)
     parser.add_argument("--views", type=int, default=12)
     options = parser.parse_args()

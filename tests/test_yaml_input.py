@@ -152,7 +152,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
     binary.write_bytes(b"title: \xff\n")
     for path, sentence in [
         (tmp_path / "absent.yaml", "no such file"),
-        (tmp_path, "cannot be read (Is a directory)"),
+        (tmp_path, "must be a file"),
         (binary, "must be UTF-8 text (invalid start byte at byte 7)"),
     ]:
         with pytest.raises(InputError) as caught:

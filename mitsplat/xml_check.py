@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.parsers import expat
 
@@ -11,6 +12,9 @@ from mitsplat.files import is_inside
 MAX_BYTES = 64 << 20
 MAX_DEPTH = 64
 MAX_INCLUDES = 100
+
+_TEXTS = ("string", "default", "spectrum", "alias")
+_PARAMETER = re.compile(r"\$\w+")
 
 
 def check_xml(path: Path, *, allow_outside: bool = False) -> None:
@@ -51,7 +55,7 @@ def _check_file(path: Path, base: Path, folder: Path | None) -> list[Path]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     parser = expat.ParserCreate()
-    depth, included, defaults = 0, list[Path](), set[str]()
+    depth, included = 0, list[Path]()
 
     def refuse(rule: str) -> InputError:
         return InputError(f"{path}:{parser.CurrentLineNumber}: {rule}")
@@ -64,26 +68,12 @@ def _check_file(path: Path, base: Path, folder: Path | None) -> list[Path]:
         depth += 1
         if depth > MAX_DEPTH:
             raise refuse(f"must not nest deeper than {MAX_DEPTH} elements")
-        value = attributes.get("filename" if name == "include" else "value", "")
-        if name == "include" and "$" not in value:
-            included.append(base / value)
-        if folder is None or name not in ("include", "path", "string", "default", "alias"):
-            return
-        if name in ("include", "path") and "$" in value:
-            raise refuse(f"{name} must not be a parameter (got {value})")
-        if name == "string" and "$" in value and defaults:
-            # What a default holds was looked at, but not what becomes of several.
-            if value.strip() not in {f"${default}" for default in defaults}:
-                raise refuse(f"text must not be put together from parameters (got {value})")
-            return
-        if name == "default":
-            defaults.add(attributes.get("name", ""))
-        if name in ("include", "path") and not is_inside(folder, value):
-            raise refuse(f"{name} must be inside the scene's folder (got {value}); --allow-outside lifts this")
-        if _names_outside(folder, value):
-            raise refuse(
-                f"must not name a file outside of the scene's folder (got {value}); --allow-outside lifts this"
-            )
+        if name == "include" and "$" not in attributes.get("filename", ""):
+            included.append(base / attributes.get("filename", ""))
+        if folder is not None:
+            for key, value in attributes.items():
+                if rule := _offence(folder, name, key, value):
+                    raise refuse(f"{rule} (got {value}); --allow-outside lifts this")
 
     def end(name: str) -> None:
         nonlocal depth
@@ -97,11 +87,24 @@ def _check_file(path: Path, base: Path, folder: Path | None) -> list[Path]:
     return included
 
 
+def _offence(folder: Path, element: str, key: str, value: str) -> str:
+    """The rule that an attribute breaks, or nothing."""
+    named = key == "filename" or (element == "path" and key == "value")
+    if named and "$" in value:
+        return f"{element} must not be a parameter"
+    if element in _TEXTS and "$" in value and not _PARAMETER.fullmatch(value.strip()):
+        # What a default holds is looked at where it is set, but not what becomes of several.
+        return "text must not be put together from parameters"
+    if named and not is_inside(folder, value):
+        return f"{element} must be inside the scene's folder"
+    return "must not name a file outside of the scene's folder" if _names_outside(folder, value) else ""
+
+
 def _names_outside(folder: Path, text: str) -> bool:
-    """Whether a text is the name of something that exists, seen from the scene or from here, but not in the folder."""
+    """Whether a text is the name of a file, seen from the scene or from here, that is not in the folder."""
     if not text or "\0" in text or len(text) > 4096:
         return False
     try:
-        return any((base / text).exists() and not is_inside(folder, str(base / text)) for base in (folder, Path.cwd()))
+        return any((base / text).is_file() and not is_inside(folder, str(base / text)) for base in (folder, Path.cwd()))
     except OSError:
         return False

@@ -1,9 +1,11 @@
 """Kill real renderings at random moments, resume them, and compare every byte with an undisturbed run.
 
-    python -m benchmarks.faults [--kills 50] [--seed 0] [--frames 12]
+    python -m benchmarks.faults [--kills 50] [--seed 0] [--frames 12] [--synthetic]
 
 Each run has 1 or 2 worker processes, at random. Of three kills (SIGKILL), two hit the whole run and one a worker, whose
 frame the run must make again. A moment is drawn anew each time: mostly while frames are written, sometimes before.
+``--synthetic`` draws frames instead of rendering them (those of ``tests/test_faults.py``): they start and follow each other
+faster, so that more kills hit the writing of files.
 """
 
 from __future__ import annotations
@@ -46,18 +48,8 @@ def hashes(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def start(scene: Path, out: Path, frames: int, workers: int) -> subprocess.Popen[bytes]:
-    command = [
-        sys.executable,
-        "-c",
-        "from mitsplat.cli import main; main()",
-        "render",
-        str(scene),
-        "-o",
-        str(out),
-        "-n",
-        str(frames),
-    ]
+def start(script: list[str], scene: Path, out: Path, frames: int, workers: int) -> subprocess.Popen[bytes]:
+    command = [sys.executable, *script, "render", str(scene), "-o", str(out), "-n", str(frames)]
     command += ["--workers", str(workers), "--json", "--allow-outside"]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
@@ -100,6 +92,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--synthetic", action="store_true")
     options = parser.parse_args()
     rng = random.Random(options.seed)
     counts: Counter[str] = Counter()
@@ -108,11 +101,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         whole, out, scene = (Path(folder) / name for name in ("undisturbed", "out", "scene.yaml"))
         scene.write_text(SCENE)
-        if start(scene, whole, options.frames, 1).wait():
+        script = ["-c", "from mitsplat.cli import main; main()"]
+        if options.synthetic:
+            sys.path.insert(0, str(ROOT / "tests"))
+            from test_faults import CHILD
+
+            (Path(folder) / "child.py").write_text(CHILD.format(tests=str(ROOT / "tests"), seconds=0.02))
+            script = [str(Path(folder) / "child.py")]
+        if start(script, scene, whole, options.frames, 1).wait():
             sys.exit("the undisturbed run failed")
         expected = hashes(whole)
         while counts["kills"] < options.kills or out.exists():
-            process = start(scene, out, options.frames, rng.choice((1, 2)))
+            process = start(script, scene, out, options.frames, rng.choice((1, 2)))
             counts["runs"] += 1
             while counts["kills"] < options.kills and await_moment(process, out, rng):
                 workers = workers_of(process.pid) if rng.random() < 1 / 3 else []
@@ -129,6 +129,8 @@ def main() -> None:
                 counts["torn lines left"] += manifest.exists() and not manifest.read_bytes().endswith((b"\n", b""))
                 continue
             counts[f"runs that ended with status {status}"] += 1
+            if status:
+                sys.exit(f"a run that was not killed ended with status {status}: {dict(counts)}")
             if status == 0:
                 counts["datasets finished"] += 1
                 found = hashes(out)

@@ -4,8 +4,8 @@
 
 Each run has 1 or 2 worker processes, at random. Of three kills (SIGKILL), two hit the whole run and one a worker, whose
 frame the run must make again. A moment is drawn anew each time: mostly while frames are written, sometimes before.
-``--synthetic`` draws frames instead of rendering them (those of ``tests/test_faults.py``): they start and follow each other
-faster, so that more kills hit the writing of files.
+``--synthetic`` draws frames instead of rendering them (those of ``tests/test_faults.py``): they start and follow each
+other faster, so that more kills hit the writing of files.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ class _Actors(Generic[Result]):
         self._hired = 0
 
     def _find_room(self, wanted: Mapping[str, float]) -> int:
-        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         return sum(int(min(node.get(name, 0.0) / amount for name, amount in wanted.items())) for node in nodes)
 
     def hire(self) -> int:

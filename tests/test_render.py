@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from mitsplat.quality import KERNELS, PRESETS, Quality
 from mitsplat.render import Layers, make_sensor, render_splats
 from mitsplat.splats import SH_C0, Splats
 
+EXAMPLES = int(os.environ.get("MITSPLAT_EXAMPLES", "25"))
 CAPTURES = Path(__file__).parents[2] / "shared/data/splats"
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=50)
 
@@ -337,6 +339,32 @@ def test_turning_the_camera_changes_no_ray() -> None:
     assert 1e-3 < changes(replace(PRESETS["exact"], order="tile")) < 0.2
 
 
+def test_one_gaussian_covers_the_whole_image() -> None:
+    wide = one((5.0, 4.0, 0.5), mean=(0.5, 0.2, 1.0), opacity=0.9)
+    layers = render_splats(wide, CAMERA, quality="exact")
+    assert layers.alpha.min() > 0.5
+    assert error(layers, wide, CAMERA) < 1e-4
+
+
+def test_near_plane_cuts_where_the_peak_is_nearer() -> None:
+    camera = replace(CAMERA, near=1.9)
+    splats = make_splats(80, 21)
+    layers = render_splats(splats, camera, quality="exact")
+    assert error(layers, splats, camera) < 1e-4
+    assert np.abs(layers.alpha - render_splats(splats, CAMERA, quality="exact").alpha).max() > 0.1
+    assert layers.depth[layers.alpha > 0.01].min() > 1.9
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_harmonics_that_overshoot_below_black_are_clamped(preset: str) -> None:
+    rng = np.random.default_rng(5)
+    splats = replace(make_splats(60, 5), sh=rng.normal(0, 3, (60, 16, 3)))
+    layers = render_splats(splats, CAMERA, quality=preset)
+    assert layers.rgb.min() >= 0 and np.isfinite(layers.rgb).all()
+    if preset == "exact":
+        assert error(layers, splats, CAMERA) < 1e-3 * render_reference(splats, CAMERA).rgb.max() ** 2.4
+
+
 def test_opaque_gaussian_hides_what_is_behind() -> None:
     front, behind = one((500, 500, 0.01), mean=(0, 0, -0.5)), one((500, 500, 0.01), mean=(0, 0, 0.5))
     behind = Splats(behind.means, behind.quats, behind.scales, behind.opacities, behind.sh * -3)
@@ -439,7 +467,7 @@ def test_second_frame_needs_no_new_kernel() -> None:
     assert kernels(make_splats(300, 26), moved) <= first
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 2**31), st.floats(-4, 1), st.floats(0, 3), st.floats(20, 120), st.booleans())
 def test_random_extremes_follow_the_twin(seed: int, size: float, stretch: float, fov: float, inside: bool) -> None:
     rng = np.random.default_rng(seed)

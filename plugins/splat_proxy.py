@@ -59,7 +59,7 @@ def srgb_to_linear(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class _Contents:
-    """What the shapes of a scene amount to on the device; kept while the shapes stay the same."""
+    """What the shapes of a scene that emit nothing amount to on the device; kept while they stay the same."""
 
     shapes: tuple[Any, ...]
     clouds: CloudSet | None
@@ -321,12 +321,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
     def _read(self, scene: Any) -> _Contents:
         """Upload what the shapes hold, unless they are those of the last call."""
-        shapes = tuple(scene.shapes())
+        # Lights that are shapes change from frame to frame, and are neither seen nor in the way.
+        shapes = tuple(s for s in scene.shapes() if not s.is_emitter())
         known = self._contents
         if known is not None and _identical(known.shapes, shapes):
             return known
         carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
-        visible = [s for s in shapes if not hasattr(s, "world_from_splats") and not s.is_emitter()]
+        visible = [s for s in shapes if not hasattr(s, "world_from_splats")]
         distinct = list({id(c.splats): c.splats for c in carriers}.values())
         number = {id(splats): i for i, splats in enumerate(distinct)}
         placements = tuple(Placement(number[id(c.splats)], c.world_from_splats, c.instance) for c in carriers)

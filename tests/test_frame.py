@@ -229,3 +229,24 @@ def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: i
     elsewhere = replace(camera, cx=camera.cx + 1)
     render_layers(still, scene(0), elsewhere)
     assert still._still[1] is None
+
+
+def test_views_of_a_layout_share_what_was_uploaded(
+    write_scene: WriteScene,
+    scene_data: dict[str, Any],
+    settled: dict[str, Any],
+    scene: ms.Scene,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Area lights are shapes that are made anew for every frame; they must not count as a change of what is there."""
+    from mitsplat.plugins import splat_proxy
+
+    uploads = []
+    merge = splat_proxy.merge_clouds
+    monkeypatch.setattr(splat_proxy, "merge_clouds", lambda clouds: uploads.append(1) or merge(clouds))
+    layout = layout_of_small_scene(scene, settled)
+    lit = scene_data | {"lights": [{"kind": "area", "position": [0, 0, 1], "target": [0, 0, 0]}]}
+    chosen = ms.load_scene(write_scene(lit, "lit.yaml"))
+    for index in (0, 1):
+        ms.render_frame(chosen, index, layout=layout)
+    assert len(uploads) == 1

@@ -44,6 +44,10 @@ surface inwards, because all of the space in front counts; without a limit, holl
 _DOUBT = 0.5
 """Standard deviations between views by which depth must exceed the hull to cut it: masks err less than depths."""
 _FAR = 1e6
+_APART = 0.02
+"""Share of the way to its neighbours by which a vertex leaves the place that it shares with another."""
+_ROUNDS_APART = 8
+"""Times that this is tried: a vertex may move to where another one is."""
 
 
 @dataclass(frozen=True)
@@ -119,27 +123,51 @@ def reconstruct_surface(
     surface = trimesh.Trimesh(grid.low + (vertices - 0.5) * grid.cell, faces)
     if not masked:
         return simplify_surface(surface, settings.faces)
-    return _outer_shell(simplify_surface(_outer_shell(surface), settings.faces))
+    return _untouched(_outer_shell(simplify_surface(_outer_shell(surface), settings.faces)))
 
 
 def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """At most ``faces`` faces by quadric error (Garland and Heckbert 1997); what is watertight stays so.
 
     Collapses that pinch a closed surface are undone by a simplification that keeps it a manifold, to within a tolerance
-    that grows until the faces are few enough, or as few as the shape has at a tenth of its size.
+    that grows until the faces are few enough, or as few as the shape has at a tenth of its size. Where a closed surface
+    then touches itself it is drawn apart, so that it is one also for readers that weld vertices.
     """
     if len(surface.faces) <= faces:
         return surface
     simple = surface.simplify_quadric_decimation(face_count=faces)
-    if not surface.is_watertight or simple.is_volume:
+    if not surface.is_watertight:
         return simple
-    solid = manifold3d.Manifold(manifold3d.Mesh(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)))
-    tolerance = 1e-4 * surface.scale
-    while solid.num_tri() > faces and tolerance < 0.1 * surface.scale:
-        solid = solid.simplify(tolerance)
-        tolerance *= 1.1
-    mesh = solid.to_mesh()
-    return trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
+    if not simple.is_volume:
+        vertices, triangles = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
+        solid = manifold3d.Manifold(manifold3d.Mesh(vertices, triangles))
+        tolerance = 1e-4 * surface.scale
+        while solid.num_tri() > faces and tolerance < 0.1 * surface.scale:
+            solid = solid.simplify(tolerance)
+            tolerance *= 1.1
+        mesh = solid.to_mesh()
+        simple = trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
+    return _untouched(simple)
+
+
+def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed surface whose vertices all lie apart in single precision, as files store them.
+
+    Vertices in one place belong to sheets that touch there: each moves a little towards its own neighbours.
+    """
+    vertices = np.array(surface.vertices)
+    one, other = surface.edges.T
+    counts = np.bincount(one, minlength=len(vertices))
+    for _ in range(_ROUNDS_APART):
+        _, place, shared = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True, return_counts=True)
+        touching = shared[place] > 1
+        if not touching.any():
+            break
+        # An edge of a closed surface is listed once in either direction.
+        sums = np.column_stack([np.bincount(one, vertices[other, k], len(vertices)) for k in range(3)])
+        middle = sums[touching] / counts[touching, None]
+        vertices[touching] += _APART * (middle - vertices[touching])
+    return trimesh.Trimesh(vertices, surface.faces, process=False)
 
 
 def _outer_shell(surface: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import KnownObject
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
+from skimage.measure import marching_cubes
 
 from mitsplat.align import invert_transform, measure_offset, register_mesh, surface_points
+from mitsplat.assets import read_mesh
 from mitsplat.camera import Camera
 from mitsplat.clearance import Surface
 from mitsplat.errors import InputError
+from mitsplat.mesh import prepare_mesh
 from mitsplat.surface import SurfaceSettings, reconstruct_surface, simplify_surface
 from mitsplat.verdict import sized_photo
 
@@ -69,6 +73,21 @@ def test_simplified_surfaces_stay_watertight() -> None:
         simple = simplify_surface(solid, faces)
         assert len(simple.faces) <= faces
         assert simple.is_volume
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_simplified_surfaces_stay_closed_when_they_are_welded(tmp_path: Path, seed: int) -> None:
+    """A sponge, whose simplification touches itself at vertices and edges, is one closed solid from its file too."""
+    noise = np.pad(gaussian_filter(np.random.default_rng(seed).normal(size=(14, 14, 14)), 1.2), 1, constant_values=-1)
+    vertices, faces, _, _ = marching_cubes(noise.astype(np.float32), 0.0, gradient_direction="ascent")
+    sponge = max(trimesh.Trimesh(vertices, faces).split(only_watertight=True), key=lambda part: float(part.volume))
+    simple = simplify_surface(sponge, len(sponge.faces) // 8)
+    assert simple.is_volume and len(simple.faces) <= len(sponge.faces) // 8
+    simple.export(tmp_path / "sponge.ply")
+    stored = read_mesh(tmp_path / "sponge.ply")
+    assert stored.is_watertight and stored.euler_number == simple.euler_number
+    solid = prepare_mesh(simple, "sponge")
+    assert solid.is_watertight and solid.volume == pytest.approx(simple.volume, rel=1e-6)
 
 
 def test_masks_that_exclude_each_other_are_refused(known_object: KnownObject) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +40,15 @@ _ROUNDS = 3
 _EXTENSIONS = 4
 _RING = 0.1
 """Width of what is in question around the object, as a share of its size."""
+
+_CELLS = 96
+"""Cells along the longest edge of the box in which masks are brought together."""
+
+_DISSENT = 0.04
+"""Share of the photos whose masks may leave a point out and be overruled by the others."""
+
+_DOUBT = 0.04
+"""Width on either side of the common outline in which a photo decides for itself, as a share of the object's size."""
 
 _ABOVE = 0.01
 """Height over the table from which a point belongs to the object, as a share of the cameras' distance."""
@@ -148,16 +157,35 @@ def geometric_masks(points: FloatArray) -> MaskMaker:
     """
 
     def make(photo: Photo) -> BoolArray:
-        camera = photo.camera
-        scale = min(1.0, _WORK_EDGE / max(camera.width, camera.height))
-        rgb, _ = photo.picture(scale)
-        small = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
-        height, width = small.shape[:2]
-        pixels, _ = camera.resized(width, height).project(points)
-        inside = _grab(small, pixels[np.isfinite(pixels).all(axis=1)])
-        soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 1.0)
-        whole = cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
-        return np.asarray(whole >= 0.5)
+        camera, bgr, _ = _reduced(photo)
+        pixels, _ = camera.project(points)
+        return _enlarged(_grab(bgr, pixels[np.isfinite(pixels).all(axis=1)]), photo.camera)
+
+    return make
+
+
+def agreed_masks(masked: Capture, points: FloatArray) -> MaskMaker:
+    """Masks by GrabCut within a band around the outline that the masks of all photos agree on.
+
+    What one photo cannot tell from its object, such as a dark corner behind it, others see beside it: the visual hull
+    (Laurentini 1994) of all masks, less the few that contradict the rest, says where the outline may be.
+
+    Args:
+        masked: The capture with first masks.
+        points: Of the object, in the capture's frame, shape (N, 3); the hull is looked for around them.
+    """
+    small = {photo.name: _reduced(photo) for photo in masked.photos}
+    hull, cell = _agreed_hull([(camera, mask) for camera, _, mask in small.values()], points)
+
+    def make(photo: Photo) -> BoolArray:
+        camera, rgb, mask = small[photo.name] if photo.name in small else _reduced(photo)
+        silhouette = _silhouette(hull, cell, camera)
+        size = float(np.sqrt(np.count_nonzero(silhouette)))
+        if size > 0:
+            near = _grown(silhouette, _DOUBT * size)
+            core = ~_grown(~silhouette, _DOUBT * size)
+            mask = _cut(rgb, near, silhouette & (mask | core), core, _DOUBT * size)
+        return _enlarged(mask, photo.camera)
 
     return make
 
@@ -216,25 +244,82 @@ def _grab(image: ByteImage, pixels: FloatArray) -> BoolArray:
     inside = filled > 0
     for _ in range(_EXTENSIONS):
         near = _grown(inside | (filled > 0), _RING * size)
-        trimap = np.full((height, width), cv2.GC_BGD, dtype=np.uint8)
-        trimap[near] = cv2.GC_PR_BGD
-        trimap[inside] = cv2.GC_PR_FGD
-        trimap[core] = cv2.GC_FGD
-        # The background that is learnt from is what surrounds the object, and the cost is that of its box.
-        edge = round(_RING * size) + 4
-        y, x = np.nonzero(near)
-        box = np.s_[max(0, y.min() - edge) : y.max() + edge + 1, max(0, x.min() - edge) : x.max() + edge + 1]
-        part = np.ascontiguousarray(trimap[box])
-        if (part == cv2.GC_PR_BGD).sum() + (part == cv2.GC_BGD).sum() == 0:
-            return inside  # it fills the photo
-        cv2.setRNGSeed(0)
-        models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
-        before, inside = inside, nothing.copy()
-        inside[box] = _largest_part((part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD))
+        before, inside = inside, _cut(image, near, inside, core, _RING * size)
         if np.count_nonzero(inside & ~before) < 0.01 * np.count_nonzero(inside):
             break
     return inside
+
+
+def _cut(image: ByteImage, near: BoolArray, inside: BoolArray, core: BoolArray, ring: float) -> BoolArray:
+    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably and surely ``inside``."""
+    trimap = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
+    trimap[near] = cv2.GC_PR_BGD
+    trimap[inside] = cv2.GC_PR_FGD
+    trimap[core] = cv2.GC_FGD
+    # The background that is learnt from is what surrounds the object, and the cost is that of its box.
+    edge = round(ring) + 4
+    y, x = np.nonzero(near)
+    box = np.s_[max(0, y.min() - edge) : y.max() + edge + 1, max(0, x.min() - edge) : x.max() + edge + 1]
+    part = np.ascontiguousarray(trimap[box])
+    found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
+    if found.any() and not found.all():
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+        found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
+    cut = np.zeros_like(near)
+    cut[box] = _largest_part(found)
+    return cut
+
+
+def _agreed_hull(views: Sequence[tuple[Camera, BoolArray]], points: FloatArray) -> tuple[FloatArray, float]:
+    """Middles (N, 3) of the cells that all masks but a few show as object, and the edge of a cell."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.3 * float((high - low).max())
+    low, high = low - (margin, margin, 0.0), high + margin
+    cell = float((high - low).max()) / _CELLS
+    axes = [np.arange(a + cell / 2, b, cell) for a, b in zip(low, high, strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    most = max(1, round(_DISSENT * len(views)))
+    misses = np.zeros(len(cells), dtype=np.int64)
+    seen = np.zeros(len(cells), dtype=np.int64)
+    for camera, mask in views:
+        left = np.flatnonzero(misses <= most)
+        pixels, _ = camera.project(cells[left])
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        x, y = pixels[inside].astype(np.intp).T
+        seen[left[inside]] += 1
+        misses[left[inside]] += ~mask[y, x]
+    return cells[(misses <= most) & (seen > len(views) // 4)], cell
+
+
+def _silhouette(cells: FloatArray, cell: float, camera: Camera) -> BoolArray:
+    """The pixels that cells with an edge of ``cell`` cover, shape (H, W)."""
+    shown = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    pixels, depths = camera.project(cells)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    if not inside.any():
+        return shown > 0
+    x, y = pixels[inside].astype(np.intp).T
+    shown[y, x] = 1
+    # Middles of cells lie apart by an edge at most, and half an edge inside of the outline.
+    edge = cell * camera.fx / float(np.median(depths[inside]))
+    return ~_grown(~_grown(shown, edge), edge / 2)
+
+
+def _reduced(photo: Photo) -> tuple[Camera, ByteImage, BoolArray]:
+    """Camera, BGR picture (H, W, 3) and mask (H, W) of a photo in the size for GrabCut; without a mask, none of it."""
+    scale = min(1.0, _WORK_EDGE / max(photo.camera.width, photo.camera.height))
+    rgb, mask = photo.picture(scale)
+    bgr = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
+    height, width = bgr.shape[:2]
+    return photo.camera.resized(width, height), bgr, np.zeros((height, width), bool) if mask is None else mask >= 0.5
+
+
+def _enlarged(mask: BoolArray, camera: Camera) -> BoolArray:
+    """A mask in the size of the camera."""
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
+    return np.asarray(cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC) >= 0.5)
 
 
 def _grown(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:

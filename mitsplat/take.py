@@ -18,7 +18,7 @@ from mitsplat.capture import Capture, Photo
 from mitsplat.capture_sheet import capture_sheet
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
-from mitsplat.photo_masks import MaskMaker, add_masks, geometric_masks, given_masks, model_masks, object_points
+from mitsplat.photo_masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
 from mitsplat.photos import Prepared, Progress, find_photos, prepare_photos, undistort
 from mitsplat.poses import read_poses
 from mitsplat.sfm import MIN_AGREEMENT, MIN_POINTS, Model, find_cameras
@@ -292,18 +292,20 @@ def _masked(
     out: Path,
     progress: Progress | None,
 ) -> Capture:
-    points = None
-    make: MaskMaker
+    mask_folder = out / "masks"
     if settings.masks is not None:
-        make = given_masks(settings.masks, {photo.name: photo for photo in prepared})
-    elif settings.mask_model is not None:
-        make = model_masks(settings.mask_model)
-    elif not anchor.table:
+        made = {photo.name: photo for photo in prepared}
+        return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
+    if settings.mask_model is not None:
+        return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
+    if not anchor.table:
         raise InputError(
             "no table was found under the object to cut it out by: give masks (--masks or --mask-model), put it on "
             "something with texture, or capture it as an environment (--kind environment)"
         )
-    else:
-        points = object_points(capture)
-        make = geometric_masks(points)
-    return add_masks(capture, make, out / "masks", progress=progress, points=points)
+    points = object_points(capture)
+    masked = add_masks(capture, geometric_masks(points), mask_folder, progress=progress, points=points)
+    if len(masked.photos) < MIN_PHOTOS:
+        return masked
+    # What a photo was rejected for may be what the others set right.
+    return add_masks(capture, agreed_masks(masked, points), mask_folder, progress=progress, points=points)

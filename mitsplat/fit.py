@@ -59,7 +59,8 @@ class FitSettings:
         opacity_weight: Weight of the mean opacity. MCMC's authors have 0.01 in fits ten times as long; in short ones it
             leaves surfaces that are seen through.
         scale_weight: Weight of the mean scale in units of the cameras' extent.
-        exposure: Whether every photo has an affine colour correction of its own (3 x 4).
+        exposure: Whether every photo has an affine colour correction of its own (3 x 4). Their mean stays the identity,
+            because photos alone do not say whether splats are bright or corrections are.
         coarse: Share of the fit that sees pictures of half the size.
         refine_every: Steps between moves of dead Gaussians and additions of new ones.
         rate_means: Learning rate at the start in units of the cameras' extent; falls to a hundredth exponentially.
@@ -249,7 +250,7 @@ class _Fit:
         self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
         self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
         self.start = self.model.count
-        self.exposure = Adam({"exposure": np.tile(np.eye(3, 4), (len(self.photos), 1, 1))})
+        self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
         self.held_out_psnr: float | None = None
@@ -290,6 +291,7 @@ class _Fit:
         )
         if s.exposure:
             self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
+            self.exposure.values["exposure"] = _centred(self.exposure.values["exposure"], len(self.photos))
         self.steps += 1
         refined = _REFINED[0] <= fraction < _REFINED[1]
         if refined and self.steps % s.refine_every == 0:
@@ -325,7 +327,7 @@ class _Fit:
         target, mask = sight.pixels()
         if s.exposure:
             self.exposure.track()
-            rgb = _exposed(rgb, alpha, self.exposure.values["exposure"], number)
+            rgb = _exposed(rgb, alpha, self.exposure.values["exposure"], number, len(self.photos))
         if s.masks == "ignore":
             rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
         if s.background == "random":
@@ -403,11 +405,20 @@ def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:
     return dr.sum(dr.abs(found - inverse)) * dr.opaque(mi.Float, 1 / dr.width(pixel))
 
 
-def _exposed(rgb: list[Any], alpha: Any, table: Any, number: int) -> list[Any]:
-    """Premultiplied colours after the affine correction of a photo."""
-    base = dr.opaque(mi.UInt32, 12 * number)
-    m = [dr.gather(mi.Float, table, base + i) for i in range(12)]
+def _exposed(rgb: list[Any], alpha: Any, table: Any, number: int, photos: int) -> list[Any]:
+    """Premultiplied colours after the affine correction of a photo; the table has its twelve entries photo by photo."""
+    place = dr.opaque(mi.UInt32, number)
+    m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
     return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
+
+
+def _centred(table: Any, photos: int) -> Any:
+    """The table of corrections, shifted so that their mean is the identity."""
+    entry = dr.arange(mi.UInt32, 12 * photos) // photos
+    mean = dr.block_sum(table, photos) * dr.opaque(mi.Float, 1 / photos)
+    centred = table - dr.gather(mi.Float, mean, entry) + dr.select(entry % 5 == 0, 1, 0)
+    dr.eval(centred)
+    return centred
 
 
 def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:

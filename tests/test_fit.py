@@ -178,12 +178,22 @@ def test_photos_get_the_exposures_that_they_were_taken_with(tmp_path: Path, monk
     def read(state: FitProgress) -> None:
         if state.step == 150:
             with np.load(tmp_path / "fit/checkpoint.npz") as checkpoint:
-                learned.append(checkpoint["exposure.value.exposure"].reshape(-1, 3, 4))
+                learned.append(checkpoint["exposure.value.exposure"].reshape(3, 4, -1).transpose(2, 0, 1))
 
     fit_capture(varied, tmp_path / "fit", settings, progress=read)
     trained = [number for number in range(VIEWS) if number % 8]
     brightness = learned[0][:, :, :3].sum(axis=(1, 2)) + learned[0][:, :, 3].sum(axis=1)
     assert np.corrcoef(brightness, gains[trained, 0])[0, 1] > 0.9
+    # Splats may not become darker while all corrections become brighter.
+    np.testing.assert_allclose(learned[0].mean(axis=0), np.eye(3, 4), atol=1e-5)
+
+
+def test_corrections_are_shifted_to_the_identity_as_their_mean() -> None:
+    ensure_variant()
+    table = np.random.default_rng(2).normal(size=(12, 7)).astype(np.float32)
+    found = np.array(fit._centred(mi.Float(table.ravel()), 7)).reshape(12, 7)
+    np.testing.assert_allclose(found.mean(axis=1).reshape(3, 4), np.eye(3, 4), atol=1e-6)
+    np.testing.assert_allclose(np.diff(found, axis=1), np.diff(table, axis=1), atol=1e-5)
 
 
 def test_fit_keeps_to_its_time_and_ends_at_its_target(capture: Capture, tmp_path: Path) -> None:

@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 import pytest
 import rendered
-from PIL import Image
+from PIL import ExifTags, Image, ImageFilter
 from test_cli import run
 
+from benchmarks.known import photograph
 from mitsplat import poses, sfm, take
 from mitsplat.anchor import fit_similarity
 from mitsplat.camera import Camera
@@ -332,6 +333,59 @@ def test_photos_of_two_things_end_with_status_4(
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
     assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
     assert len(Capture.load(tmp_path / "out").photos) == 8
+
+
+def test_photos_as_they_come_end_in_a_capture(
+    photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One held upright, one sent smaller, one shaken and one cut short, among others."""
+    given, out = tmp_path / "given", tmp_path / "out"
+    given.mkdir()
+    for number in range(8):
+        shutil.copy(photos[0] / f"photo{number:02}.png", given)
+    with Image.open(given / "photo02.png") as image:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 6  # to be shown turned by 90 degrees clockwise
+        image.transpose(Image.Transpose.ROTATE_90).save(given / "photo02.png", exif=exif)
+    with Image.open(given / "photo06.png") as image:
+        image.resize((360, 270), Image.Resampling.BOX).save(given / "photo06.png")
+    with Image.open(given / "photo00.png") as image:
+        image.filter(ImageFilter.GaussianBlur(8)).save(given / "shaken.png")
+        image.save(given / "short.jpg", quality=95)
+    (given / "short.jpg").write_bytes((given / "short.jpg").read_bytes()[:9000])
+    assert run("capture", given, "-o", out, "--square", 0.035, "--kind", "environment") == 0
+    said, err = capsys.readouterr()
+    assert "Traceback" not in err
+    assert "rejected: shaken.png: it is blurred (sharpness " in said
+    assert "rejected: short.jpg: it cannot be read (" in said
+    capture = Capture.load(out)
+    assert set(capture.rejected) == {"shaken.png", "short.jpg"}
+    cameras = {photo.name: photo.camera for photo in capture.photos}
+    assert (cameras["photo02.png"].width, cameras["photo02.png"].height) == rendered.SIZE
+    assert (cameras["photo06.png"].width, cameras["photo06.png"].height) == (360, 270)
+    found, true = (np.array([of[name].centre for name in cameras]) for of in (cameras, photos[1]))
+    assert np.linalg.norm(fit_similarity(found, true)[1], axis=1).max() < 0.01 * 0.26
+
+
+def test_photos_of_another_thing_are_left_out(
+    photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second thing stands on another table, without a board."""
+    given, out = tmp_path / "given", tmp_path / "out"
+    scene = rendered.box_scene(6)
+    del scene["board"]
+    for name in photograph(scene, rendered.cameras(16)[8:14], given, samples=8):
+        (given / name).rename(given / name.replace("photo", "other"))
+    for number in range(8):
+        shutil.copy(photos[0] / f"photo{number:02}.png", given)
+    assert run("capture", given, "-o", out, "--square", 0.035, "--kind", "environment") == 4
+    said, err = capsys.readouterr()
+    assert "only 8 of 14 photos (57%) could be used, 75% are wanted" in err
+    assert "Traceback" not in err
+    capture = Capture.load(out)
+    assert {photo.name for photo in capture.photos} == {f"photo{number:02}.png" for number in range(8)}
+    assert set(capture.rejected) == {f"other{number:02}.png" for number in range(6)}
+    assert "rejected: other00.png: it " in said
 
 
 def test_lenses_of_other_models_are_refused() -> None:

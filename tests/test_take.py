@@ -335,6 +335,7 @@ def test_photos_of_two_things_end_with_status_4(
     assert len(Capture.load(tmp_path / "out").photos) == 8
 
 
+@pytest.mark.slow
 def test_photos_as_they_come_end_in_a_capture(
     photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -367,6 +368,7 @@ def test_photos_as_they_come_end_in_a_capture(
     assert np.linalg.norm(fit_similarity(found, true)[1], axis=1).max() < 0.01 * 0.26
 
 
+@pytest.mark.slow
 def test_photos_of_another_thing_are_left_out(
     photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

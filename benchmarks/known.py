@@ -3,8 +3,8 @@
     python -m benchmarks.known OUT [--views 60] [--width 1200] [--iterations 3000]
 
 The solid, a ball and a box with a pocket, stands on a ChArUco board and is path-traced with sensor noise; ``mitsplat
-asset`` makes an asset of the pictures, which is dropped into a scene and rendered. The exit
-status is 1 if a figure misses what is wanted. OUT keeps the stages of the asset for another run.
+asset`` makes an asset of the pictures, which is dropped into a scene and rendered. The exit status is 1 if a figure
+misses what is wanted. OUT keeps the stages of the asset for another run.
 """
 
 from __future__ import annotations

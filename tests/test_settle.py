@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -169,6 +171,26 @@ def test_seed_and_index_decide_every_byte(stepper, scene_data, write_scene):
     assert json.dumps(settle_layout(scene, 1, cached=False).to_json()["instances"]) != json.dumps(
         json.loads(here)["instances"]
     )
+
+
+def test_simulations_do_not_pile_up(scene_data, write_scene, monkeypatch):
+    """Models that Newton leaves in reference cycles are let go of, however seldom Python collects."""
+    from mitsplat import drop, physics
+    from mitsplat.settle import warp_settings
+
+    models = []
+    build = physics._build_model
+    monkeypatch.setattr(physics, "_build_model", lambda *args: (model := build(*args), models.append(ref(model)))[0])
+    monkeypatch.setattr(drop, "_GARBAGE", 2)
+    gc.disable()
+    try:
+        with warp_settings():
+            made = drop.Drop(load_scene(write_scene(scene_data)), lambda text: None)
+            for number in range(4):
+                made._world((0, 1)[: 1 + number % 2], (0.5, 0.5), 1.0)
+    finally:
+        gc.enable()
+    assert [model() is None for model in models] == [True, True, True, False]
 
 
 def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):

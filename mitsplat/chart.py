@@ -102,6 +102,7 @@ def measure_steps(
     *,
     frames: int = 3,
     overrides: Mapping[str, Any] | None = None,
+    allow_outside: bool = False,
     note: Note | None = None,
 ) -> list[Row]:
     """Measure steps against the preset ``exact``.
@@ -111,6 +112,7 @@ def measure_steps(
         steps: What to measure; all that apply to the file by default.
         frames: Pictures to compare, spread evenly over the scene's.
         overrides: Changes to the scene file by key, such as ``output.width``.
+        allow_outside: Whether the scene may name files outside of its folder.
         note: Hears (steps done, steps, name of the next).
 
     Raises:
@@ -129,7 +131,7 @@ def measure_steps(
     for i, step in enumerate(plan):
         if note is not None:
             note(i, len(plan), step.name)
-        shots = _run_alone(path, step, frames, {**(overrides or {}), **step.overrides})
+        shots = _run_alone(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
         truth = truth or shots
         rows[step.name] = _compare(step.name, shots, truth)
     return [rows[step.name] for step in steps]
@@ -148,14 +150,20 @@ def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
 
 
 def choose_preset(
-    path: str | Path, tolerance: float, *, overrides: Mapping[str, Any] | None = None, note: Note | None = None
+    path: str | Path,
+    tolerance: float,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    allow_outside: bool = False,
+    note: Note | None = None,
 ) -> Row:
-    """The cheapest preset for a scene, from two of its frames.
+    """The cheapest preset for a scene, from two of its frames; see :func:`measure_steps`.
 
     Raises:
         InputError: If the tolerance is negative, or the scene file is not as it should be.
     """
-    rows = measure_steps(path, STEPS[: len(PRESETS)], frames=2, overrides=overrides, note=note)
+    steps = STEPS[: len(PRESETS)]
+    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, note=note)
     return cheapest(rows, tolerance)
 
 
@@ -163,21 +171,22 @@ def _is_splats(path: Path) -> bool:
     return path.suffix.lower() not in (".yaml", ".yml")
 
 
-def _run_alone(path: Path, step: Step, frames: int, overrides: Mapping[str, Any]) -> _Shots:
+def _run_alone(path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool) -> _Shots:
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
-            return pool.submit(_shoot, path, step.quality, frames, dict(overrides)).result()
+            return pool.submit(_shoot, path, step.quality, frames, dict(overrides), allow_outside).result()
         except BrokenProcessPool as error:
             raise MissingResourceError(f"{path}: the process of '{step.name}' died; is there enough memory?") from error
 
 
-def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any]) -> _Shots:
+def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool) -> _Shots:
     """Make the pictures; the first one twice, because it compiles or loads kernels."""
     if quality is None:
         shoot = _volprim_shooter(path, frames, overrides)
+    elif _is_splats(path):
+        shoot = _splats_shooter(path, quality, frames, overrides)
     else:
-        shooter = _splats_shooter if _is_splats(path) else _scene_shooter
-        shoot = shooter(path, quality, frames, overrides)
+        shoot = _scene_shooter(path, quality, frames, overrides, allow_outside)
     shots = [shoot(i) for i in (0, *range(frames))][1:]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return _Shots(
@@ -191,12 +200,14 @@ def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str
 Shot = tuple[npt.NDArray[np.float32], npt.NDArray[np.uint16], float]
 
 
-def _scene_shooter(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+def _scene_shooter(
+    path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
+) -> Callable[[int], Shot]:
     from mitsplat.colour import encode_srgb
     from mitsplat.frame import render_frame
     from mitsplat.scene import load_scene
 
-    scene = load_scene(path, overrides=overrides)
+    scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
     drawn = scene.spec.rendering
     quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings)
     indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)

@@ -17,6 +17,7 @@ import typer.core
 import typer.main
 from conftest import WriteScene, box_asset
 from PIL import Image, ImageSequence
+from ruamel.yaml import YAML
 
 from mitsplat import bake, chart, dataset, fit, frame, pipeline, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
@@ -108,6 +109,32 @@ def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_d
     assert write_dataset.kwargs == {
         "frames": None, "shard": None, "workers": None, "cluster": None, "overwrite": False,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", [("chart",), ("render", "--tolerance", "0.02")])
+def test_presets_are_measured_on_a_scene_with_files_outside_only_if_allowed(
+    command: tuple[str, ...],
+    scene_data: dict[str, Any],
+    write_scene: WriteScene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def load(path: Path, step: chart.Step, frames: int, overrides: Any, allow_outside: bool) -> None:
+        chart._scene_shooter(path, step.quality or chart.PRESETS["fast"], frames, overrides, allow_outside)
+        raise InputError("loaded")
+
+    write_scene(scene_data)
+    (tmp_path / "inner").mkdir()
+    inner = tmp_path / "inner" / "scene.yaml"
+    asset = (tmp_path / scene_data["objects"][0]["asset"]).resolve()
+    YAML(typ="safe", pure=True).dump(scene_data | {"objects": [{"asset": str(asset)}]}, inner)
+    monkeypatch.setattr(chart, "_run_alone", load)
+    out = "-o", tmp_path / "chart.png"
+    assert run(command[0], inner, *command[1:], *out) == 2
+    assert "must be inside the scene's folder" in capsys.readouterr().err
+    assert run(command[0], inner, *command[1:], *out, "--allow-outside") == 2
+    assert "loaded" in capsys.readouterr().err
 
 
 def test_render_chooses_the_preset_within_a_tolerance(

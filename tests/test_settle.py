@@ -188,9 +188,10 @@ def test_simulations_do_not_pile_up(scene_data, write_scene, monkeypatch):
             made = drop.Drop(load_scene(write_scene(scene_data)), lambda text: None)
             for number in range(4):
                 made._world((0, 1)[: 1 + number % 2], (0.5, 0.5), 1.0)
+        gone = [model() is None for model in models]
     finally:
         gc.enable()
-    assert [model() is None for model in models] == [True, True, True, False]
+    assert gone == [True, True, True, False]
 
 
 def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):

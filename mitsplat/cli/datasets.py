@@ -96,7 +96,7 @@ def render(
             from mitsplat.chart import choose_preset
 
             with progress_bars() as progress:
-                best = choose_preset(scene, tolerance, overrides=overrides, note=progress)
+                best = choose_preset(scene, tolerance, overrides=overrides, allow_outside=allow_outside, note=progress)
             typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
             loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
         with progress_bars() as progress:
@@ -150,6 +150,7 @@ def chart(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Chart to write (.png); a .csv of the same name goes beside it.")
     ] = Path("chart.png"),
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Chart speed against accuracy for SCENE.
 
@@ -163,7 +164,9 @@ def chart(
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
     with progress_bar() as progress:
-        rows = measure_steps(scene, frames=frames, overrides=_overrides(size=size), note=progress)
+        rows = measure_steps(
+            scene, frames=frames, overrides=_overrides(size=size), allow_outside=allow_outside, note=progress
+        )
     best = cheapest(rows, tolerance)
     table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "SSIM", "mask IoU", "peak [GiB]")
     for row in rows:

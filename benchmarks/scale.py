@@ -2,7 +2,7 @@
 
     python -m benchmarks.scale workers [--scene scenes/workcell.yaml] [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale scene [--frames 6] [--size 320x180]
-    python -m benchmarks.scale memory [--frames 2000]
+    python -m benchmarks.scale memory [--frames 2000] [--views 50]
     python -m benchmarks.scale project --seconds 1.55 --bytes 2.5e5 [--settle 3] [--views 12]
 
 ``workers`` also compares the manifests' SHA-256. ``project`` prints a table from figures that the others measured; its
@@ -109,9 +109,10 @@ def measure_scene(frames: int, size: str) -> None:
         print(f"{count:7d}  {count * len(scene.assets[0].splats):9d}  {1 / statistics.median(gaps):.2f}", flush=True)
 
 
-def measure_memory(frames: int) -> None:
+def measure_memory(frames: int, views: int) -> None:
     """Resident memory of one process over many small frames, and its slope by least squares after a quarter of them."""
-    text = SCENE.replace("layouts: 3, views: 5", f"layouts: {-(-frames // 50)}, views: 50").replace(
+    layouts = -(-frames // views)
+    text = SCENE.replace("layouts: 3, views: 5", f"layouts: {layouts}, views: {views}").replace(
         "yolo, coco, exr", "yolo"
     )
     page = os.sysconf("SC_PAGE_SIZE") / 2**20
@@ -127,7 +128,6 @@ def measure_memory(frames: int) -> None:
         write_dataset(load_scene(path, allow_outside=True), Path(folder) / "out", frames=frames, progress=hear)
     kept = np.array(rows[len(rows) // 4 :])
     slope = float(np.polyfit(kept[:, 0], kept[:, 1], 1)[0])
-    layouts = -(-frames // 50)
     print(
         f"{frames} frames of 64x48, {layouts} layouts: {1024 * slope:.1f} KiB a frame, from frame {kept[0, 0]:.0f} on"
     )
@@ -162,16 +162,16 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.55)
     parser.add_argument("--bytes", type=float, default=2.5e5)
     parser.add_argument("--settle", type=float, default=3.0)
-    parser.add_argument("--views", type=int, default=12)
+    parser.add_argument("--views", type=int)
     options = parser.parse_args()
     if options.what == "workers":
         measure_workers(options.scene, options.workers, options.frames or 12, options.size)
     elif options.what == "scene":
         measure_scene(options.frames or 6, options.size)
     elif options.what == "memory":
-        measure_memory(options.frames or 2000)
+        measure_memory(options.frames or 2000, options.views or 50)
     else:
-        project(options.seconds, options.bytes, options.settle, options.views)
+        project(options.seconds, options.bytes, options.settle, options.views or 12)
 
 
 if __name__ == "__main__":

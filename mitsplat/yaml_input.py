@@ -15,6 +15,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq, TaggedScalar
 from ruamel.yaml.constructor import DuplicateKeyError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.scanner import RoundTripScanner
 
 from mitsplat.errors import InputError
 
@@ -62,6 +63,16 @@ class FieldError(ValueError):
     def __init__(self, key: str | KeyPath, rule: str) -> None:
         super().__init__(rule)
         self.key: KeyPath = (key,) if isinstance(key, str) else key
+
+
+class _Scanner(RoundTripScanner):
+    """Ends at what nests too deep, on which it otherwise spends time with the square of the depth."""
+
+    def fetch_flow_collection_start(self, *args: Any, **kwargs: Any) -> None:
+        """Begin a list or mapping in brackets."""
+        if len(self.flow_context) > MAX_DEPTH:
+            raise RecursionError
+        super().fetch_flow_collection_start(*args, **kwargs)
 
 
 class _Finding(NamedTuple):
@@ -120,7 +131,9 @@ def _parse(path: Path) -> CommentedMap:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: must be UTF-8 text ({error.reason} at byte {error.start})") from None
     try:
-        tree = YAML(typ="rt", pure=True).load(text)
+        reader = YAML(typ="rt", pure=True)
+        reader.Scanner = _Scanner
+        tree = reader.load(text)
     except DuplicateKeyError as error:
         line = None if error.problem_mark is None else error.problem_mark.line + 1
         problem = str(error.problem).partition(" with value")[0]

@@ -4,6 +4,7 @@ import gzip
 import os
 import resource
 import struct
+import time
 import zipfile
 
 import pytest
@@ -54,6 +55,16 @@ class TestScenes:
         (tmp_path / "nut/asset.yaml").write_text(text.replace("splats.ply", "../secret.ply"))
         with pytest.raises(InputError, match=r"asset\.yaml:\d+: splats: must be a file inside .*nut \(got \.\./secret"):
             Asset.load(tmp_path / "nut")
+
+    @pytest.mark.parametrize("opening", ["[", "{", "[ ", "- "])
+    def test_deep_nesting_takes_no_time(self, tmp_path, opening):
+        """It would take ruamel.yaml a time with the square of the depth, 6 s for 2,000 brackets."""
+        path = tmp_path / "scene.yaml"
+        path.write_text(opening * 2000)
+        begun = time.process_time()
+        with pytest.raises(InputError, match="must not nest deeper than 32 levels"):
+            load_scene(path)
+        assert time.process_time() - begun < 1
 
     def test_aliases_do_not_multiply(self, tmp_path):
         """The billion laughs: ten levels of ten aliases each."""

@@ -73,11 +73,14 @@ def command(tmp_path, *args, seconds=0.05):
     return [sys.executable, str(script), "render", *map(str, args)]
 
 
-def start(tmp_path, scene, out, *options):
+def start(tmp_path, scene, out, *options, seconds=0.05):
     """The command line on synthetic frames, in a session of its own, as from a terminal."""
     with (tmp_path / "said").open("w") as said:
         return subprocess.Popen(
-            command(tmp_path, scene.path, "-o", out, *options), stdout=said, stderr=said, start_new_session=True
+            command(tmp_path, scene.path, "-o", out, *options, seconds=seconds),
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
         )
 
 
@@ -113,7 +116,7 @@ def test_killed_at_random_moments(scene, tmp_path, undisturbed):
 def test_interrupted(scene, tmp_path, undisturbed):
     """Ctrl-C, which goes to all processes of a terminal, stops at once with status 130 and leaves nothing half done."""
     out = tmp_path / "out"
-    process = start(tmp_path, scene, out, "--workers", 2)
+    process = start(tmp_path, scene, out, "--workers", 2, seconds=0.5)  # not finished before the signal
     wait_for_frames(process, out, 3)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=60) == 130

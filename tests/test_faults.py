@@ -81,6 +81,8 @@ def start(tmp_path, scene, out, *options, seconds=0.05):
             stdout=said,
             stderr=said,
             start_new_session=True,
+            # Who starts the tests in the background has them, and what they start, ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
 
 

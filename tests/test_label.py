@@ -290,7 +290,8 @@ class TestOutline:
             assert not (labelled & ~exact).any()
             if parts == 1:
                 np.testing.assert_array_equal(exact, labelled)
-            assert np.count_nonzero(back ^ exact) <= ROUNDED
+            # Of more than a hundred specks, each bridge has two long diagonals more.
+            assert np.count_nonzero(back ^ exact) <= max(ROUNDED, parts // 16)
             np.testing.assert_allclose(box, entry.box, atol=0.03)
 
     @settings(max_examples=30, deadline=None)

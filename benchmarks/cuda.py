@@ -45,8 +45,9 @@ def time_ours(splats: Splats) -> None:
     """Print the time of binning and march, per preset."""
     from mitsplat.plugins.gaussian import upload_cloud
     from mitsplat.plugins.march import march
+    from mitsplat.plugins.project import Placement, merge_clouds
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.plugins.tiles import Placement, TileLists, bin_gaussians, merge_clouds
+    from mitsplat.plugins.tiles import TileLists, bin_gaussians
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
     camera = view_of(make_sensor(CAMERA))

@@ -48,8 +48,9 @@ def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, flo
     """Seconds of projecting, binning and sorting, seconds of the march, and pairs of a Gaussian and a tile."""
     from mitsplat.plugins.gaussian import upload_cloud
     from mitsplat.plugins.march import march
+    from mitsplat.plugins.project import Placement, merge_clouds
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.plugins.tiles import Placement, bin_gaussians, merge_clouds
+    from mitsplat.plugins.tiles import bin_gaussians
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
     view = view_of(make_sensor(camera)).sampled(quality.samples)

@@ -173,11 +173,18 @@ def _starts(points: FloatArray, samples: FloatArray) -> list[FloatArray]:
     return starts
 
 
+def _matched(
+    surface: Surface, points: FloatArray, matrix: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+    """Moved points, what is nearest to them on the surface and its normals, and which are near enough to count."""
+    moved = _moved(points, matrix)
+    nearest, normal, distance = surface.nearest(moved)
+    return moved, nearest, normal, distance <= np.quantile(distance, _TRIM)
+
+
 def _procrustes_steps(surface: Surface, points: FloatArray, matrix: FloatArray, steps: int) -> FloatArray:
     for _ in range(steps):
-        moved = _moved(points, matrix)
-        nearest, _, distance = surface.nearest(moved)
-        near = distance <= np.quantile(distance, _TRIM)
+        moved, nearest, _, near = _matched(surface, points, matrix)
         step, *_ = trimesh.registration.procrustes(moved[near], nearest[near], reflection=False)
         matrix = step @ matrix
     return matrix
@@ -186,9 +193,7 @@ def _procrustes_steps(surface: Surface, points: FloatArray, matrix: FloatArray, 
 def _plane_steps(surface: Surface, points: FloatArray, matrix: FloatArray, steps: int) -> FloatArray:
     """Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t."""
     for _ in range(steps):
-        moved = _moved(points, matrix)
-        nearest, normal, distance = surface.nearest(moved)
-        near = distance <= np.quantile(distance, _TRIM)
+        moved, nearest, normal, near = _matched(surface, points, matrix)
         middle = moved.mean(axis=0)
         arm, normal, gap = (moved - middle)[near], normal[near], (nearest - moved)[near]
         size = float(np.linalg.norm(arm, axis=1).mean())

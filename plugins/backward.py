@@ -20,8 +20,9 @@ import mitsuba as mi
 
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.plugins.march import Lanes, march
+from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
-from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians
+from mitsplat.plugins.tiles import TileLists, bin_gaussians
 from mitsplat.quality import KERNELS, Quality
 
 LN_2 = 0.6931471805599453

@@ -15,8 +15,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.gaussian import RECORD
+from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
-from mitsplat.plugins.tiles import CloudSet, CrowdedError, Placement, TileLists, bin_gaussians
+from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians
 from mitsplat.quality import KERNELS, Quality
 
 SORT_SLOTS = 8

@@ -19,11 +19,12 @@ from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, trace
+from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.still import StillLayer
-from mitsplat.plugins.tiles import CloudSet, CrowdedError, Placement, merge_clouds
+from mitsplat.plugins.tiles import CrowdedError
 from mitsplat.quality import Quality, resolve_quality
 
 AOVS = (

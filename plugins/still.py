@@ -15,8 +15,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.march import Image, Lanes, march
+from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import View
-from mitsplat.plugins.tiles import CloudSet, Placement, TileLists, bin_gaussians, merge_lists
+from mitsplat.plugins.tiles import TileLists, bin_gaussians, merge_lists
 from mitsplat.quality import Quality
 
 

@@ -1,7 +1,7 @@
 """From clouds of Gaussians to depth-sorted lists per image tile, all on the device.
 
 1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
-2. *Project* what is left to view records (one kernel).
+2. *Project* what is left to view records (one kernel), see :mod:`mitsplat.plugins.project`.
 3. *Pair* each with the tiles that its cut-off ellipse really meets: the ellipse cuts a span out of every row of tiles.
 4. *Sort* the pairs by tile and by depth there. For the order per tile that is the peak's depth along the tile's ray
    nearest to the Gaussian's centre; for the order per ray it is a lower bound over all rays of the tile, which says
@@ -19,80 +19,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import MissingResourceError
-from mitsplat.plugins.device import wrapped
-from mitsplat.plugins.gaussian import (
-    LOG2_E_HALF,
-    RECORD,
-    Cloud,
-    conic_touches_rectangle,
-    ellipse_bounds,
-    ellipse_span,
-    evaluate_sh,
-    general_response,
-    project_gaussian,
-    rotation_axes,
-)
+from mitsplat.plugins.gaussian import RECORD, conic_touches_rectangle, ellipse_span
+from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import View
-from mitsplat.quality import KERNELS, Quality
-
-PLACEMENT = 32
-"""Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
-cloud's frame as a sum of two floats (3 + 3), padding. Two floats keep the difference exact far from the origin."""
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """A cloud in the world.
-
-    Attributes:
-        cloud: Index of the cloud.
-        world_from_cloud: Rotation, translation and uniform scale, shape (4, 4).
-        instance: Instance id; 0 is the environment.
-    """
-
-    cloud: int
-    world_from_cloud: np.ndarray
-    instance: int
-
-
-@dataclass(frozen=True, eq=False)
-class CloudSet:
-    """Several clouds in one set of device arrays, so that one kernel serves every placement of a scene."""
-
-    counts: tuple[int, ...]
-    first: tuple[int, ...]
-    geometry: Any
-    scales: Any
-    sh: Any
-    sh_count: int
-    sh_stride: int
-
-
-def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
-    """Concatenate clouds on the device; SH are padded with zeros to the largest degree present."""
-    counts = tuple(c.count for c in clouds)
-    first = tuple(int(i) for i in np.concatenate([[0], np.cumsum(counts)[:-1]]))
-    if len(clouds) == 1:
-        (c,) = clouds
-        return CloudSet(counts, first, c.geometry, c.scales, c.sh, c.sh_count, c.sh_stride)
-    total = sum(counts)
-    stride = max(c.sh_stride for c in clouds)
-    geometry, scales = dr.empty(mi.Float, 8 * total), dr.empty(mi.Float, 4 * total)
-    sh = dr.zeros(mi.Float, stride * total)
-    for start, c in zip(first, clouds, strict=True):
-        if c.count == 0:
-            continue
-        for target, source, width in ((geometry, c.geometry, 8), (scales, c.scales, 4)):
-            dr.scatter(target, source, dr.arange(mi.UInt32, c.count * width) + start * width)
-        i = dr.arange(mi.UInt32, c.count * c.sh_stride)
-        dr.scatter(sh, c.sh, (i // c.sh_stride + start) * stride + i % c.sh_stride)
-    dr.eval(geometry, scales, sh)
-    return CloudSet(counts, first, geometry, scales, sh, max(c.sh_count for c in clouds), stride)
-
-
-_ADJOINT = dr.ReduceMode.NoConflicts
-"""How gradients are added to a cloud: they are asked for where it is placed once, so each Gaussian has but one sum. The
-default would write the number of Gaussians into the kernels, and compile them anew whenever it changes."""
+from mitsplat.quality import Quality
 
 PAIRS_MAX = 1 << 26
 """Most pairs of a Gaussian and a tile that are held at once, about 40 bytes each."""
@@ -161,11 +91,11 @@ def bin_gaussians(
         CrowdedError: If the view has too many pairs to hold.
     """
     tiles = view.tiles_x * view.tiles_y
-    table, owner, local = _placement_table(clouds, placements, view)
+    table, owner, local = placement_table(clouds, placements, view)
     total = dr.width(local)
     if total == 0:
         return _empty(tiles)
-    source = _Source(clouds, table, view, quality, at_camera)
+    source = Projector(clouds, table, view, quality, at_camera)
 
     visible, near = source.cull(owner, local)
     index = dr.compress(visible)
@@ -228,226 +158,42 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    count = dr.width(tiles)
-    record: list[Any] = []
-    tile: list[Any] = []
-    level: list[Any] = []
     visible = dr.width(first.records) // RECORD
-    for lists, shift in ((first, 0), (second, visible)):
-        start = dr.gather(mi.UInt32, lists.start, tiles)
-        length = dr.gather(mi.UInt32, lists.stop, tiles) - start
-        begin, size = _ranges(length)
-        if size == 0:
-            continue
-        parts = [dr.empty(mi.UInt32, size) for _ in range(3)]
-        offset = dr.opaque(mi.UInt32, shift)
-
-        def one_pair(
-            k: Any, start: Any = start, begin: Any = begin, parts: Any = parts, lists: Any = lists, offset: Any = offset
-        ) -> tuple[Any]:
-            entry, at = start + k, begin + k
-            dr.scatter(parts[0], dr.gather(mi.UInt32, lists.entries, entry) + offset, at, mode=dr.ReduceMode.Permute)
-            dr.scatter(parts[1], dr.arange(mi.UInt32, count), at, mode=dr.ReduceMode.Permute)
-            dr.scatter(parts[2], dr.gather(mi.UInt32, lists.levels, entry), at, mode=dr.ReduceMode.Permute)
-            return (k + 1,)
-
-        dr.while_loop((dr.zeros(mi.UInt32, count),), lambda k, length=length: k < length, one_pair, label="merge")
-        dr.eval(parts)
-        for whole, part in zip((record, tile, level), parts, strict=True):
-            whole.append(part)
-    pairs = _Pairs(dr.concat(record), dr.concat(tile), dr.concat(level), None)
+    both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
+    record, place, level = (dr.concat(parts) for parts in zip(*both, strict=True))
+    pairs = _Pairs(record, place, level, None)
     records, near = second.records, second.near
     if near is not None and first.near is not None:
         # The rows of the second follow those of the first.
-        row, a = dr.arange(mi.UInt32, second.visible) * RECORD, mi.Float(dr.width(first.near) // RECORD)
-        shifted = dr.copy(records)
-        dr.scatter(shifted, dr.gather(mi.Float, records, row) + a, row, dr.gather(mi.Float, records, row + 2) < 0)
+        row, before = dr.arange(mi.UInt32, second.visible) * RECORD, dr.opaque(mi.Float, dr.width(first.near) // RECORD)
+        shifted, at_camera = dr.copy(records), dr.gather(mi.Float, records, row + 2) < 0
+        dr.scatter(shifted, dr.gather(mi.Float, records, row) + before, row, at_camera)
         records, near = shifted, dr.concat([first.near, near])
     records = dr.concat([first.records, records])
     near = first.near if near is None else near
-    return _listed(records, near, pairs, visible + second.visible, count, view, None, tiles)
+    return _listed(records, near, pairs, visible + second.visible, dr.width(tiles), view, None, tiles)
 
 
-def _placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
-    """Placement rows on the device, and for every Gaussian of every placement its row and its number in the clouds."""
-    rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
-    counts = [clouds.counts[p.cloud] for p in placements]
-    for row, placement in zip(rows, placements, strict=False):
-        matrix = np.asarray(placement.world_from_cloud, dtype=np.float64)
-        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-        camera_from_cloud = view.world_from_camera[:3, :3].T @ (matrix[:3, :3] / scale)
-        centre = np.linalg.solve(matrix[:3, :3], view.world_from_camera[:3, 3] - matrix[:3, 3])
-        coarse = centre.astype(np.float32)
-        row[:9] = camera_from_cloud.ravel()
-        row[9] = scale
-        row[10] = placement.instance
-        row[12:15] = coarse
-        row[16:19] = centre - coarse
-    total = int(sum(counts))
-    if len(placements) == 1:
-        local = dr.arange(mi.UInt32, total) + dr.opaque(mi.UInt32, clouds.first[placements[0].cloud])
-        return wrapped(mi.Float, rows), dr.zeros(mi.UInt32, total), local
-    ends = np.cumsum(counts)
-    begins = ends - counts
-    number = dr.arange(mi.UInt32, total)
-    owner = dr.zeros(mi.UInt32, total)
-    shift = np.array([clouds.first[p.cloud] for p in placements], dtype=np.int64) - begins
-    marks = dr.zeros(mi.UInt32, total)
-    inner = [int(b) for b, n in zip(begins, counts, strict=True) if 0 < b < total and n]
-    if inner:
-        # Placements without Gaussians share a start with the next one: count each start as often as it occurs.
-        starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
-        dr.scatter(marks, mi.UInt32(repeats.astype(np.uint32)), mi.UInt32(starts.astype(np.uint32)))
-        owner = dr.cumsum(marks)
-    offsets = wrapped(mi.Int32, shift.astype(np.int32))
-    local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, offsets, owner))
-    dr.eval(owner, local)
-    return wrapped(mi.Float, rows), owner, local
+def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:
+    """Records (counted from ``shift``), places in ``tiles``, and levels of the entries of some tiles; None if none."""
+    start = dr.gather(mi.UInt32, lists.start, tiles)
+    length = dr.gather(mi.UInt32, lists.stop, tiles) - start
+    begin, size = _ranges(length)
+    if size == 0:
+        return None
+    number, place, level = (dr.empty(mi.UInt32, size) for _ in range(3))
+    offset, own = dr.opaque(mi.UInt32, shift), dr.arange(mi.UInt32, dr.width(tiles))
 
+    def one_pair(k: Any) -> tuple[Any]:
+        entry, at = start + k, begin + k
+        dr.scatter(number, dr.gather(mi.UInt32, lists.entries, entry) + offset, at, mode=dr.ReduceMode.Permute)
+        dr.scatter(place, own, at, mode=dr.ReduceMode.Permute)
+        dr.scatter(level, dr.gather(mi.UInt32, lists.levels, entry), at, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
 
-class _Source:
-    """Gaussians of placements as the projection kernels read them."""
-
-    def __init__(self, clouds: CloudSet, table: Any, view: View, quality: Quality, at_camera: bool) -> None:
-        self.clouds, self.table, self.view, self.quality, self.at_camera = clouds, table, view, quality, at_camera
-        self.cut = dr.opaque(mi.Float, quality.alpha_min)
-
-    def load(self, owner: Any, local: Any) -> dict[str, Any]:
-        row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PLACEMENT, dr.width(owner)))
-        packet = dr.gather(mi.ArrayXf, self.clouds.geometry, local, mode=_ADJOINT, shape=(8, dr.width(local)))
-        sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, mode=_ADJOINT, shape=(4, dr.width(local)))
-        mean = mi.Vector3f(*[packet[i] - row[12 + i] - row[16 + i] for i in range(3)])
-        return {
-            "mean": mean,
-            "axes": rotation_axes([packet[4 + i] for i in range(4)]),
-            "sigma": [sigma[i] for i in range(3)],
-            "right": mi.Vector3f(row[0], row[1], row[2]),
-            "down": mi.Vector3f(row[3], row[4], row[5]),
-            "forward": mi.Vector3f(row[6], row[7], row[8]),
-            "scale": row[9],
-        } | {"opacity": packet[3], "instance": row[10]}
-
-    def bounds(self, g: dict[str, Any]) -> tuple[Any, ...]:
-        """Response, opacity, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth.
-
-        Gaussians near the plane keep the exact response: a pixel is small against them, and no line of sight central.
-        """
-        view, kernel = self.view, KERNELS[self.quality.kernel]
-        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
-        k = dr.safe_sqrt(2 * dr.log(g["opacity"] / self.cut))
-        reach = [
-            g["scale"]
-            * k
-            * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(g["axes"], g["sigma"], strict=True)]))
-            for v in (g["right"], g["down"], g["forward"])
-        ]
-        centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
-        response, opacity = project_gaussian(**shape), g["opacity"]
-        if kernel.variance > 0:
-            covariance = view.pixel_covariance(response.u0, response.v0, kernel.variance)
-            response, det = response.filtered(*covariance)
-            if kernel.keeps_light:
-                opacity = opacity * dr.rsqrt(det)
-        if self.quality.response == "ewa":
-            response = response.parallel()
-        k2 = 2 * dr.log(opacity / self.cut)
-        du0, du1, dv0, dv1, ellipse = ellipse_bounds(response.cutoff(k2))
-        near = ~ellipse | (centre[2] - reach[2] < view.near_plane)
-        opacity, k2 = dr.select(near, g["opacity"], opacity), dr.select(near, k * k, k2)
-        farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
-
-        # Slopes of the part of the ellipsoid's box beyond the near plane: loose, but only few Gaussians need it.
-        def slopes(axis: int) -> tuple[Any, Any]:
-            lo, hi = centre[axis] - reach[axis], centre[axis] + reach[axis]
-            return (
-                lo / dr.select(lo < 0, view.near_plane, farthest),
-                hi / dr.select(hi > 0, view.near_plane, farthest),
-            )
-
-        (near_u0, near_u1), (near_v0, near_v1) = slopes(0), slopes(1)
-        box = (
-            dr.select(near, near_u0, response.u0 + du0),
-            dr.select(near, near_u1, response.u0 + du1),
-            dr.select(near, near_v0, response.v0 + dv0),
-            dr.select(near, near_v1, response.v0 + dv1),
-        )
-        visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
-        if not self.at_camera:
-            visible &= ~near
-        return response, opacity, k2, near, visible, box, centre[2] - reach[2]
-
-    def cull(self, owner: Any, local: Any) -> tuple[Any, Any]:
-        """Whether Gaussians are in view, and whether they reach the camera's plane."""
-        g = self.load(owner, local)
-        _, _, _, near, visible, box, _ = self.bounds(g)
-        x0, x1, y0, y1 = self.view.tile_box(*box)
-        visible, near = dr.detach(visible & (x1 > x0) & (y1 > y0)), dr.detach(near)
-        dr.eval(visible, near)
-        return visible, near
-
-    def records(self, owner: Any, local: Any, near: Any) -> tuple[Any, Any, Any, Any]:
-        """View records, rows of those at the camera, least depths of the ellipsoids, and boxes of tiles."""
-        count = dr.width(local)
-        g = self.load(owner, local)
-        response, opacity, _, _, _, box, least = self.bounds(g)
-        colour = self.colour(g["mean"], local)
-        order = dr.arange(mi.UInt32, count)
-        near_rows = None
-        near_index = dr.compress(near)
-        near_number = dr.zeros(mi.UInt32, count)
-        if dr.width(near_index) > 0:
-            near_rows = self.near_rows(near_index, owner, local)
-            dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
-        scaled = LOG2_E_HALF
-        record = [
-            dr.select(near, mi.Float(near_number), response.u0),
-            response.v0,
-            dr.select(near, -1.0, response.a * scaled),
-            response.b2 * scaled,
-            response.c * scaled,
-            dr.log2(opacity),
-            *colour,
-            response.depth,
-            response.e,
-            response.f,
-            response.g,
-            response.h,
-            response.i,
-            g["instance"],
-        ]
-        records, tile_box = dr.empty(mi.Float, RECORD * count), dr.empty(mi.UInt32, 4 * count)
-        dr.scatter(records, mi.ArrayXf(record), order)
-        x0, x1, y0, y1 = self.view.tile_box(*(dr.detach(side) for side in box))
-        dr.scatter(tile_box, mi.ArrayXu([x0, x1, y0, y1]), order)
-        least = dr.detach(least)
-        dr.eval(records, tile_box, least)
-        return records, near_rows, least, tile_box
-
-    def near_rows(self, index: Any, owner: Any, local: Any) -> Any:
-        """General responses of Gaussians at the camera's plane."""
-        count = dr.width(index)
-        g = self.load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
-        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
-        c = [dr.detach(v) for v in general_response(**shape)]
-        rows = dr.empty(mi.Float, RECORD * count)
-        row = [*[x * LOG2_E_HALF for x in c[:6]], *c[6:], mi.Float(0)]
-        dr.scatter(rows, mi.ArrayXf(row), dr.arange(mi.UInt32, count))
-        dr.eval(rows)
-        return rows
-
-    def colour(self, mean: Any, local: Any) -> list[Any]:
-        clouds = self.clouds
-        bands = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
-        floats = -(-3 * bands // 4) * 4
-        base = local * (clouds.sh_stride // 4)
-        packets = [dr.gather(mi.Array4f, clouds.sh, base + j, mode=_ADJOINT) for j in range(floats // 4)]
-
-        def coefficient(k: int) -> list[Any]:
-            return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]
-
-        # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
-        direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
-        return evaluate_sh(direction, coefficient, bands)
+    dr.while_loop((dr.zeros(mi.UInt32, dr.width(tiles)),), lambda k: k < length, one_pair, label="merge")
+    dr.eval(number, place, level)
+    return number, place, level
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from mitsplat.splats import SH_C0, Splats
 CELLS = 80
 """Cells of the grid along its longest side."""
 
-BOUNCE_RAYS = 8
+BOUNCE_RAYS = 4
 """Rays per object pixel, before neighbours are averaged."""
 
 

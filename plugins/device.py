@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import fields
+from typing import Any, TypeVar
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -20,6 +22,15 @@ def wrapped(kind: type, values: np.ndarray) -> Any:
     line = memory[start : start + values.nbytes].view(values.dtype)
     line[...] = values
     return kind(line)
+
+
+Columns = TypeVar("Columns")
+
+
+def gathered(columns: Columns, index: Any) -> Columns:
+    """The rows ``index`` of a dataclass of device arrays; those of one element hold for all rows."""
+    values = [getattr(columns, f.name) for f in fields(columns)]  # type: ignore[arg-type]
+    return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:

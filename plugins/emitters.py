@@ -13,7 +13,7 @@ import numpy as np
 from mitsplat.plugins.device import wrapped
 
 SURVEY_LATTICE = (233, 144)
-OPEN_LATTICE = (144, 89)
+OPEN_LATTICE = (89, 55)
 SKY_LATTICE = (377, 233)
 REFERENCE_LATTICE = (4181, 2584)
 """Points and generator of Fibonacci lattices: consecutive Fibonacci numbers give the best two-dimensional ones

@@ -18,15 +18,17 @@ differ; those get ``FIRST_RAYS``, and as many more as the wanted standard error 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.bounce import RadianceGrid, bounced_light
+from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import Emitters, receiver
-from mitsplat.plugins.light_filter import RADIUS, Estimate, LightFilter
+from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter
 from mitsplat.plugins.proxies import Proxies
 from mitsplat.plugins.rays import View
 
@@ -51,7 +53,7 @@ FIRST_RAYS = 4
 
 @dataclass(eq=False)
 class Surface:
-    """Visible points of all pixels, flat and row-major.
+    """Visible points.
 
     Attributes:
         position, normal: Point [m] and unit normal towards the camera.
@@ -77,11 +79,6 @@ class Surface:
     known: Any
     valid: Any
 
-    def at(self, index: Any) -> Surface:
-        """The points of some pixels."""
-        values = [getattr(self, f.name) for f in fields(self)]
-        return Surface(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
-
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -99,7 +96,7 @@ class Accuracy:
 def light_factor(
     scene: Any,
     proxies: Proxies,
-    surface: Surface,
+    surface: Callable[[Any], Surface],
     group: Any,
     view: View,
     *,
@@ -118,7 +115,7 @@ def light_factor(
     Args:
         scene: Mitsuba scene whose emitters give the light.
         proxies: What can stand in its way.
-        surface: Visible points of an image.
+        surface: Gives the visible points of pixels (UInt32), which are counted row by row.
         group: Instance id per pixel; light is not averaged across its borders.
         view: Camera.
         accuracy: How many rays to spend.
@@ -128,50 +125,59 @@ def light_factor(
         grid: Captured colours of the surroundings, for the light that they reflect to objects; None leaves it out.
     """
     emitters = Emitters(scene, point)
-    tracer = _Tracer(emitters, proxies, surface, view.width, seed)
-    needed = surface.valid & (surface.relit | (surface.specular > 0))
+    everything = surface(dr.arange(mi.UInt32, view.width * view.height))
+    needed = everything.valid & (everything.relit | (everything.specular > 0))
     if accuracy.error > 0:
         rays = min(FIRST_RAYS, accuracy.most)
         enough = dr.opaque(mi.Float, FAINT * accuracy.error * (3 * BLOCK) ** 2)
-        needed = surface.valid & _spread(dr.select(needed, enough, tracer.search()), enough, view)
+        pixel, inside = _block_order(view)
+        met = _Tracer(emitters, proxies, surface(pixel), pixel, view, seed).search(inside)
+        found = dr.zeros(mi.Float, view.width * view.height)
+        dr.scatter(found, met, pixel, inside)
+        needed = everything.valid & _spread(dr.select(needed, enough, found), enough, view)
     else:
         rays = accuracy.most
-        needed = mi.Bool(surface.valid)
+        needed = everything.valid
     dr.eval(needed)
     light, highlight = mi.Color3f(1), mi.Color3f(0)
     index = dr.compress(needed)
     if not dr.width(index):
         return light, highlight
-    estimate = tracer.trace(index, Estimate.nothing(dr.width(surface.valid)), dr.opaque(mi.UInt32, rays))
-    light_filter = LightFilter(surface, group, view, index)
+    here = surface(index)
+    dr.eval(here)
+    light_filter = LightFilter(here, group, view, index)
+    tracer = _Tracer(emitters, proxies, here, index, view, seed)
+    places = _blockwise(light_filter.place, view)
+    estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), dr.opaque(mi.UInt32, rays))
     if rays < accuracy.most:
         wanted = light_filter.rays_for(estimate, accuracy.error)
         # Doubled until enough: pixels with the same number of rays go together, so that no lane waits for another.
         done = rays
         while done < accuracy.most:
-            index_more = dr.gather(mi.UInt32, index, dr.compress(wanted > done))
-            if not dr.width(index_more):
+            places = dr.gather(mi.UInt32, places, dr.compress(dr.gather(mi.Float, wanted, places) > done))
+            if not dr.width(places):
                 break
             extra = min(done, accuracy.most - done)
-            estimate = tracer.trace(index_more, estimate, dr.opaque(mi.UInt32, extra), first=done)
+            estimate = tracer.trace(places, estimate, dr.opaque(mi.UInt32, extra), first=done)
             done += extra
     lit, base, shine = light_filter.smooth(estimate)
     share = dr.select(base > 0, lit / base, 1)
-    here = surface.at(index)
+    shine *= dr.pi / reference
     anew = dr.compress(here.relit)
     if dr.width(anew):
-        own = here.at(anew)
-        relit = emitters.open_irradiance(receiver(own.position, own.normal), mi.Bool(own.valid)) / reference
-        scale = mi.Color3f(dr.full(mi.Float, 1, dr.width(index)))
-        dr.scatter(scale, relit, anew)
-        share *= scale
-    shine *= dr.pi / reference
-    shine -= dr.select(here.relit, share * _mirrored(here), 0)
-    if dr.width(anew) and grid is not None and proxies.static is not None:
-        # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest known.
-        share += tracer.bounce(grid, group, view, index)
-    light = mi.Color3f(dr.full(mi.Float, 1, dr.width(surface.valid)))
-    highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(surface.valid)))
+        own = gathered(here, anew)
+        open_light = emitters.open_irradiance(receiver(own.position, own.normal), own.valid) / reference
+        dr.eval(own, open_light, share, shine)
+        relit = dr.gather(mi.Color3f, share, anew) * open_light
+        dr.scatter(shine, dr.gather(mi.Color3f, shine, anew) - relit * _mirrored(own), anew)
+        if grid is not None and proxies.static is not None:
+            # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
+            # known.
+            pixels = dr.gather(mi.UInt32, index, anew)
+            relit += _Tracer(emitters, proxies, own, pixels, view, seed).bounce(grid, group)
+        dr.scatter(share, relit, anew)
+    light = mi.Color3f(dr.full(mi.Float, 1, dr.width(needed)))
+    highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
     dr.scatter(light, share, index)
     dr.scatter(highlight, shine, index)
     return light, highlight
@@ -188,32 +194,62 @@ def _spread(found: Any, enough: Any, view: View) -> Any:
     return sum((dr.gather(mi.Float, hits, mi.UInt32(mi.Int32(tile) + step)) for step in beside), mi.Float(0)) >= enough
 
 
+def _block_order(view: View) -> tuple[Any, Any]:
+    """Pixels in an order for tracing, and whether they lie in the image.
+
+    Those that share their place in a block take the same point of the low-discrepancy sequence, hence similar rays, and
+    are traced side by side (Keller and Heidrich 2001, "Interleaved Sampling"); but only within squares of BLOCK x BLOCK
+    blocks, so that what is known of their pixels stays in the processor's cache.
+    """
+    square = BLOCK * BLOCK
+    squares_x, squares_y = -(-view.width // square), -(-view.height // square)
+    i = dr.arange(mi.UInt32, squares_x * squares_y * square**2)
+    block, within, number = i % square, i // square % square, i // square**2
+    x = number % squares_x * square + block % BLOCK * BLOCK + within % BLOCK
+    y = number // squares_x * square + block // BLOCK * BLOCK + within // BLOCK
+    inside = (x < view.width) & (y < view.height)
+    return dr.select(inside, y * view.width + x, 0), inside
+
+
+def _blockwise(place: Any, view: View) -> Any:
+    """What an image ``place`` holds, less where it is NOWHERE, in the order of :func:`_block_order`."""
+    pixel, inside = _block_order(view)
+    ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), NOWHERE)
+    return dr.gather(mi.UInt32, ordered, dr.compress(ordered != NOWHERE))
+
+
 @dataclass(frozen=True, eq=False)
 class _Tracer:
-    """Shadow rays from the visible points of an image."""
+    """Rays from visible points.
+
+    Attributes:
+        surface: The points.
+        pixel: Where in the image each of them is.
+    """
 
     emitters: Emitters
     proxies: Proxies
     surface: Surface
-    width: int
+    pixel: Any
+    view: View
     seed: int
 
-    def search(self) -> Any:
-        """1 where one ray towards the light meets a dynamic proxy, else 0."""
+    def search(self, active: Any) -> Any:
+        """1 where one ray from a point towards the light meets a dynamic proxy, else 0."""
         if self.proxies.dynamic is None:
             return mi.Float(0)
         surface = self.surface
-        si = receiver(surface.position, surface.normal)
-        start = self._start(dr.arange(mi.UInt32, dr.width(surface.valid)))
-        beam = self.emitters.sample(si, _sequence(start), surface.valid)
-        active = surface.valid & (dr.sum(beam.irradiance) > 0)
+        beam = self.emitters.sample(
+            receiver(surface.position, surface.normal), _sequence(self._start(self.pixel)), active & surface.valid
+        )
+        active = active & surface.valid & (dr.sum(beam.irradiance) > 0)
         ray = _shadow_ray(_origin(surface), beam, surface.offset)
         return dr.select(self.proxies.dynamic.scene.ray_test(ray, active=active), mi.Float(1), 0)
 
-    def trace(self, index: Any, before: Estimate, rays: Any, *, first: int = 0) -> Estimate:
-        """What ``rays`` more rays add to an estimate at the pixels ``index``, which have had ``first``."""
-        surface = self.surface.at(index)
-        start = self._start(index) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
+    def trace(self, places: Any, before: Estimate, rays: Any, *, first: int = 0) -> Estimate:
+        """What ``rays`` more rays add to an estimate at the points ``places``, which have had ``first``."""
+        surface = gathered(self.surface, places)
+        start = self._start(dr.gather(mi.UInt32, self.pixel, places)) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
         si = receiver(surface.position, surface.normal)
         origin = _origin(surface)
         alpha2 = dr.square(dr.square(surface.roughness))
@@ -235,33 +271,29 @@ class _Tracer:
             squares += dr.square(dr.sum(compared))
             return i + 1, lit, base, shine, squares
 
-        sums = [dr.gather(type(v), v, index) for v in (before.lit, before.base, before.shine, before.squares)]
-        state = dr.zeros(mi.UInt32, dr.width(index)), *sums
+        sums = [dr.gather(type(v), v, places) for v in (before.lit, before.base, before.shine, before.squares)]
+        state = dr.zeros(mi.UInt32, dr.width(places)), *sums
         _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
-        count = dr.gather(mi.Float, before.rays, index) + mi.Float(rays)
-        return before.updated(index, *sums, count)
+        count = dr.gather(mi.Float, before.rays, places) + mi.Float(rays)
+        return before.updated(places, *sums, count)
 
-    def bounce(self, grid: RadianceGrid, group: Any, view: View, index: Any) -> Any:
-        """Irradiance from the surroundings over that of display white (Color3f), at ``index``; zero if not relit."""
-        surface = self.surface
-        pixels = dr.gather(mi.UInt32, index, dr.compress(dr.gather(mi.Bool, surface.relit, index)))
-        here = surface.at(pixels)
-        start = self._start(pixels)
+    def bounce(self, grid: RadianceGrid, group: Any) -> Any:
+        """Irradiance (Color3f) from the surroundings over that of display white, averaged over neighbours."""
+        light_filter = LightFilter(self.surface, group, self.view, self.pixel)
+        places = _blockwise(light_filter.place, self.view)
+        here = gathered(self.surface, places)
+        start = self._start(dr.gather(mi.UInt32, self.pixel, places))
         total = bounced_light(
             grid, self.proxies, _origin(here), here.normal, lambda i: _sequence(start + i * (BLOCK * BLOCK))
         )
-        count = dr.width(surface.valid)
-        dr.eval(total)
-        ones = dr.full(mi.Float, 1, dr.width(pixels))
-        smooth = LightFilter(surface, group, view, pixels).average([*total], ones, RADIUS)
-        images = [dr.zeros(mi.Float, count) for _ in range(3)]
-        for image, channel in zip(images, smooth, strict=True):
-            dr.scatter(image, channel, pixels)
-        return mi.Color3f(*[dr.gather(mi.Float, image, index) for image in images])
+        rough = dr.empty(mi.Color3f, dr.width(places))
+        dr.scatter(rough, total, places)
+        dr.eval(rough)
+        return mi.Color3f(*light_filter.average([*rough], dr.full(mi.Float, 1, dr.width(places)), RADIUS))
 
     def _start(self, pixel: Any) -> Any:
         start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
-        return start + _bayer(pixel % self.width, pixel // self.width)
+        return start + _bayer(pixel % self.view.width, pixel // self.view.width)
 
 
 def _origin(surface: Surface) -> Any:

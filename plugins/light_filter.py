@@ -27,9 +27,13 @@ GAIN = 3.0
 over 3 x 3."""
 
 
+NOWHERE = 0xFFFFFFFF
+"""Place of a pixel at which no light was traced."""
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Sums over the shadow rays of every pixel.
+    """Sums over the shadow rays of every point.
 
     Attributes:
         lit, base: Light that arrives and light to compare with (Color3f).
@@ -46,20 +50,15 @@ class Estimate:
 
     @classmethod
     def nothing(cls, count: int) -> Estimate:
-        """No rays yet at ``count`` pixels."""
+        """No rays yet at ``count`` points."""
         lit, base, shine = (dr.zeros(mi.Color3f, count) for _ in range(3))
         return cls(lit, base, shine, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
 
-    def at(self, index: Any) -> Estimate:
-        """The sums of some pixels."""
-        return Estimate(
-            *[dr.gather(type(v), v, index) for v in (self.lit, self.base, self.shine, self.squares, self.rays)]
-        )
-
-    def updated(self, index: Any, *values: Any) -> Estimate:
-        """The estimate with new values at some pixels."""
+    def updated(self, places: Any, *values: Any) -> Estimate:
+        """The estimate with new values at some points."""
+        dr.eval(values)  # else what they were made from would be copied before it is written to
         for old, new in zip((self.lit, self.base, self.shine, self.squares, self.rays), values, strict=True):
-            dr.scatter(old, new, index)
+            dr.scatter(old, new, places)
         dr.eval(self.lit, self.base, self.shine, self.squares, self.rays)
         return self
 
@@ -77,36 +76,34 @@ class LightFilter:
     the known neighbours that show the same thing.
     """
 
-    def __init__(self, surface: Any, group: Any, view: View, index: Any) -> None:
-        """A filter at the pixels ``index`` of an image."""
-        self.view, self.index, self.here = view, index, surface.at(index)
+    def __init__(self, here: Any, group: Any, view: View, index: Any) -> None:
+        """A filter at the pixels ``index`` of an image, which show the points ``here``."""
+        self.view, self.index, self.here = view, index, here
         # What is gathered from neighbours lies together, and holds no more than the pixels in question.
-        self.place = dr.full(mi.UInt32, _NOWHERE, dr.width(group))
+        self.place = dr.full(mi.UInt32, NOWHERE, dr.width(group))
         dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
         self.group = mi.Float(dr.gather(mi.UInt32, group, index))
-        dr.eval(self.here, self.place, self.group)
+        dr.eval(self.place, self.group)
 
     def rays_for(self, estimate: Estimate, error: float) -> Any:
         """Rays per pixel of ``index`` after which the filtered share of light has a standard error of ``error``."""
-        here = estimate.at(self.index)
-        _, variance = self._share(here)
-        return here.rays * variance / (GAIN * error * error)
+        _, variance = self._share(estimate)
+        return estimate.rays * variance / (GAIN * error * error)
 
     def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any]:
         """Light that arrives, light to compare with, and highlight (Color3f) per ray, at the pixels of ``index``."""
-        here = estimate.at(self.index)
-        weight = dr.rcp(dr.maximum(here.rays, 1))
-        values = [c * weight for colour in (here.lit, here.base, here.shine) for c in colour]
-        values = self.average(values, here.rays, RADIUS, self._share(here))
+        weight = dr.rcp(dr.maximum(estimate.rays, 1))
+        values = [c * weight for colour in (estimate.lit, estimate.base, estimate.shine) for c in colour]
+        values = self.average(values, estimate.rays, RADIUS, self._share(estimate))
         return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])
 
-    def _share(self, here: Estimate) -> tuple[Any, Any]:
+    def _share(self, estimate: Estimate) -> tuple[Any, Any]:
         """Share of light that arrives, over 3 x 3 pixels, and its variance."""
-        weight = dr.rcp(dr.maximum(here.rays, 1))
-        values = [dr.sum(here.lit) * weight, dr.sum(here.base) * weight, here.squares * weight]
-        lit, base, squares = self.average(values, here.rays, 1)
+        weight = dr.rcp(dr.maximum(estimate.rays, 1))
+        values = [dr.sum(estimate.lit) * weight, dr.sum(estimate.base) * weight, estimate.squares * weight]
+        lit, base, squares = self.average(values, estimate.rays, 1)
         share = dr.select(base > 0, lit / base, 1)
-        draws = dr.maximum(SMALL * here.rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
+        draws = dr.maximum(SMALL * estimate.rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
         likely = (share * draws + 0.5) / (draws + 1)
         variance = likely * (1 - likely) / draws
         dr.eval(share, variance)
@@ -141,7 +138,7 @@ class LightFilter:
             nx, ny, distance = x + step[0], y + step[1], abs(sum(step))
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
             place = dr.gather(mi.UInt32, self.place, mi.UInt32(ny * view.width + nx), inside)
-            same = inside & (place != _NOWHERE)
+            same = inside & (place != NOWHERE)
             other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
             position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
             group, known, rays = other[6], other[7] > 0, other[8]
@@ -164,7 +161,6 @@ class LightFilter:
         return [own + total / weights for own, total in zip(values, sums, strict=True)]
 
 
-_NOWHERE = 0xFFFFFFFF
 _TRAITS = 12
 
 

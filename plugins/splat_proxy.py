@@ -14,7 +14,7 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import gathered, wrapped
 from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
@@ -231,7 +231,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
         covered = dr.maximum(splat.alpha, 1e-6)
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
-        alpha, depth, instance = splat.alpha, splat.depth, splat.instance
+        alpha, depth, instance, front = splat.alpha, splat.depth, splat.instance, mi.Bool(False)
         if behind:
             front = behind.valid & (splat.alpha < 0.5)
             colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
@@ -240,13 +240,12 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             instance = dr.select(front, 0, instance)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
-            surface = _surface(contents, view, rays, alpha, depth, instance, hit, static)
-            if behind:
-                surface.relit |= front
+            seen = _Seen(rays.d, alpha, depth, instance, front)
+            dr.eval(seen)
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
-                surface,
+                lambda pixel: _surface(contents, view, rays.o, pixel, seen, hit, static),
                 instance,
                 view,
                 accuracy=accuracy,
@@ -407,11 +406,22 @@ def _trace_meshes(scene: Any, view: View, rays: Any) -> _Behind:
     return _Behind(depth, reflectance, valid)
 
 
-def _surface(
-    contents: _Contents, view: View, rays: Any, alpha: Any, depth: Any, instance: Any, hit: Hit, static: Hit
-) -> Surface:
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What pixels show: direction of their rays, opacity, depth, instance, and whether it is a visible mesh."""
+
+    direction: Any
+    alpha: Any
+    depth: Any
+    instance: Any
+    mesh: Any
+
+
+def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen, hit: Hit, static: Hit) -> Surface:
     """Points that light is traced at: on the proxy where it agrees with what is seen, else at the seen depth."""
-    cosine = view.cosine(rays)
+    seen, hit, static = gathered(seen, pixel), gathered(hit, pixel), gathered(static, pixel)
+    ray, depth, instance = mi.Ray3f(eye, seen.direction), seen.depth, seen.instance
+    cosine = view.cosine(ray)
     met = hit.distance < dr.inf
     known = ~met | (hit.instance == instance)
     # What shows through or beside a dynamic object's proxy lies on a static one.
@@ -419,21 +429,21 @@ def _surface(
     same = dr.select(behind, static.distance < dr.inf, met & known)
     proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
     shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
-    towards = mi.Normal3f(-rays.d)
+    towards = mi.Normal3f(-ray.d)
     # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
     on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
     z = dr.select(on_proxy, proxy_depth, depth)
-    position = rays(z / cosine)
-    valid = (alpha > 1 / 255) & (z > 0)
+    position = ray(z / cosine)
+    valid = (seen.alpha > 1 / 255) & (z > 0)
     reach = dr.max(dr.abs(position))
     return Surface(
         position=position,
         normal=mi.Vector3f(dr.select(same, shown[0], towards)),
         face=mi.Vector3f(dr.select(same, shown[1], towards)),
         lift=dr.select(on_proxy, shown[2], 0),
-        to_camera=-rays.d,
+        to_camera=-ray.d,
         offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
-        relit=dr.gather(mi.Bool, contents.relit, instance),
+        relit=dr.gather(mi.Bool, contents.relit, instance) | seen.mesh,
         roughness=dr.gather(mi.Float, contents.roughness, instance),
         specular=dr.gather(mi.Float, contents.specular, instance),
         known=known,

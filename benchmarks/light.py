@@ -64,6 +64,8 @@ class Pictures:
             self.frames.append((mi.load_dict(self.studio.describe(layout, plan.lights)), plan.camera))
 
     def integrator(self, **properties: Any) -> Any:
+        """The scene's own, with some properties changed."""
+        """The scene's own, with some properties changed."""
         return make_integrator(quality=resolve_quality("fast"), **{**light_properties(self.scene), **properties})
 
     def render(self, integrator: Any, seed: int) -> tuple[list[Layers], list[float]]:

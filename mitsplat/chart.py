@@ -55,6 +55,7 @@ STEPS = (
 SPLATS_STEPS = (Step("Mitsuba's volprim_rf_basic", None),)
 LIGHT_STEPS = (
     Step("fast, shadow error 0.1", _FAST, {"composite.shadow_error": 0.1}),
+    Step("fast, shadows of splats", _FAST, {"composite.occluders": "splats"}),
     Step("fast, no bounce", _FAST, {"composite.bounce": False}),
     Step("fast, image shadow", _FAST, {"composite.shadow": "image"}),
     Step("fast, no shadow", _FAST, {"composite.shadow": "none"}),

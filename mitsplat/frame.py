@@ -239,6 +239,7 @@ def light_properties(scene: Scene) -> dict[str, Any]:
     return {
         "shadow": "none" if composite.shadow == "none" else "traced",
         "shadow_error": composite.shadow_error,
+        "occluders": composite.occluders,
         "bounce": composite.bounce,
         "highlight": composite.highlight,
         "reference": list(reference_point(scene)),

@@ -419,6 +419,9 @@ class Composite(StrictModel):
     )
     image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of shadow: image.")
     highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")
+    occluders: Literal["proxies", "splats"] = Field(
+        "proxies", description="What casts traced shadows of objects: their meshes, or the splats of thin, porous ones."
+    )
     bounce: bool = Field(True, description="Whether objects get the light that the environment reflects to them.")
     tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
     sensor: Sensor = Field(Sensor(), description="Noise of the sensor.")

@@ -61,6 +61,7 @@ class Surface:
         lift: Displacement [m] from the triangle to the smooth surface that it stands for.
         to_camera: Unit vector towards the camera.
         offset: How far shadow rays start off the surface [m].
+        instance: Instance id (Float); light is not averaged across its borders.
         relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
         roughness, specular: GGX roughness and reflectance at normal incidence.
         known: Whether the proxy of what is seen says so; else position and normal are a guess.
@@ -73,6 +74,7 @@ class Surface:
     lift: Any
     to_camera: Any
     offset: Any
+    instance: Any
     relit: Any
     roughness: Any
     specular: Any
@@ -97,7 +99,6 @@ def light_factor(
     scene: Any,
     proxies: Proxies,
     surface: Callable[[Any], Surface],
-    group: Any,
     view: View,
     *,
     accuracy: Accuracy,
@@ -116,7 +117,6 @@ def light_factor(
         scene: Mitsuba scene whose emitters give the light.
         proxies: What can stand in its way.
         surface: Gives the visible points of pixels (UInt32), which are counted row by row.
-        group: Instance id per pixel; light is not averaged across its borders.
         view: Camera.
         accuracy: How many rays to spend.
         seed: Offset into the low-discrepancy sequence.
@@ -145,7 +145,7 @@ def light_factor(
         return light, highlight
     here = surface(index)
     dr.eval(here)
-    light_filter = LightFilter(here, group, view, index)
+    light_filter = LightFilter(here, view, index)
     tracer = _Tracer(emitters, proxies, here, index, view, seed)
     places = _blockwise(light_filter.place, view)
     estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), dr.opaque(mi.UInt32, rays))
@@ -174,7 +174,7 @@ def light_factor(
             # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
             # known.
             pixels = dr.gather(mi.UInt32, index, anew)
-            relit += _Tracer(emitters, proxies, own, pixels, view, seed).bounce(grid, group)
+            relit += _Tracer(emitters, proxies, own, pixels, view, seed).bounce(grid)
         dr.scatter(share, relit, anew)
     light = mi.Color3f(dr.full(mi.Float, 1, dr.width(needed)))
     highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
@@ -235,8 +235,8 @@ class _Tracer:
     seed: int
 
     def search(self, active: Any) -> Any:
-        """1 where one ray from a point towards the light meets a dynamic proxy, else 0."""
-        if self.proxies.dynamic is None:
+        """1 where one ray from a point towards the light is stopped by a dynamic object, else 0."""
+        if self.proxies.casting is None:
             return mi.Float(0)
         surface = self.surface
         beam = self.emitters.sample(
@@ -244,24 +244,29 @@ class _Tracer:
         )
         active = active & surface.valid & (dr.sum(beam.irradiance) > 0)
         ray = _shadow_ray(_origin(surface), beam, surface.offset)
-        return dr.select(self.proxies.dynamic.scene.ray_test(ray, active=active), mi.Float(1), 0)
+        stopped = self.proxies.casting.stop(ray, surface.instance, self.pixel, active)
+        return dr.select(stopped, mi.Float(1), 0)
 
     def trace(self, places: Any, before: Estimate, rays: Any, *, first: int = 0) -> Estimate:
         """What ``rays`` more rays add to an estimate at the points ``places``, which have had ``first``."""
         surface = gathered(self.surface, places)
-        start = self._start(dr.gather(mi.UInt32, self.pixel, places)) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
+        pixel = dr.gather(mi.UInt32, self.pixel, places)
+        start = self._start(pixel) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
         si = receiver(surface.position, surface.normal)
         origin = _origin(surface)
         alpha2 = dr.square(dr.square(surface.roughness))
         cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
-        static, dynamic = self.proxies.static, self.proxies.dynamic
+        static, casting = self.proxies.static, self.proxies.casting
 
         def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
-            beam = self.emitters.sample(si, _sequence(start + i * (BLOCK * BLOCK)), surface.valid)
+            number = start + i * (BLOCK * BLOCK)
+            beam = self.emitters.sample(si, _sequence(number), surface.valid)
             active = surface.valid & (dr.sum(beam.irradiance) > 0)
             ray = _shadow_ray(origin, beam, surface.offset)
             blocked = mi.Bool(False) if static is None else static.scene.ray_test(ray, active=active)
-            shadowed = mi.Bool(False) if dynamic is None else dynamic.scene.ray_test(ray, active=active & ~blocked)
+            shadowed = mi.Bool(False)
+            if casting is not None:
+                shadowed = casting.stop(ray, surface.instance, pixel * R2[0] + number, active & ~blocked)
             static_light = dr.select(active & ~blocked, beam.irradiance, 0)
             light = dr.select(shadowed, 0, static_light)
             compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), static_light)
@@ -277,9 +282,9 @@ class _Tracer:
         count = dr.gather(mi.Float, before.rays, places) + mi.Float(rays)
         return before.updated(places, *sums, count)
 
-    def bounce(self, grid: RadianceGrid, group: Any) -> Any:
+    def bounce(self, grid: RadianceGrid) -> Any:
         """Irradiance (Color3f) from the surroundings over that of display white, averaged over neighbours."""
-        light_filter = LightFilter(self.surface, group, self.view, self.pixel)
+        light_filter = LightFilter(self.surface, self.view, self.pixel)
         places = _blockwise(light_filter.place, self.view)
         here = gathered(self.surface, places)
         start = self._start(dr.gather(mi.UInt32, self.pixel, places))

@@ -66,7 +66,7 @@ class Estimate:
 class LightFilter:
     """A separable filter that keeps edges, at those pixels of an image where light was traced.
 
-    A neighbour counts where it belongs to the same ``group``, its normal agrees, it lies in the tangent plane, and its
+    A neighbour counts where it belongs to the same instance, its normal agrees, it lies in the tangent plane, and its
     share of light differs by no more than noise explains, so that a hard shadow keeps its edge while a penumbra becomes
     smooth. A few rays per pixel say too little about that share; both are taken from 3 x 3 pixels. Their noise is that
     of as many binary draws as equal weights would need for the same variance (Kish 1965, section 11.7). Equal sums stay
@@ -76,14 +76,13 @@ class LightFilter:
     the known neighbours that show the same thing.
     """
 
-    def __init__(self, here: Any, group: Any, view: View, index: Any) -> None:
+    def __init__(self, here: Any, view: View, index: Any) -> None:
         """A filter at the pixels ``index`` of an image, which show the points ``here``."""
         self.view, self.index, self.here = view, index, here
         # What is gathered from neighbours lies together, and holds no more than the pixels in question.
-        self.place = dr.full(mi.UInt32, NOWHERE, dr.width(group))
+        self.place = dr.full(mi.UInt32, NOWHERE, view.width * view.height)
         dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
-        self.group = mi.Float(dr.gather(mi.UInt32, group, index))
-        dr.eval(self.place, self.group)
+        dr.eval(self.place)
 
     def rays_for(self, estimate: Estimate, error: float) -> Any:
         """Rays per pixel of ``index`` after which the filtered share of light has a standard error of ``error``."""
@@ -116,7 +115,7 @@ class LightFilter:
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        traits = _packed([*here.position, *here.normal, self.group, known, rays, *(share or (0, 0))])
+        traits = _packed([*here.position, *here.normal, here.instance, known, rays, *(share or (0, 0))])
         steps = [s for r in range(1, radius + 1) for s in (-r, r)]
         for direction in ((1, 0), (0, 1)):
             values = self._average_along(values, traits, [(s * direction[0], s * direction[1]) for s in steps], share)
@@ -141,8 +140,8 @@ class LightFilter:
             same = inside & (place != NOWHERE)
             other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
             position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
-            group, known, rays = other[6], other[7] > 0, other[8]
-            same &= group == self.group
+            instance, known, rays = other[6], other[7] > 0, other[8]
+            same &= instance == here.instance
             plane = dr.abs(dr.dot(here.normal, position - here.position))
             near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * (8 * distance))
             if share is not None:

@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.occlusion import Caster, SplatOccluders
 from mitsplat.surfels import CREASE_ANGLE, corner_normals
 
 NOISE_CREASE = 10.0
@@ -67,10 +68,16 @@ class Hit:
 class Proxies:
     """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones."""
 
-    def __init__(self, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> None:
-        """Proxies from meshes, and visible Mitsuba shapes, which are static."""
+    def __init__(
+        self, occluders: Sequence[Occluder], visible: Sequence[Any] = (), casters: Sequence[Caster] | None = None
+    ) -> None:
+        """Proxies from meshes, and visible Mitsuba shapes, which are static.
+
+        The shadows of what is dynamic are cast by ``casters``, or else by its meshes.
+        """
         self.static = _TraceScene.build([o for o in occluders if not o.dynamic], visible)
         self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic])
+        self.casting = self.dynamic if casters is None else SplatOccluders.build(casters)
 
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
         """What rays meet first, and what they would meet without the dynamic proxies."""
@@ -106,6 +113,10 @@ class _TraceScene:
             dr.select(closer, dr.select(proxy, lift, 0), other.lift),
             dr.select(closer, number, other.instance),
         )
+
+    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+        """Whether rays are stopped."""
+        return self.scene.ray_test(ray, active=active)
 
     def _smooth(self, si: Any, flip: Any, proxy: Any) -> tuple[Any, Any]:
         """Interpolated normal, and the way to the surface that bulges out from a triangle's corners.

@@ -19,6 +19,7 @@ from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, trace
+from mitsplat.plugins.occlusion import Caster
 from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
@@ -114,6 +115,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - |int|
        - Most shadow rays per pixel. (Default: 64)
 
+     * - occluders
+       - |string|
+       - What casts the shadows of dynamic objects: their ``proxies``, or their ``splats``, which thin and porous things
+         need, and which takes longer. (Default: ``proxies``)
+
      * - bounce
        - |bool|
        - Whether uniformly captured objects also get the light that the surroundings reflect. (Default: true)
@@ -158,6 +164,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow = _text(props, "shadow", "traced")
         if self.shadow not in ("traced", "none"):
             raise InputError(f"integrator 'splat_proxy': 'shadow' must be 'traced' or 'none' (got {self.shadow!r})")
+        self.occluders = _text(props, "occluders", "proxies")
+        if self.occluders not in ("proxies", "splats"):
+            raise InputError(
+                f"integrator 'splat_proxy': 'occluders' must be 'proxies' or 'splats' (got {self.occluders!r})"
+            )
         self.shadow_error = _number(props, "shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
             raise InputError(f"integrator 'splat_proxy': 'shadow_error' must be in [0, 1) (got {self.shadow_error!r})")
@@ -246,7 +257,6 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 scene,
                 contents.proxies,
                 lambda pixel: _surface(contents, view, rays.o, pixel, seen, hit, static),
-                instance,
                 view,
                 accuracy=accuracy,
                 seed=seed,
@@ -335,6 +345,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats) for c in carriers if c.proxy is not None
         ]
         size = 1 + max([0, *(c.instance for c in carriers)])
+        casters = None
+        if self.occluders == "splats":
+            casters = [Caster(c.splats, c.instance, c.world_from_splats) for c in carriers if c.dynamic]
         relit, roughness, specular = np.zeros(size, bool), np.full(size, 0.4, np.float32), np.zeros(size, np.float32)
         for c in carriers:
             relit[c.instance], roughness[c.instance], specular[c.instance] = (
@@ -346,7 +359,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             shapes,
             self._upload(distinct),
             placements,
-            Proxies(occluders, visible),
+            Proxies(occluders, visible, casters),
             bool(visible),
             wrapped(mi.Bool, relit),
             wrapped(mi.Float, roughness),
@@ -443,6 +456,7 @@ def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen,
         lift=dr.select(on_proxy, shown[2], 0),
         to_camera=-ray.d,
         offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
+        instance=mi.Float(instance),
         relit=dr.gather(mi.Bool, contents.relit, instance) | seen.mesh,
         roughness=dr.gather(mi.Float, contents.roughness, instance),
         specular=dr.gather(mi.Float, contents.specular, instance),

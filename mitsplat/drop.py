@@ -6,7 +6,7 @@ import gc
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.assets import Asset
 from mitsplat.clearance import Clearance, PlacedSurface, Surface, all_clearances, standoff
+from mitsplat.contacts import ContactFinder
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
-from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, run_to_rest
+from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, all_pieces, run_to_rest
 from mitsplat.place import Item, draw_poses, fixed_pose
 from mitsplat.scene import ENCLOSURE, Scene, bin_walls
 from mitsplat.settle import NOTHING_TO_REST, FloatArray, Instance, Layout, Progress, RestCertificate
@@ -79,6 +80,7 @@ class Drop:
         self._colliders: list[Collider] = []
         self._obstacles: list[PlacedSurface] = []
         walls = self._add_colliders(progress)
+        self._contact_finder = ContactFinder(all_pieces((part.body for part in self._objects), self._colliders))
         self._check_given_poses()
         self._bounds = _enclosure(scene.spec.region, [item.bounds for item in self._obstacles], walls)
         if scene.spec.settle.arrangement == "pile":
@@ -177,7 +179,7 @@ class Drop:
         """The simulation of these assets; the last one is kept."""
         if (assets, frictions, capacity) not in self._worlds:
             settle = self.scene.spec.settle
-            bodies = [replace(self._objects[asset].body, friction=frictions[asset]) for asset in assets]
+            bodies = [self._objects[asset].body.with_friction(frictions[asset]) for asset in assets]
             self._worlds.clear()
             self._made += 1
             if self._made % _GARBAGE == 0:
@@ -185,7 +187,13 @@ class Drop:
             self._worlds[assets, frictions, capacity] = (
                 MujocoWorld(bodies, self._colliders, timestep=settle.timestep)
                 if settle.stepper == "mujoco"
-                else WarpWorld(bodies, self._colliders, timestep=settle.timestep, capacity=capacity)
+                else WarpWorld(
+                    bodies,
+                    self._colliders,
+                    timestep=settle.timestep,
+                    capacity=capacity,
+                    contact_finder=self._contact_finder,
+                )
             )
         return self._worlds[assets, frictions, capacity]
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ from newton.solvers import SolverMuJoCo
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mitsplat.contacts import ContactFinder, newton_hull
 from mitsplat.mesh import MassProperties, join_meshes
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +42,7 @@ _MOTION, _WATCH_TIME = 5e-4, 1.0  # how far no surface may move [m] in how long 
 _CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
 # Spin and roll friction [m], at most these shares of the size: round parts stop, thin ones do not stand on their rim.
 _TORSIONAL, _ROLLING = (5e-3, 0.1), (5e-4, 0.01)
+_WITH_ROLL, _WITHOUT_ROLL = 6, 4  # dimensions of a contact: one across, two of sliding, spin, and two of rolling
 _LEAST_FRICTION = 2e-5  # below it MuJoCo divides by almost nothing
 # Impedance of contacts at their surface and 1 mm deep: at MuJoCo's default of 0.9, a nut that carries a plate of a
 # hundred times its mass sinks by 1 mm. MuJoCo's own contacts, which flicker, come to rest less often when stiffer.
@@ -85,7 +87,13 @@ class Body:
     @cached_property
     def hulls(self) -> list[newton.Mesh]:
         """The pieces for Newton."""
-        return [_newton_hull(piece) for piece in self.pieces]
+        return [newton_hull(piece) for piece in self.pieces]
+
+    def with_friction(self, friction: float) -> Body:
+        """The same body with another friction; what is made of its pieces is made once for both."""
+        body = replace(self, friction=friction)
+        vars(body).update(outline=self.outline, size=self.size, hulls=self.hulls)
+        return body
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +103,14 @@ class Collider:
     friction: float
     pieces: tuple[trimesh.Trimesh, ...] = ()
     box: tuple[tuple[float, float, float], FloatArray] | None = None
+
+
+def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterator[trimesh.Trimesh]:
+    """Convex pieces of all that is simulated."""
+    for body in bodies:
+        yield from body.pieces
+    for collider in colliders:
+        yield from collider.pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,19 +214,26 @@ class WarpWorld(World):
     """
 
     def __init__(
-        self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float, capacity: float
+        self,
+        bodies: Sequence[Body],
+        colliders: Sequence[Collider],
+        *,
+        timestep: float,
+        capacity: float,
+        contact_finder: ContactFinder | None = None,
     ) -> None:
         super().__init__(bodies, timestep=timestep)
         self._timestep = timestep
         model = _build_model(bodies, colliders, _IMPEDANCE_WARP)
-        contacts = max(8, int(capacity * (40 * len(bodies) + model.shape_count)))
+        contacts = max(8, int(capacity * max_contacts(len(bodies), model.shape_count)))
         self._solver = SolverMuJoCo(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
         )
         # Overflow is read from flags: the kernels would print it at every step.
         self._solver.mjw_model.opt.warn_overflow = 0
         # One contact more than the solver takes: the pipeline stops counting when it is full, and flags nothing then.
-        self._pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=contacts + 1)
+        finder = contact_finder or ContactFinder(all_pieces(bodies, colliders))
+        self._pipeline = finder.pipeline(model, max_contacts=contacts + 1)
         self._contacts = self._pipeline.contacts()
         self._states = model.state(), model.state()
         self._control = model.control()
@@ -219,7 +242,6 @@ class WarpWorld(World):
         with wp.ScopedCapture(device="cpu") as capture:
             self._record()
         self._graph = capture.graph
-        self._frictions = np.array(self._solver.mjw_model.geom_friction.numpy())
 
     @property
     def velocities(self) -> FloatArray:
@@ -247,7 +269,7 @@ class WarpWorld(World):
             raise ContactOverflow
 
     def _let_roll(self, rolls: bool) -> None:
-        self._solver.mjw_model.geom_friction.assign(_without_roll(self._frictions) if rolls else self._frictions)
+        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if rolls else _WITH_ROLL)
 
     def _coordinates(self) -> FloatArray:
         return _array(self._states[0].body_q)
@@ -264,7 +286,6 @@ class MujocoWorld(World):
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep = timestep
         self._centres = np.array([body.mass.centre for body in bodies])
-        self._frictions = np.array(self._model.geom_friction)
 
     @property
     def velocities(self) -> FloatArray:
@@ -291,7 +312,7 @@ class MujocoWorld(World):
             raise ContactOverflow
 
     def _let_roll(self, rolls: bool) -> None:
-        self._model.geom_friction[:] = _without_roll(self._frictions) if rolls else self._frictions
+        self._model.geom_condim[:] = _WITHOUT_ROLL if rolls else _WITH_ROLL
 
     def _coordinates(self) -> FloatArray:
         return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]
@@ -374,7 +395,9 @@ def _centres(bodies: Sequence[Body], poses: FloatArray) -> FloatArray:
 def _mean_speeds(bodies: Sequence[Body], before: FloatArray, after: FloatArray, seconds: float) -> tuple[float, float]:
     """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
     way = np.linalg.norm(_centres(bodies, after) - _centres(bodies, before), axis=1)
-    turn = Rotation.from_matrix(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)).magnitude()
+    # Rotations that are an angle t apart differ by a matrix of Frobenius norm 2 sqrt(2) sin(t / 2).
+    apart = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2))
+    turn = 2 * np.arcsin(np.minimum(1.0, apart / np.sqrt(8.0)))
     return float(way.max()) / seconds, float(turn.max()) / seconds
 
 
@@ -385,13 +408,6 @@ def _array(values: Any) -> FloatArray:
 
 def _assign(array: Any, values: FloatArray) -> None:
     array.assign(values.astype(np.float32))
-
-
-def _without_roll(frictions: NDArray[Any]) -> NDArray[Any]:
-    """Slide, spin and roll friction (..., 3) with next to none of the last."""
-    changed = frictions.copy()
-    changed[..., 2] = np.minimum(changed[..., 2], _LEAST_FRICTION)
-    return changed
 
 
 def _surface_motion(bodies: Sequence[Body], before: FloatArray, after: FloatArray) -> float:
@@ -423,6 +439,11 @@ def _coordinates(bodies: Sequence[Body], poses: FloatArray) -> FloatArray:
     return coordinates
 
 
+def max_contacts(bodies: int, shapes: int) -> int:
+    """How many contacts to make room for; most kernels run over all of it. Parts that tumble together fill a half."""
+    return 16 * bodies + shapes
+
+
 def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]) -> newton.Model:
     return _build_scene(bodies, colliders, impedance).finalize(device="cpu")
 
@@ -430,7 +451,7 @@ def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedanc
 def _build_scene(
     bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]
 ) -> newton.ModelBuilder:
-    contact = {"mujoco:condim": 6, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}  # with spin and roll friction
+    contact = {"mujoco:condim": _WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
     builder = newton.ModelBuilder(gravity=_GRAVITY)
     builder.validate_inertia_detailed = True  # in Python: the other way compiles a kernel for 4 s
     SolverMuJoCo.register_custom_attributes(builder)
@@ -442,7 +463,7 @@ def _build_scene(
             hx, hy, hz = np.divide(size, 2).tolist()
             xform = wp.transform(wp.vec3(*pose[:3, 3]), wp.quat(*Rotation.from_matrix(pose[:3, :3]).as_quat()))
             builder.add_shape_box(-1, xform=xform, hx=hx, hy=hy, hz=hz, cfg=config, custom_attributes=contact)
-        _add_hulls(builder, -1, [_newton_hull(piece) for piece in collider.pieces], config, contact)
+        _add_hulls(builder, -1, [newton_hull(piece) for piece in collider.pieces], config, contact)
     for i, place in enumerate(_parking(bodies)):
         body = bodies[i] if i < len(bodies) else None
         mass = bodies[0].mass if body is None else body.mass
@@ -480,7 +501,3 @@ def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeC
         margin=0.0,
         gap=0.0,
     )
-
-
-def _newton_hull(piece: trimesh.Trimesh) -> newton.Mesh:
-    return newton.Mesh(piece.vertices, np.asarray(piece.faces).ravel(), maxhullvert=-1, compute_inertia=False)

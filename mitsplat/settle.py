@@ -216,7 +216,7 @@ def _scene_hash(scene: Scene) -> str:
 
     for name in ("coacd", "mujoco", "mujoco-warp", "newton", "numpy", "scipy", "trimesh", "warp-lang"):
         add(name, version(name))
-    for module in ("clearance", "drop", "mesh", "physics", "place"):
+    for module in ("clearance", "contacts", "drop", "mesh", "physics", "place"):
         digest.update((Path(__file__).parent / f"{module}.py").read_bytes())
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)

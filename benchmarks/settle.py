@@ -5,7 +5,7 @@ faces    faces that a box of 1 : 1 : 0.3 comes to rest on, with both steppers, c
 thin     random drops of a screw, a torus, a mug and a concave bracket, certified
 bin      forty objects poured into a bin
 rest     ten objects, seed after seed: time to rest, and what moves in the five seconds after
-worlds   CPU time of several layouts in one simulation, per layout
+worlds   time of several layouts in one simulation, per layout, on ``--device cpu`` or ``cuda:0``
 share    what settling adds to the images of the shipped workcell at 1280x720 with ten views of each layout
 
 Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless said otherwise.
@@ -20,7 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -30,15 +30,10 @@ from trimesh.creation import annulus, box, cylinder, torus
 
 from mitsplat.assets import Asset
 from mitsplat.errors import InputError
-from mitsplat.frame import render_frame
 from mitsplat.mesh import convex_pieces
 from mitsplat.scene import Scene, load_scene
 from mitsplat.settle import Layout, settle_layout, settle_layouts, warp_settings
 from mitsplat.splats import Splats
-
-if TYPE_CHECKING:
-    from mitsplat.physics import Body, Collider
-    from mitsplat.settle import FloatArray
 
 STEPPERS = ("warp", "mujoco")
 WORKCELL = Path(__file__).resolve().parents[1] / "scenes/workcell.yaml"
@@ -230,8 +225,9 @@ def measure_rest(count: int) -> None:
         )
 
 
-def measure_worlds(count: int) -> None:
-    """The step of :class:`mitsplat.physics.WarpWorld` for several worlds at once, up to ``count``."""
+def measure_worlds(count: int, device: str) -> None:
+    """Layouts of ten objects in one simulation of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device."""
+    from benchmarks.worlds import time_worlds
     from mitsplat.drop import drop_of
 
     scene = make_scene(parts(), 2, "warp")
@@ -239,54 +235,13 @@ def measure_worlds(count: int) -> None:
     assets, _ = drop._draw_objects(0)
     starts = [drop.draw_poses(assets, np.random.default_rng(world)) for world in range(count)]
     bodies = [drop._objects[asset].body for asset in assets]
-    for worlds in (1, 2, count):
-        seconds = time_worlds(bodies, drop._colliders, starts[:worlds], scene.spec.settle.timestep)
-        print(f"{worlds} worlds of 10 objects: {seconds:.2f} CPU s per simulated second and world", flush=True)
-
-
-def time_worlds(bodies: list[Body], colliders: list[Collider], starts: list[FloatArray], timestep: float) -> float:
-    """CPU seconds per simulated second and world, over one and a half of fall and rest."""
-    import newton
-    import warp as wp
-    from newton.solvers import SolverMuJoCo
-
-    from mitsplat import physics
-
-    one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP)
-    contacts = 40 * len(bodies) + one.shape_count
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -9.81))
-    SolverMuJoCo.register_custom_attributes(builder)
-    builder.replicate(one, len(starts))
-    model = builder.finalize(device="cpu")
-    solver = SolverMuJoCo(
-        model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics._SOLVER_OPTIONS
-    )
-    pipeline = newton.CollisionPipeline(model, broad_phase="nxn", rigid_contact_max=len(starts) * contacts + 1)
-    found, states, control = pipeline.contacts(), (model.state(), model.state()), model.control()
-
-    def steps() -> None:
-        here, there = states
-        for _ in range(4):
-            pipeline.collide(here, found)
-            solver.step(here, there, control, found, timestep)
-            here, there = there, here
-
-    steps()
-    with wp.ScopedCapture(device="cpu") as capture:
-        steps()
-    coordinates = np.concatenate([physics._coordinates(bodies, poses) for poses in starts])
-    physics._assign(states[0].joint_q, coordinates.ravel())
-    physics._assign(states[0].body_q, coordinates)
-    physics._assign(states[0].joint_qd, np.zeros(6 * len(coordinates)))
-    physics._assign(states[0].body_qd, np.zeros((len(coordinates), 6)))
-    start = time.process_time()
-    for _ in range(round(1.5 / (4 * timestep))):
-        wp.capture_launch(capture.graph)
-    return (time.process_time() - start) / 1.5 / len(starts)
+    time_worlds(bodies, drop._colliders, starts, drop._bounds, timestep=scene.spec.settle.timestep, device=device)
 
 
 def measure_share(count: int) -> None:
     """CPU seconds of settling and of rendering, layout by layout, so that other work on the machine slows both."""
+    from mitsplat.frame import render_frame
+
     scene = load_scene(WORKCELL, overrides={"output.layouts": count + 1, "output.views": 10})
     settling, drawing, first = [], [], 0.0
     for index in range(count + 1):
@@ -311,19 +266,22 @@ MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
     "thin": (measure_thin, 50),
     "bin": (measure_bin, 3),
     "rest": (measure_rest, 20),
-    "worlds": (measure_worlds, 8),
     "share": (measure_share, 6),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("measure", choices=MEASURES)
+    parser.add_argument("measure", choices=[*MEASURES, "worlds"])
     parser.add_argument("--count", type=int)
+    parser.add_argument("--device", default="cpu", help="of worlds: cpu, or cuda:0")
     arguments = parser.parse_args()
-    measure, count = MEASURES[arguments.measure]
     with warp_settings():
-        measure(arguments.count or count)
+        if arguments.measure == "worlds":
+            measure_worlds(arguments.count or (8 if arguments.device == "cpu" else 256), arguments.device)
+        else:
+            measure, count = MEASURES[arguments.measure]
+            measure(arguments.count or count)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -242,22 +243,34 @@ def measure_share(count: int) -> None:
     """CPU seconds of settling and of rendering, layout by layout, so that other work on the machine slows both."""
     from mitsplat.frame import render_frame
 
-    scene = load_scene(WORKCELL, overrides={"output.layouts": count + 1, "output.views": 10})
-    settling, drawing, first = [], [], 0.0
-    for index in range(count + 1):
+    scenes = {
+        stepper: load_scene(
+            WORKCELL, overrides={"output.layouts": count + 1, "output.views": 10, "settle.stepper": stepper}
+        )
+        for stepper in STEPPERS
+    }
+    spent: dict[str, list[float]] = {name: [] for name in (*STEPPERS, "rendering")}
+
+    def timed(name: str, work: Callable[[], Any]) -> Any:
         start = time.process_time()
-        layout = settle_layout(scene, index, cached=False)
-        settled = time.process_time()
-        frames = [render_frame(scene, 10 * index + view, layout=layout) for view in range(2)]
-        rendered = time.process_time()
-        if index:  # the first one makes what all share: parts and compiled kernels
-            settling.append(settled - start)
-            drawing.append((rendered - settled) / len(frames))
-        else:
-            first = settled - start
-    settle, draw = np.mean(settling), np.mean(drawing)
-    print(f"settling {settle:.2f} CPU s a layout, {first:.2f} the first; rendering {draw:.2f} CPU s an image")
-    print(f"settling adds {settle / 10 / draw:.1%} to an image at ten views of a layout")
+        result = work()
+        spent[name].append(time.process_time() - start)
+        return result
+
+    # Stepper by stepper, because what the layouts of a scene share is kept for one scene.
+    for stepper, scene in scenes.items():
+        for index in range(count + 1):
+            layout = timed(stepper, partial(settle_layout, scene, index, cached=False))
+            timed("rendering", partial(render_frame, scene, 10 * index, layout=layout))
+    # The first one makes what all share: parts and compiled kernels.
+    image = np.mean(spent["rendering"][1:])
+    for stepper in STEPPERS:
+        layout_seconds = np.mean(spent[stepper][1:])
+        print(
+            f"{stepper}: {layout_seconds:.2f} CPU s a layout, {spent[stepper][0]:.2f} the first; rendering {image:.2f} "
+            f"CPU s an image: settling adds {layout_seconds / 10 / image:.1%} to one at ten views of a layout",
+            flush=True,
+        )
 
 
 MEASURES: dict[str, tuple[Callable[[int], None], int]] = {

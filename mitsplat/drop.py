@@ -30,9 +30,9 @@ _DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _WIDEST_GAP, _SHARE = 3e-4, 5e-4, 1e-3
 _DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scene file says so [m]
 _NEAREST = 5e-4  # what is scattered is farther apart than this [m]
 _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
-# Simulations of which the remains may pile up. Newton leaves the model of each and the kernels that it generated, 3 MiB
-# and more, in reference cycles, which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
-_GARBAGE = 8
+# Simulations of which the remains may pile up. Newton leaves the model of each, a MiB and more, in reference cycles,
+# which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
+_GARBAGE = 24
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
 
 

@@ -238,9 +238,9 @@ class WarpWorld(World):
         self._states = model.state(), model.state()
         self._control = model.control()
         self._observables = [self._solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW}) for _ in range(_STEPS)]
-        self._record()  # loads the kernels, which a capture must not
+        self._record(self._observables[:1])  # loads the kernels, which a capture must not
         with wp.ScopedCapture(device="cpu") as capture:
-            self._record()
+            self._record(self._observables)
         self._graph = capture.graph
 
     @property
@@ -248,9 +248,9 @@ class WarpWorld(World):
         """See :attr:`World.velocities`."""
         return _array(self._states[0].body_qd)[: len(self.bodies)].reshape(-1, 2, 3)
 
-    def _record(self) -> None:
+    def _record(self, steps: Sequence[Any]) -> None:
         here, there = self._states
-        for observables in self._observables:
+        for observables in steps:
             self._pipeline.collide(here, self._contacts)
             self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
             here, there = there, here
@@ -440,8 +440,8 @@ def _coordinates(bodies: Sequence[Body], poses: FloatArray) -> FloatArray:
 
 
 def max_contacts(bodies: int, shapes: int) -> int:
-    """How many contacts to make room for; most kernels run over all of it. Parts that tumble together fill a half."""
-    return 16 * bodies + shapes
+    """How many contacts to make room for: most kernels run over all of it, and parts that tumble fill a half to 0.8."""
+    return 24 * bodies + shapes
 
 
 def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]) -> newton.Model:

@@ -136,6 +136,42 @@ def test_a_contact_buffer_that_is_too_small_is_noticed():
     assert run_to_rest(world, max_time=1.0, bounds=EVERYWHERE).refused == OVERFLOW
 
 
+def test_worlds_that_share_kernels_do_not_meet():
+    """A world falls as it does alone while another of more pieces, made after it by the same kernels, runs too."""
+    from mitsplat.contacts import ContactFinder
+    from mitsplat.physics import WarpWorld, all_pieces
+
+    few = [body_of(trimesh.creation.box((0.02, 0.03, 0.01)))] * 2
+    many = [body_of(trimesh.creation.icosphere(subdivisions=1, radius=0.01))] * 6
+    poses = np.stack([pose_at((0.05 * i, 0, 0.03), Rotation.from_euler("xy", (20 * i, 35))) for i in range(6)])
+
+    def made(bodies, finder):
+        world = WarpWorld(bodies, [table()], timestep=0.002, capacity=1.0, contact_finder=finder)
+        world.reset(poses[: len(bodies)])
+        return world
+
+    alone = made(few, None)
+    run_until(alone, 0.3)
+    finder = ContactFinder(all_pieces([*few, *many], [table()]))
+    first, second = made(few, finder), made(many, finder)
+    while first.time < 0.3 - 1e-9:
+        first.advance()
+        second.advance()
+    np.testing.assert_array_equal(first.poses, alone.poses)
+    assert (second.poses[:, 2, 3] > 0.009).all()
+
+
+def test_mean_speeds():
+    """A turn of t about an axis through the centre of mass, and a way of w, in s seconds: t / s and w / s."""
+    from mitsplat.physics import _mean_speeds
+
+    body = body_of(trimesh.creation.box((0.02, 0.03, 0.01)))
+    before = pose_at((0.1, 0, 0), Rotation.from_rotvec((0.3, -1, 2)))[None]
+    for turn in (1e-4, 0.5, np.pi):
+        after = pose_at((0.1, 0, 3e-4), Rotation.from_rotvec((0, turn, 0)) * Rotation.from_rotvec((0.3, -1, 2)))[None]
+        assert _mean_speeds([body], before, after, 0.05) == pytest.approx((6e-3, turn / 0.05), rel=1e-6)
+
+
 def test_a_light_part_carries_a_heavy_one():
     """A plate a hundred times as heavy rests on two nuts: none of them sinks by more than 0.1 mm."""
     from mitsplat.physics import run_to_rest

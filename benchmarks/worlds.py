@@ -58,7 +58,7 @@ class Batch:
         device: str,
     ) -> None:
         one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP)
-        contacts = physics.max_contacts(len(bodies), one.shape_count)
+        contacts = 2 * physics.max_contacts(len(bodies), one.shape_count)  # nothing is drawn again here
         builder = newton.ModelBuilder(gravity=physics._GRAVITY)
         SolverMuJoCo.register_custom_attributes(builder)
         builder.replicate(one, len(starts))

@@ -173,8 +173,8 @@ def settle_layouts(
 ) -> Iterator[Layout]:
     """Settle many layouts over processes, in the order in which they are finished; see :func:`settle_layout`.
 
-    Several layouts in one simulation (Newton's worlds) cost as much each as one alone on a CPU, and would wait for the
-    slowest (``python -m benchmarks.settle worlds``).
+    Several layouts in one simulation (Newton's worlds) cost about as much each as one alone on a CPU, and would wait
+    for the slowest (``python -m benchmarks.settle worlds``).
     """
     from mitsplat.engine import run_frames
 

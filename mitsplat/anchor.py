@@ -24,8 +24,11 @@ DEFAULT_BOARD = Board()
 MAX_ERROR = 3.0
 """Reprojection error from which an observation of a target's corner is an outlier [px]."""
 
-MAX_CONTRADICTION = 0.01
-"""Reprojection error of the fitted board from which a camera is wrong, as a share of its image's width."""
+MAX_CONTRADICTION = 0.0025
+"""Reprojection error of the fitted board from which a camera can be wrong, as a share of its image's width."""
+
+_OUTLYING = 3.0
+"""A wrong camera's error is also so many times that of the median camera: a bent print is off in all of them."""
 
 PRINT_ERROR = 1e-4
 """Standard error with which a user measures the edge of a printed square or tag [m]."""
@@ -51,6 +54,8 @@ class Anchor:
         source: What decided, a clause for the user.
         scale_error: Estimated relative standard error of the scale, if metric.
         wrong: Images whose cameras the board contradicts, and by how many pixels.
+        confirmed: Images whose cameras see the board where it is.
+        board: Pose (4, 4) of the ChArUco board where the reconstruction is put, in metres, if there is one.
     """
 
     matrix: FloatArray
@@ -60,6 +65,8 @@ class Anchor:
     source: str
     scale_error: float | None = None
     wrong: Mapping[str, float] = field(default_factory=dict)
+    confirmed: frozenset[str] = frozenset()
+    board: FloatArray | None = None
 
 
 def find_anchor(
@@ -91,13 +98,16 @@ def find_anchor(
     corners = _triangulate_corners(views, set(model.cameras))
     tags = _triangulate_tags(tag_views, set(model.cameras))
     wrong: dict[str, float] = {}
+    confirmed: frozenset[str] = frozenset()
+    board_pose: FloatArray | None = None
     scale: tuple[float, float | None] | None = None
     plane: tuple[FloatArray, FloatArray] | None = None
     source = ""
     axes: FloatArray | None = None
     if fitted := _fit_board(corners, board):
         pose, factor = fitted
-        wrong = _contradicted(views, board.corners / factor @ pose[:3, :3].T + pose[:3, 3])
+        board_pose = pose
+        wrong, confirmed = _judge_cameras(views, board.corners / factor @ pose[:3, :3].T + pose[:3, 3])
 
         def board_scale(names: set[str]) -> float | None:
             fitted = _fit_board(_triangulate_corners(views, names), board)
@@ -147,6 +157,11 @@ def find_anchor(
     matrix = np.eye(4)
     matrix[:3, :3] = factor * rotation
     matrix[:3, 3] = -factor * rotation @ origin
+    if board_pose is not None:
+        turned = np.eye(4)
+        turned[:3, :3] = rotation @ board_pose[:3, :3]
+        turned[:3, 3] = matrix[:3, :3] @ board_pose[:3, 3] + matrix[:3, 3]
+        board_pose = turned
     return Anchor(
         matrix=matrix,
         units="metre" if scale else "unknown",
@@ -155,6 +170,8 @@ def find_anchor(
         source=source,
         scale_error=scale[1] if scale else None,
         wrong=wrong,
+        confirmed=confirmed,
+        board=board_pose,
     )
 
 
@@ -383,10 +400,11 @@ def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, FloatArray]:
     return tags
 
 
-def _contradicted(views: _Views, corners: FloatArray) -> dict[str, float]:
-    """Images that see at least six corners of the board elsewhere than their cameras do, and how far off [px].
+def _judge_cameras(views: _Views, corners: FloatArray) -> tuple[dict[str, float], frozenset[str]]:
+    """Images that see the board elsewhere than their cameras do, and by how far [px]; and those that see it there.
 
-    Cameras that few or repetitive points hold can be far off at small reprojection errors.
+    Six of its corners must be seen. Cameras that few or repetitive points hold can be far off at small reprojection
+    errors.
     """
     errors: dict[str, list[float]] = {}
     widths = {}
@@ -396,7 +414,10 @@ def _contradicted(views: _Views, corners: FloatArray) -> dict[str, float]:
             errors.setdefault(name, []).append(float(np.nan_to_num(error, nan=np.inf)))
             widths[name] = camera.width
     medians = {name: float(np.median(values)) for name, values in errors.items() if len(values) >= 6}
-    return {name: error for name, error in medians.items() if error > MAX_CONTRADICTION * widths[name]}
+    usual = _OUTLYING * float(np.median([medians[name] / widths[name] for name in medians])) if medians else 0.0
+    limit = max(MAX_CONTRADICTION, usual)
+    wrong = {name: error for name, error in medians.items() if error > limit * widths[name]}
+    return wrong, frozenset(medians.keys() - wrong.keys())
 
 
 def _fit_board(corners: Mapping[int, FloatArray], board: Board) -> tuple[FloatArray, float] | None:

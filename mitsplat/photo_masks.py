@@ -27,6 +27,9 @@ ByteImage = npt.NDArray[np.uint8]
 MaskMaker = Callable[[Photo], BoolArray]
 """Makes the mask of a photo, shape (H, W)."""
 
+Bare = Callable[[Camera, npt.NDArray[np.uint8]], BoolArray]
+"""Pixels (H, W) of a grey image (H, W) by a camera that are surely not the object."""
+
 MIN_SHARE = 0.02
 """Share of a photo that its object must cover; models that find nothing mark less than that."""
 
@@ -149,22 +152,24 @@ def model_masks(model: Path) -> MaskMaker:
     return make
 
 
-def geometric_masks(points: FloatArray) -> MaskMaker:
+def geometric_masks(points: FloatArray, bare: Bare | None = None) -> MaskMaker:
     """Masks by GrabCut (Rother et al. 2004), begun from the hull of points on the object.
 
     Args:
         points: Of the object, in the capture's frame, shape (N, 3); see :func:`object_points`.
+        bare: Finds what is surely not the object.
     """
 
     def make(photo: Photo) -> BoolArray:
         camera, bgr, _ = _reduced(photo)
         pixels, _ = camera.project(points)
-        return _enlarged(_grab(bgr, pixels[np.isfinite(pixels).all(axis=1)]), photo.camera)
+        free = _free(bare, camera, bgr)
+        return _enlarged(_grab(bgr, pixels[np.isfinite(pixels).all(axis=1)], free), photo.camera)
 
     return make
 
 
-def agreed_masks(masked: Capture, points: FloatArray) -> MaskMaker:
+def agreed_masks(masked: Capture, points: FloatArray, bare: Bare | None = None) -> MaskMaker:
     """Masks by GrabCut within a band around the outline that the masks of all photos agree on.
 
     What one photo cannot tell from its object, such as a dark corner behind it, others see beside it: the visual hull
@@ -173,6 +178,7 @@ def agreed_masks(masked: Capture, points: FloatArray) -> MaskMaker:
     Args:
         masked: The capture with first masks.
         points: Of the object, in the capture's frame, shape (N, 3); the hull is looked for around them.
+        bare: Finds what is surely not the object.
     """
     small = {photo.name: _reduced(photo) for photo in masked.photos}
     hull, cell = _agreed_hull([(camera, mask) for camera, _, mask in small.values()], points)
@@ -184,7 +190,8 @@ def agreed_masks(masked: Capture, points: FloatArray) -> MaskMaker:
         if size > 0:
             near = _grown(silhouette, _DOUBT * size)
             core = ~_grown(~silhouette, _DOUBT * size)
-            mask = _cut(rgb, near, silhouette & (mask | core), core, _DOUBT * size)
+            free = _free(bare, camera, rgb)
+            mask = _cut(rgb, near, silhouette & (mask | core), core, free, _DOUBT * size)
         return _enlarged(mask, photo.camera)
 
     return make
@@ -223,8 +230,15 @@ def object_points(capture: Capture) -> FloatArray:
     return np.concatenate([cluster, (low if len(low) >= 5 else cluster) * (1, 1, 0)])
 
 
-def _grab(image: ByteImage, pixels: FloatArray) -> BoolArray:
-    """GrabCut of a BGR image (H, W, 3) from where points of the object are in it, shape (N, 2).
+def _free(bare: Bare | None, camera: Camera, bgr: ByteImage) -> BoolArray:
+    """What is surely not the object, shape (H, W)."""
+    if bare is None:
+        return np.zeros(bgr.shape[:2], dtype=bool)
+    return bare(camera, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+
+
+def _grab(image: ByteImage, pixels: FloatArray, free: BoolArray) -> BoolArray:
+    """GrabCut of a BGR image (H, W, 3) from where points of the object are in it, shape (N, 2), and where it is not.
 
     Sides without points lie outside of the hull. So the region in question begins at it and follows what was found.
     """
@@ -244,18 +258,21 @@ def _grab(image: ByteImage, pixels: FloatArray) -> BoolArray:
     inside = filled > 0
     for _ in range(_EXTENSIONS):
         near = _grown(inside | (filled > 0), _RING * size)
-        before, inside = inside, _cut(image, near, inside, core, _RING * size)
+        before, inside = inside, _cut(image, near, inside, core, free, _RING * size)
         if np.count_nonzero(inside & ~before) < 0.01 * np.count_nonzero(inside):
             break
     return inside
 
 
-def _cut(image: ByteImage, near: BoolArray, inside: BoolArray, core: BoolArray, ring: float) -> BoolArray:
-    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably and surely ``inside``."""
+def _cut(
+    image: ByteImage, near: BoolArray, inside: BoolArray, core: BoolArray, free: BoolArray, ring: float
+) -> BoolArray:
+    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably, surely and not ``inside``."""
     trimap = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
     trimap[near] = cv2.GC_PR_BGD
     trimap[inside] = cv2.GC_PR_FGD
     trimap[core] = cv2.GC_FGD
+    trimap[free] = cv2.GC_BGD
     # The background that is learnt from is what surrounds the object, and the cost is that of its box.
     edge = round(ring) + 4
     y, x = np.nonzero(near)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -59,11 +59,13 @@ class Finished:
         folder: Of the asset.
         verdict: Its figures.
         kept: Whether an earlier run had made it of the same inputs.
+        warnings: What there is to say about its photographs, one sentence each.
     """
 
     folder: Path
     verdict: Verdict
     kept: bool
+    warnings: tuple[str, ...] = ()
 
     @property
     def shortcoming(self) -> str | None:
@@ -115,7 +117,8 @@ def make_photo_asset(
     from mitsplat.fit import FitProgress, fit_capture
     from mitsplat.take import capture_photos
 
-    found = capture_photos(photos, out / "capture", capture, progress=progress).capture
+    taken = capture_photos(photos, out / "capture", capture, progress=progress)
+    found = taken.capture
 
     def fitting(now: FitProgress) -> None:
         if progress is not None:
@@ -127,7 +130,8 @@ def make_photo_asset(
     stale = marker.exists() and marker.read_text() != inputs
     write_text(marker, inputs)
     fit_capture(found, out / "fit", fit, overwrite=stale, progress=fitting)
-    return make_asset(out / "capture", out / "fit", out, job, progress=progress)
+    done = make_asset(out / "capture", out / "fit", out, job, progress=progress)
+    return replace(done, warnings=taken.warnings)
 
 
 def _fit_inputs(folder: Path, capture: Capture, settings: FitSettings) -> str:

@@ -30,6 +30,9 @@ MIN_POINTS = 30
 MIN_AGREEMENT = 0.5
 """Share of a photo's matches that its camera must explain. On photographs of a statue it was 98 % or more for each."""
 
+SURE_AGREEMENT = 0.65
+"""Share below which a camera is doubtful, unless a board says otherwise."""
+
 ENOUGH = 0.8
 """Share of registered photos below which the global mapper is tried as well."""
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from mitsplat.anchor import DEFAULT_BOARD, Anchor, find_anchor
+from mitsplat.bare_board import bare_squares
 from mitsplat.board import Board
 from mitsplat.capture import Capture, Photo
 from mitsplat.capture_sheet import capture_sheet
@@ -21,7 +23,7 @@ from mitsplat.files import write_file, write_text
 from mitsplat.photo_masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
 from mitsplat.photos import Prepared, Progress, find_photos, prepare_photos, undistort
 from mitsplat.poses import read_poses
-from mitsplat.sfm import MIN_AGREEMENT, MIN_POINTS, Model, find_cameras
+from mitsplat.sfm import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, Model, find_cameras
 
 MIN_PHOTOS = 3
 MIN_REGISTERED = 0.75
@@ -82,12 +84,14 @@ class CaptureResult:
         given: Number of photographs given.
         source: Where scale and gravity come from, a clause.
         reprojection_error: Mean over all observations [px].
+        doubtful: Share of the matches that a camera explains, where it is low and no board confirms the camera.
     """
 
     capture: Capture
     given: int
     source: str
     reprojection_error: float
+    doubtful: Mapping[str, float]
 
     @property
     def registered(self) -> float:
@@ -99,6 +103,19 @@ class CaptureResult:
         """Photos that observe few points, and how many."""
         counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
         return {name: count for name, count in counts.items() if count < FEW_POINTS}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of photos that are in the capture, one sentence each."""
+        warnings = []
+        if self.doubtful:
+            shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
+            warnings.append(
+                f"cameras explain few of their matches and may be wrong, leave them out or add others: {shares}"
+            )
+        if self.weak:
+            warnings.append(f"weakly held, more overlap would help: {', '.join(self.weak)}")
+        return tuple(warnings)
 
     @property
     def shortcoming(self) -> str | None:
@@ -142,30 +159,27 @@ def capture_photos(
     if len(prepared) < MIN_PHOTOS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
-    weak: dict[str, int] = {}
-    wrong: dict[str, float] = {}
+    faults: dict[str, str] = {}
     if settings.poses is not None:
         model = read_poses(settings.poses, prepared, work, progress)
     else:
-        model, weak = find_cameras(prepared, work, progress).without_weak()
-        wrong = {file: model.agreement.get(file, 1.0) for file in model.cameras}
-        wrong = {file: share for file, share in wrong.items() if share < MIN_AGREEMENT}
-        model = model.without(wrong)
-    if len(model.cameras) < MIN_PHOTOS:
-        raise InputError(
-            f"{photos}: cameras of only {len(model.cameras)} of {len(prepared)} photos could be found, {MIN_PHOTOS} "
-            "are needed; take them closer together, and with texture on or under the object"
-        )
+        model, faults = _without_faults(find_cameras(prepared, work, progress))
+    _demand(len(model.cameras), len(prepared), photos)
     by_file = {photo.file.name: photo for photo in prepared}
-    rejected |= _unregistered(by_file, model, weak, wrong)
     anchor = _anchored(model, by_file, settings)
-    if anchor.wrong:
-        rejected |= {
-            by_file[file].name: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
+    while anchor.wrong:
+        faults |= {
+            file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
             for file, error in anchor.wrong.items()
         }
         model = model.without(anchor.wrong)
+        _demand(len(model.cameras), len(prepared), photos)
         anchor = _anchored(model, by_file, settings)
+    rejected |= {
+        photo.name: faults.get(file) or _absent(file, model)
+        for file, photo in by_file.items()
+        if file not in model.cameras
+    }
     capture = Capture(
         photos=tuple(
             Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
@@ -195,10 +209,18 @@ def capture_photos(
         if path.name not in used:
             path.unlink()
     write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
-    result = CaptureResult(capture, len(files), anchor.source, model.reprojection_error)
-    record = {"inputs": inputs, "source": result.source, "reprojection_error": result.reprojection_error}
-    write_text(out / _INPUTS, json.dumps(record, indent=1))
-    return result
+    doubtful = {
+        by_file[file].name: share
+        for file, share in model.agreement.items()
+        if share < SURE_AGREEMENT and file in used and file not in anchor.confirmed
+    }
+    record: dict[str, Any] = {
+        "source": anchor.source,
+        "reprojection_error": model.reprojection_error,
+        "doubtful": doubtful,
+    }
+    write_text(out / _INPUTS, json.dumps({"inputs": inputs} | record, indent=1))
+    return CaptureResult(capture, len(files), **record)
 
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
@@ -224,7 +246,7 @@ def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
         if record["inputs"] != inputs:
             return None
         capture = Capture.load(out)
-        return CaptureResult(capture, len(record["inputs"]["photos"]), record["source"], record["reprojection_error"])
+        return CaptureResult(capture, len(record.pop("inputs")["photos"]), **record)
     except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
         return None
 
@@ -240,21 +262,34 @@ def _forget_other_photos(out: Path, inputs: dict[str, object]) -> None:
         write_text(file, marker)
 
 
-def _unregistered(
-    by_file: dict[str, Prepared], model: Model, weak: dict[str, int], wrong: dict[str, float]
-) -> dict[str, str]:
-    """Why photos are not in the model."""
-    reasons = {}
-    for file, photo in by_file.items():
-        if file in weak:
-            reasons[photo.name] = f"only {weak[file]} points could be matched in it, {MIN_POINTS} are needed"
-        elif file in wrong:
-            reasons[photo.name] = f"its camera is wrong: it explains only {wrong[file]:.0%} of its matches"
-        elif file in model.elsewhere:
-            reasons[photo.name] = "it only fits a smaller group of photos, as of another object or side"
-        elif file not in model.cameras:
-            reasons[photo.name] = "it shares too few points with the other photos"
-    return reasons
+def _demand(found: int, given: int, photos: Path) -> None:
+    """Refuse too few cameras."""
+    if found < MIN_PHOTOS:
+        raise InputError(
+            f"{photos}: cameras of only {found} of {given} photos could be found, {MIN_PHOTOS} are needed; take them "
+            "closer together, and with texture on or under the object"
+        )
+
+
+def _without_faults(model: Model) -> tuple[Model, dict[str, str]]:
+    """The model without cameras that are weakly held or contradict the others, and why each is left out."""
+    model, weak = model.without_weak()
+    faults = {
+        file: f"only {points} points could be matched in it, {MIN_POINTS} are needed" for file, points in weak.items()
+    }
+    wrong = {file: model.agreement.get(file, 1.0) for file in model.cameras}
+    wrong = {file: share for file, share in wrong.items() if share < MIN_AGREEMENT}
+    faults |= {
+        file: f"its camera is wrong: it explains only {share:.0%} of its matches" for file, share in wrong.items()
+    }
+    return model.without(wrong), faults
+
+
+def _absent(file: str, model: Model) -> str:
+    """Why structure from motion left a photo out."""
+    if file in model.elsewhere:
+        return "it only fits a smaller group of photos, as of another object or side"
+    return "it shares too few points with the other photos"
 
 
 def _anchored(model: Model, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
@@ -304,8 +339,9 @@ def _masked(
             "something with texture, or capture it as an environment (--kind environment)"
         )
     points = object_points(capture)
-    masked = add_masks(capture, geometric_masks(points), mask_folder, progress=progress, points=points)
+    bare = None if anchor.board is None else partial(bare_squares, settings.board, anchor.board)
+    masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=points)
     if len(masked.photos) < MIN_PHOTOS:
         return masked
     # What a photo was rejected for may be what the others set right.
-    return add_masks(capture, agreed_masks(masked, points), mask_folder, progress=progress, points=points)
+    return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=points)

@@ -173,8 +173,8 @@ def march_backward(
             q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
             z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
             hit = (log_opacity - q > cut) & (z > near) & (t > end)
-            # A response that overflows beyond the cut-off has no gradient, not an undefined one.
-            inverse, q = dr.select(hit, inverse, 0), dr.select(hit, q, 0)
+            # A response that overflows beyond the cut-off, or that rounding lifts over the peak, has no gradient.
+            inverse, q = dr.select(hit & (q > 0), inverse, 0), dr.select(hit & (q > 0), q, 0)
             alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)
             weight = t * alpha
             d_own = red * ds[0] + green * ds[1] + blue * ds[2]

@@ -131,7 +131,9 @@ def respond_along(
         result, _ = dr.if_stmt(
             (result, u0), a < 0, at_the_camera, lambda result, row: (result, row), label="gaussian at the camera"
         )
-    log_alphas = result[0::2] if cap is None else [dr.minimum(log_alpha, cap) for log_alpha in result[0::2]]
+    # Rounding can lift the response of a needle over its peak, by any factor.
+    most = opacity if cap is None else dr.minimum(opacity, cap)
+    log_alphas = [dr.minimum(log_alpha, most) for log_alpha in result[0::2]]
     return list(zip(log_alphas, result[1::2], strict=True))
 
 

@@ -113,7 +113,39 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
     cameras_astray = {**model.cameras, "03.png": replace(astray, world_from_camera=pose)}
     spoilt = find_anchor(replace(model, cameras=cameras_astray), images, board=BOARD)
     assert set(spoilt.wrong) == {"03.png"}
+    assert spoilt.confirmed == set(images) - {"03.png"}
     assert abs(errors(spoilt.matrix)[0]) < 1e-3
+
+
+def test_the_board_is_known_where_the_reconstruction_is_put(tmp_path: Path) -> None:
+    cameras = ring()
+    images = {
+        f"{k:02}.png": draw(BOARD.draw(200), 200 / BOARD.square, camera, tmp_path, f"{k:02}.png")
+        for k, camera in enumerate(cameras)
+    }
+    found = find_anchor(model_of(cameras, table_and_thing()), images, board=BOARD)
+    assert found.board is not None
+    truth = found.matrix @ LOST  # the board lies where the world's origin is
+    scale = np.cbrt(np.linalg.det(truth[:3, :3]))
+    np.testing.assert_allclose(found.board[:3, :3], truth[:3, :3] / scale, atol=1e-3)
+    np.testing.assert_allclose(found.board[:3, 3], truth[:3, 3], atol=1e-4)
+
+
+@pytest.mark.parametrize("away", [0.0008, 0.0032])
+def test_a_camera_is_wrong_by_the_measure_of_the_others(away: float) -> None:
+    """A quarter of a per cent of the width condemns a camera, unless the board fits none of them much better."""
+    cameras = ring()
+    rng = np.random.default_rng(4)
+    views: Any = {index: {} for index in range(len(BOARD.corners))}
+    for k, camera in enumerate(cameras):
+        off = 0.004 * camera.width if k == 0 else 1.0 * away * camera.width
+        pixels, _ = camera.project(BOARD.corners)
+        for index, pixel in enumerate(pixels):
+            angle = rng.uniform(0, 2 * np.pi)
+            views[index][f"{k:02}"] = camera, pixel + off * np.array([np.cos(angle), np.sin(angle)])
+    wrong, confirmed = anchor._judge_cameras(views, BOARD.corners)
+    assert set(wrong) == ({"00"} if away == 0.0008 else set())
+    assert len(wrong) + len(confirmed) == len(cameras)
 
 
 def test_the_error_of_the_scale_covers_what_wrong_cameras_do_to_it() -> None:

@@ -81,6 +81,15 @@ def test_gradients_equal_finite_differences_of_the_twin(bands: int) -> None:
             assert got == pytest.approx(expected, rel=1e-2, abs=1e-2), name
 
 
+def test_needles_thinner_than_rounding_have_finite_gradients() -> None:
+    """Else one of them makes numbers of a whole fit undefined."""
+    rng = np.random.default_rng(3)
+    splats = make_splats(200, 34)
+    scales = 10 ** np.column_stack([rng.uniform(-10, -8, (200, 2)), rng.uniform(-10, -0.5, 200)])
+    for name, values in gradients(replace(splats, scales=scales)).items():
+        assert np.isfinite(values).all(), name
+
+
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
 def test_image_is_that_of_the_plain_march(distortion: tuple[float, ...]) -> None:
     ensure_variant()

@@ -431,6 +431,19 @@ def test_denormal_scales_stay_finite() -> None:
     assert render_splats(one((1e-40, 1e-40, 1e-40)), CAMERA).alpha.max() <= 1.0
 
 
+@pytest.mark.parametrize("preset", ["fast", "balanced", "exact"])
+def test_needles_thinner_than_rounding_neither_flash_nor_go_dark(preset: str) -> None:
+    """Axes of 0.1 nm seen from 2 m: rounding made responses of any size of them, and pixels that were no numbers."""
+    splats = make_splats(400, 41)
+    rng = np.random.default_rng(41)
+    for longest in (-8.0, -0.5):
+        scales = 10 ** np.column_stack([rng.uniform(-10, -8, (400, 2)), rng.uniform(-10, longest, 400)])
+        layers = render_splats(replace(splats, scales=scales), CAMERA, quality=preset)
+        assert np.isfinite(layers.rgb).all() and np.isfinite(layers.depth).all()
+        assert layers.alpha.min() >= 0 and layers.alpha.max() <= 1
+        assert layers.rgb.max() < 2
+
+
 def test_samples_average_the_pixel() -> None:
     """4x4 samples of a small image equal the box-downsampled image of four times the size."""
     splats = make_splats(30, 21)

@@ -19,7 +19,7 @@ from test_cli import run
 
 from benchmarks.known import photograph
 from mitsplat import poses, sfm, take
-from mitsplat.anchor import fit_similarity
+from mitsplat.anchor import find_anchor, fit_similarity
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture
 from mitsplat.errors import InputError, MissingResourceError
@@ -333,6 +333,37 @@ def test_photos_of_two_things_end_with_status_4(
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
     assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
     assert len(Capture.load(tmp_path / "out").photos) == 8
+
+
+def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
+    captured: tuple[Path, Path, CaptureResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given, _, result = captured
+    photos = result.capture.photos
+    model = Model(
+        {photo.file.name: photo.camera for photo in photos},
+        result.capture.points,
+        result.capture.colours,
+        {photo.file.name: photo.seen for photo in photos},
+    )
+    images = {photo.file.name: photo.file for photo in photos}
+    seen, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed - {"photo03.png"})
+    model = replace(model, agreement=dict.fromkeys(model.cameras, 0.98) | {"photo03.png": 0.4, seen: 0.6})
+    monkeypatch.setattr(take, "find_cameras", lambda *args: model)
+    assert run("capture", given, "-o", tmp_path / "sure", "--square", 0.035, "--kind", "environment") == 0
+    said = capsys.readouterr().out
+    assert "rejected: photo03.png: its camera is wrong: it explains only 40% of its matches\n" in said
+    assert "warning" not in said
+    for _ in range(2):  # made, and kept
+        assert run("capture", given, "-o", tmp_path / "out", "--squares", "3x3", "--kind", "environment") == 0
+        said = capsys.readouterr().out
+        assert (
+            "warning: cameras explain few of their matches and may be wrong, leave them out or add others: "
+            f"{seen} (60%)\n" in said
+        )
 
 
 @pytest.mark.slow

@@ -186,8 +186,8 @@ def capture(
     found = result.capture
     for name, reason in sorted(found.rejected.items()):
         typer.echo(f"rejected: {name}: {reason}")
-    if result.weak:
-        typer.echo(f"weakly held, more overlap would help: {', '.join(result.weak)}")
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}")
     typer.echo(
         f"capture: {out} ({len(found.photos)} of {result.given} photos, {len(found.points)} points, "
         f"{result.reprojection_error:.2f} px)"
@@ -333,6 +333,8 @@ def _tell_asset(done: Finished) -> None:
     found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
     closed = "watertight" if found.watertight else "open"
     typer.echo(f"asset: {done.folder}{kept}")
+    for warning in done.warnings:
+        typer.echo(f"warning: {warning}")
     typer.echo(f"photos: {found.photos} of {found.photos + found.rejected} with a camera; units: {found.units}")
     typer.echo(f"splats: {found.gaussians}; mesh: {found.faces} faces, {closed}")
     figures = {

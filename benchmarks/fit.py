@@ -16,7 +16,6 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-import mitsplat  # noqa: F401 - points Dr.Jit to its LLVM
 from mitsplat.capture import Capture
 from mitsplat.densify import seed_splats
 from mitsplat.fit import FitSettings, fit_capture

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import trimesh
 from PIL import Image
@@ -78,7 +79,6 @@ def photograph(
 ) -> dict[str, Camera]:
     """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files."""
     ensure_variant()
-    import mitsuba as mi
 
     folder.mkdir(parents=True, exist_ok=True)
     loaded = mi.load_dict(dict(scene))
@@ -99,7 +99,6 @@ def _named(views: list[Camera]) -> dict[str, Camera]:
 def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
     """A board, z = 0 and its middle the origin, on a speckled table under a lamp and an even sky."""
     ensure_variant()
-    import mitsuba as mi
 
     drawn = board.draw(60).astype(np.float32) / 255
     sheet = np.array([board.columns, board.rows]) * board.square / 2
@@ -133,8 +132,6 @@ def speckle(rng: np.random.Generator, size: int, colour: tuple[float, float, flo
 
 def paint(texture: np.ndarray) -> dict[str, Any]:
     """A matt surface with this texture, its first row above."""
-    import mitsuba as mi
-
     bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
     colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
@@ -142,8 +139,6 @@ def paint(texture: np.ndarray) -> dict[str, Any]:
 
 def _sensor(camera: Camera) -> Any:
     """Mitsuba's own camera: x left and y up, half a pixel as here."""
-    import mitsuba as mi
-
     return mi.load_dict(
         {
             "type": "perspective",
@@ -156,8 +151,6 @@ def _sensor(camera: Camera) -> Any:
 
 def _speckled(mesh: trimesh.Trimesh) -> Any:
     """The solid with matt speckles of 3 and 10 mm on its vertices."""
-    import mitsuba as mi
-
     from mitsplat.plugins.device import plain_mesh
 
     fine = mesh.subdivide_to_size(0.0012)
@@ -206,8 +199,6 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> 
 
 def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> list[float]:
     """IoU of each photo's mask with the true silhouette."""
-    import mitsuba as mi
-
     from mitsplat.plugins.device import plain_mesh
 
     solid = mi.load_dict({"type": "scene", "solid": plain_mesh(mesh, mi.Properties())})
@@ -246,7 +237,9 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba's, such as cuda_ad_rgb")
     args = parser.parse_args()
+    mi.set_variant(args.variant)
     mesh, views, photos = solid(), cameras(args.views, args.width), args.out / "photos"
     ensure_variant()
     scene = table_scene(BOARD, np.random.default_rng(5)) | {"solid": _speckled(mesh)}

@@ -154,6 +154,7 @@ def _speckled(mesh: trimesh.Trimesh) -> Any:
     from mitsplat.plugins.device import plain_mesh
 
     fine = mesh.subdivide_to_size(0.0012)
+    fine.update_faces(fine.nondegenerate_faces())
     rng = np.random.default_rng(3)
     shade = np.zeros((len(fine.vertices), 3))
     for size in (0.003, 0.01):

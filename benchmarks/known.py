@@ -224,7 +224,7 @@ def drop(asset: Path, out: Path) -> int:
     }
     out.mkdir(parents=True, exist_ok=True)
     (out / "scene.yaml").write_text(json.dumps(scene))
-    path = write_dataset(load_scene(out / "scene.yaml"), out / "frames", overwrite=True).path
+    path = write_dataset(load_scene(out / "scene.yaml", allow_outside=True), out / "frames", overwrite=True).path
     record = json.loads((path / "manifest.jsonl").read_text().splitlines()[0])
     return len(record["labels"]["instances"])
 

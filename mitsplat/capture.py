@@ -72,6 +72,7 @@ class CaptureSpec(_Strict):
 
     units: Literal["metre", "unknown"]
     up: Literal["z", "unknown"]
+    table: bool = False
     scale_error: Annotated[float, Field(ge=0)] | None = None
     rejected: dict[str, str]
     photos: list[PhotoSpec]
@@ -139,6 +140,7 @@ class Capture:
         colours: Of the points, display-encoded 8-bit, shape (N, 3).
         units: Whether cameras and points are in metres; if not, their scale is arbitrary.
         up: Whether +z points against gravity.
+        table: Whether z = 0 is the plane that the object stands on.
         rejected: Why a given photo is not among ``photos``, one clause, by name.
         scale_error: Estimated relative error of the metric scale, if known.
 
@@ -153,6 +155,7 @@ class Capture:
     up: Literal["z", "unknown"] = "unknown"
     rejected: Mapping[str, str] = field(default_factory=dict)
     scale_error: float | None = None
+    table: bool = False
 
     def __post_init__(self) -> None:
         photos = tuple(sorted(self.photos, key=lambda photo: photo.name))
@@ -239,6 +242,7 @@ class Capture:
             spec = CaptureSpec(
                 units=self.units,
                 up=self.up,
+                table=self.table,
                 scale_error=self.scale_error,
                 rejected=dict(sorted(self.rejected.items())),
                 photos=[_photo_spec(photo, folder) for photo in photos],
@@ -281,7 +285,8 @@ class Capture:
             mask = None if entry.mask is None else _named_file(folder, entry.mask)
             photos.append(Photo(entry.name, file, camera, mask, indices))
         try:
-            return cls(tuple(photos), points, colours, spec.units, spec.up, spec.rejected, spec.scale_error)
+            known = spec.units, spec.up, spec.rejected, spec.scale_error, spec.table
+            return cls(tuple(photos), points, colours, *known)
         except ValueError as error:
             raise InputError(f"{folder}: {error}") from error
 

@@ -125,7 +125,8 @@ def reconstruct_asset(
         masks = [view.mask for view in views] if kind == "object" else None
         seen_by = [view.camera for view in views] if kind == "object" else cameras
         telling_surface = telling("finding the surface")
-        mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, progress=telling_surface)
+        floor = 0.0 if kind == "object" and capture.table else None
+        mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, floor=floor, progress=telling_surface)
     else:
         mesh, alignment = _placed(imported, splats, cameras)
         mesh = simplify_surface(mesh, settings.surface.faces)

@@ -4,7 +4,8 @@ The hull (Laurentini 1994) is the set of points that every mask shows as object;
 photograph looks, and knows nothing of hollows. Depth that the splats are rendered to is fused into a truncated signed
 distance (Curless and Levoy 1996), which cuts the hollows out, and only as deep as the views agree on. Both are
 distances on one grid, positive inside: their minimum is the intersection, and marching cubes (Lorensen and Cline 1987)
-takes its zero for the surface.
+takes its zero for the surface. Below an object that stands on a table the hull sags, because no camera looks there: the
+table bounds it.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ def reconstruct_surface(
     masks: Sequence[npt.NDArray[np.float32]] | None = None,
     settings: SurfaceSettings = SurfaceSettings(),
     *,
+    floor: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the splats in their own frame.
@@ -93,6 +95,7 @@ def reconstruct_surface(
         masks: Share of each pixel of their pictures that is the object, (H, W) each; None leaves the hull out, as
             surroundings need.
         settings: Resolution and size.
+        floor: Height z of the table that the object stands on, if it does.
         progress: Told after every view how many of how many are done.
 
     Returns:
@@ -111,6 +114,8 @@ def reconstruct_surface(
         if progress is not None:
             progress(number + 1, len(cameras))
     distance, known = grid.combine(state, settings.blur)
+    if floor is not None:
+        distance = np.minimum(distance, grid.heights() - np.float32(floor))
     # A border outside closes the surface at the edge of the grid.
     padded, known = np.pad(distance, 1, constant_values=-grid.truncation), np.pad(known, 1, constant_values=masked)
     try:
@@ -223,6 +228,10 @@ class _Grid:
         cell = float((high - low).max()) / settings.voxels
         shape = np.maximum(np.ceil((high - low) / cell).astype(int), 1)
         return cls(low, cell, (int(shape[0]), int(shape[1]), int(shape[2])), settings.truncation * cell)
+
+    def heights(self) -> npt.NDArray[np.float32]:
+        """Height z of the middles of the layers of cells, shape (cells along z,)."""
+        return np.asarray(self.low[2] + self.cell * (np.arange(self.shape[2]) + 0.5), dtype=np.float32)
 
     def start(self, silhouettes: int) -> _State:
         ensure_variant()

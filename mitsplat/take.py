@@ -191,6 +191,8 @@ def capture_photos(
         up=anchor.up,
         rejected=rejected,
         scale_error=anchor.scale_error,
+        # Masks that were given need no table; then z = 0 of given poses may be anything.
+        table=anchor.table and (not settings.metric or settings.masks is settings.mask_model is None),
     ).transformed(anchor.matrix)
     # What is near depends on what the units are; poses carry none.
     capture = replace(capture, photos=tuple(replace(p, camera=replace(p.camera, near=0.01)) for p in capture.photos))

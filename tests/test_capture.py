@@ -44,6 +44,7 @@ def capture(tmp_path: Path) -> Capture:
         up="z",
         rejected={"blurred: 1.jpg": "it is blurred"},
         scale_error=1e-3 / 3,
+        table=True,
     )
 
 
@@ -55,7 +56,7 @@ def test_saved_captures_come_back_exactly(capture: Capture, tmp_path: Path) -> N
     loaded = Capture.load(tmp_path / "a")
     np.testing.assert_array_equal(loaded.points, capture.points)
     np.testing.assert_array_equal(loaded.colours, capture.colours)
-    for name in ("units", "up", "rejected", "scale_error"):
+    for name in ("units", "up", "rejected", "scale_error", "table"):
         assert getattr(loaded, name) == getattr(capture, name)
     assert [photo.name for photo in loaded.photos] == [f"view {number}.png" for number in range(10)]
     for one, other in zip(loaded.photos, capture.photos, strict=True):

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from mitsplat.pipeline import AssetJob, Finished, make_asset, make_photo_asset, 
 from mitsplat.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
 from mitsplat.scene import load_scene
 from mitsplat.surface import SurfaceSettings
-from mitsplat.take import CaptureSettings
+from mitsplat.take import CaptureResult, CaptureSettings
 from mitsplat.verdict import Verdict
 
 SETTINGS = ReconstructSettings(surface=SurfaceSettings(voxels=96, faces=4000), view_size=160, verdict_size=160)
@@ -150,6 +149,15 @@ def test_a_drawing_gives_a_capture_its_scale(known_object: KnownObject) -> None:
     assert found.verdict.offset < 0.003
 
 
+def test_an_object_ends_on_the_table_that_it_stood_on(known_object: KnownObject) -> None:
+    """The lower half of the object is below z = 0, where a capture that knows of its table expects nothing."""
+    capture = replace(known_object.capture, table=True)
+    found = reconstruct_asset(capture, known_object.splats, name="part", settings=SETTINGS)
+    assert found.asset.mesh is not None
+    assert found.asset.mesh.bounds[0, 2] == pytest.approx(0, abs=1e-3)
+    assert found.asset.mesh.is_volume
+
+
 def test_surroundings_need_no_masks_and_get_an_open_mesh(known_object: KnownObject) -> None:
     photos = tuple(replace(photo, mask=None) for photo in known_object.capture.photos)
     capture = replace(known_object.capture, photos=photos)
@@ -195,14 +203,21 @@ def test_photos_go_through_all_stages_and_stale_fits_are_replaced(
     def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:
         overwritten.append(overwrite)
 
-    captured = SimpleNamespace(capture=known_object.capture.save(tmp_path / "asset" / "capture"))
+    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, *, progress: object) -> Finished:
+        assert (capture, fit) == (out / "capture", out / "fit")
+        return Finished(out, GOOD, kept=False)
+
+    capture = known_object.capture.save(tmp_path / "asset" / "capture")
+    captured = CaptureResult(capture, 32, "a board", 0.5, doubtful={"05.png": 0.6})
     monkeypatch.setattr("mitsplat.take.capture_photos", lambda photos, out, settings, progress: captured)
     monkeypatch.setattr("mitsplat.fit.fit_capture", fit_capture)
-    monkeypatch.setattr("mitsplat.pipeline.make_asset", lambda capture, fit, out, job, progress: (capture, fit, out))
+    monkeypatch.setattr("mitsplat.pipeline.make_asset", made_of)
     job = AssetJob(name="part")
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):
         made = make_photo_asset(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)
-    assert made == (tmp_path / "asset" / "capture", tmp_path / "asset" / "fit", tmp_path / "asset")
+    assert made.folder == tmp_path / "asset"
+    assert made.warnings == captured.warnings
+    assert "05.png (60%)" in made.warnings[0]
     assert overwritten == [False, False, True]
 
 

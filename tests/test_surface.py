@@ -54,6 +54,20 @@ def test_depth_opens_the_pocket_that_no_silhouette_shows(known_object: KnownObje
     assert Surface(surface).signed_distances(middle)[0] == pytest.approx(depth, abs=0.001)
 
 
+def test_the_table_ends_what_no_camera_looks_under(known_object: KnownObject) -> None:
+    """Photos from above alone: the hull hangs through the table that the ball stands on, z = -0.05."""
+    cameras, masks = views_of(known_object)
+    above = [number for number, camera in enumerate(cameras) if camera.centre[2] > 0.05]
+    views = [cameras[number] for number in above], [masks[number] for number in above]
+    settings = SurfaceSettings(voxels=64, faces=4000)
+    hanging = reconstruct_surface(known_object.splats, *views, settings)
+    standing = reconstruct_surface(known_object.splats, *views, settings, floor=-0.05)
+    assert hanging.bounds[0, 2] < -0.054
+    assert standing.is_volume
+    assert standing.bounds[0, 2] == pytest.approx(-0.05, abs=2e-4)
+    assert chamfer(standing, known_object.mesh) < chamfer(hanging, known_object.mesh)
+
+
 def test_surroundings_need_no_masks(known_object: KnownObject) -> None:
     cameras, _ = views_of(known_object)
     found = reconstruct_surface(known_object.splats, cameras, settings=SurfaceSettings(voxels=64))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mitsplat.cache import cache_folder
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
 from mitsplat.dataset import write_dataset
-from mitsplat.scene import load_scene
+from mitsplat.scene import Scene, load_scene
 from mitsplat.settle import warp_settings
 from mitsplat.spec import FORMATS
 from mitsplat.splats import Splats
@@ -87,23 +87,39 @@ def write_scene(tmp_path: Path) -> WriteScene:
     return write
 
 
+def small_scene(folder: Path, assets: Sequence[Asset], objects: list[dict[str, Any]], **output: Any) -> Scene:
+    """A scene in ``folder`` of assets that fall before an orbiting camera, in images of 64x48."""
+    for asset in assets:
+        asset.save(folder / "assets" / asset.name)
+    data = {
+        "name": "small",
+        "objects": objects,
+        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+        "output": {"width": 64, "height": 48, **output},
+    }
+    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
+    return load_scene(folder / "scene.yaml")
+
+
+def nut_and_bolt() -> list[Asset]:
+    """Two assets with a named point each."""
+    boxes = box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))
+    return [replace(box, keypoints={"top": (0, 0, 0.005)}) for box in boxes]
+
+
+BOTH = [{"asset": "assets/nut"}, {"asset": "assets/bolt"}]
+"""The objects of these."""
+
+
 @pytest.fixture(scope="session")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small dataset of drawn frames in every format, to be left as it is."""
     from test_dataset import render, settle
 
     folder = tmp_path_factory.mktemp("clean")
-    for asset in (box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))):
-        replace(asset, keypoints={"top": (0, 0, 0.005)}).save(folder / "assets" / asset.name)
-    data = {
-        "name": "small",
-        "objects": [{"asset": "assets/nut"}, {"asset": "assets/bolt"}],
-        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
-        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
-        "output": {"width": 64, "height": 48, "layouts": 3, "views": 2, "formats": list(FORMATS)},
-    }
-    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
-    return write_dataset(load_scene(folder / "scene.yaml"), folder / "out", render=render, settle=settle).path
+    scene = small_scene(folder, nut_and_bolt(), BOTH, layouts=3, views=2, formats=list(FORMATS))
+    return write_dataset(scene, folder / "out", render=render, settle=settle).path
 
 
 @pytest.fixture

@@ -16,13 +16,11 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from conftest import box_asset
-from ruamel.yaml import YAML
+from conftest import box_asset, small_scene
 from test_dataset import contents, render, settle, write
 
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.manifest import Manifest
-from mitsplat.scene import load_scene
 
 CHILD = """
 import sys
@@ -48,16 +46,8 @@ def slow(seconds, scene, index, *, layout):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    box_asset("nut").save(folder / "nut")
-    data = {
-        "name": "small",
-        "objects": [{"asset": "nut", "count": 2}],
-        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
-        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
-        "output": {"width": 64, "height": 48, "layouts": 4, "views": 5, "formats": ["yolo", "coco", "exr"]},
-    }
-    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
-    return load_scene(folder / "scene.yaml")
+    objects = [{"asset": "assets/nut", "count": 2}]
+    return small_scene(folder, [box_asset("nut")], objects, layouts=4, views=5, formats=["yolo", "coco", "exr"])
 
 
 @pytest.fixture(scope="module")

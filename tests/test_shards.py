@@ -8,6 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from conftest import BOTH, nut_and_bolt, small_scene
 from test_cli import run
 from test_dataset import contents, render, settle, write
 from test_faults import KilledOnce
@@ -24,23 +25,8 @@ from mitsplat.spec import FORMATS
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    from dataclasses import replace
-
-    from conftest import box_asset
-    from ruamel.yaml import YAML
-
     folder = tmp_path_factory.mktemp("scene")
-    for name in ("nut", "bolt"):
-        replace(box_asset(name), keypoints={"top": (0, 0, 0.005)}).save(folder / name)
-    data = {
-        "name": "small",
-        "objects": [{"asset": "nut"}, {"asset": "bolt"}],
-        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
-        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
-        "output": {"width": 64, "height": 48, "layouts": 3, "views": 4, "formats": list(FORMATS)},
-    }
-    YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
-    return load_scene(folder / "scene.yaml")
+    return small_scene(folder, nut_and_bolt(), BOTH, layouts=3, views=4, formats=list(FORMATS))
 
 
 @pytest.fixture(scope="module")

@@ -310,6 +310,13 @@ def test_a_crash_of_colmap_is_one_sentence(tmp_path: Path, monkeypatch: pytest.M
         capture_photos(tmp_path / "photos", tmp_path / "out")
 
 
+def model_of(capture: Capture, count: int | None = None) -> Model:
+    """The first photos of a capture as structure from motion would have found them."""
+    photos = capture.photos[:count]
+    cameras, seen = ({photo.file.name: getattr(photo, key) for photo in photos} for key in ("camera", "seen"))
+    return Model(cameras, capture.points, capture.colours, seen)
+
+
 def test_photos_of_two_things_end_with_status_4(
     captured: tuple[Path, Path, CaptureResult],
     tmp_path: Path,
@@ -317,15 +324,8 @@ def test_photos_of_two_things_end_with_status_4(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     given, _, result = captured
-    capture = result.capture
-    half = capture.photos[:8]
-    model = Model(
-        {photo.file.name: photo.camera for photo in half},
-        capture.points,
-        capture.colours,
-        {photo.file.name: photo.seen for photo in half},
-        frozenset(photo.file.name for photo in capture.photos[8:14]),
-    )
+    elsewhere = frozenset(photo.file.name for photo in result.capture.photos[8:14])
+    model = replace(model_of(result.capture, 8), elsewhere=elsewhere)
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
     assert run("capture", given, "-o", tmp_path / "out", "--square", 0.035, "--kind", "environment") == 4
     out, err = capsys.readouterr()
@@ -342,14 +342,8 @@ def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     given, _, result = captured
-    photos = result.capture.photos
-    model = Model(
-        {photo.file.name: photo.camera for photo in photos},
-        result.capture.points,
-        result.capture.colours,
-        {photo.file.name: photo.seen for photo in photos},
-    )
-    images = {photo.file.name: photo.file for photo in photos}
+    model = model_of(result.capture)
+    images = {photo.file.name: photo.file for photo in result.capture.photos}
     seen, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed - {"photo03.png"})
     model = replace(model, agreement=dict.fromkeys(model.cameras, 0.98) | {"photo03.png": 0.4, seen: 0.6})
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)

@@ -25,10 +25,13 @@ MAX_ERROR = 3.0
 """Reprojection error from which an observation of a target's corner is an outlier [px]."""
 
 MAX_CONTRADICTION = 0.0025
-"""Reprojection error of the fitted board from which a camera can be wrong, as a share of its image's width."""
+"""Error up to which a camera sees the board where it is, as a share of its image's longer edge."""
+
+_CERTAINLY_WRONG = 0.01
+"""Error from which a camera is wrong, in the same units; between the two it is if it stands out from the others."""
 
 _OUTLYING = 3.0
-"""A wrong camera's error is also so many times that of the median camera: a bent print is off in all of them."""
+"""Errors of the median camera from which one stands out."""
 
 PRINT_ERROR = 1e-4
 """Standard error with which a user measures the edge of a printed square or tag [m]."""
@@ -94,7 +97,7 @@ def find_anchor(
     Raises:
         InputError: If ``scale_from`` names places that do not exist.
     """
-    views, tag_views = _find_targets(model, images, board)
+    views, tag_views = _find_targets(model, images, board, tags=tag is not None)
     corners = _triangulate_corners(views, set(model.cameras))
     tags = _triangulate_tags(tag_views, set(model.cameras))
     wrong: dict[str, float] = {}
@@ -107,7 +110,7 @@ def find_anchor(
     if fitted := _fit_board(corners, board):
         pose, factor = fitted
         board_pose = pose
-        wrong, confirmed = _judge_cameras(views, board.corners / factor @ pose[:3, :3].T + pose[:3, 3])
+        wrong, confirmed = _judge_cameras(views, corners)
 
         def board_scale(names: set[str]) -> float | None:
             fitted = _fit_board(_triangulate_corners(views, names), board)
@@ -349,19 +352,19 @@ def _upright(normal: FloatArray, heading: FloatArray) -> FloatArray:
     return np.stack([x, np.cross(normal, x), normal])
 
 
-def _find_targets(model: Model, images: Mapping[str, Path], board: Board) -> tuple[_Views, _Views]:
+def _find_targets(model: Model, images: Mapping[str, Path], board: Board, *, tags: bool) -> tuple[_Views, _Views]:
     """Where images see the board's corners, (2,) by index and image, and AprilTags, (4, 2) by id and image."""
-    corners: _Views = {}
-    tags: _Views = {}
+    corner_views: _Views = {}
+    tag_views: _Views = {}
     for name, camera in model.cameras.items():
         grey = cv2.imread(str(images[name]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
         if grey is None:
             raise InputError(f"{images[name]}: not a readable image")
         pixels = np.asarray(grey, dtype=np.uint8)
-        for found, views in ((board.find(pixels), corners), (find_tags(pixels), tags)):
+        for found, views in ((board.find(pixels), corner_views), (find_tags(pixels) if tags else {}, tag_views)):
             for index, places in found.items():
                 views.setdefault(index, {})[name] = (camera, places)
-    return corners, tags
+    return corner_views, tag_views
 
 
 def _scale_error(scale: float, measure: Callable[[set[str]], float | None], images: list[str], edge: float) -> float:
@@ -400,24 +403,26 @@ def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, FloatArray]:
     return tags
 
 
-def _judge_cameras(views: _Views, corners: FloatArray) -> tuple[dict[str, float], frozenset[str]]:
-    """Images that see the board elsewhere than their cameras do, and by how far [px]; and those that see it there.
+def _judge_cameras(views: _Views, corners: Mapping[int, FloatArray]) -> tuple[dict[str, float], frozenset[str]]:
+    """Images that see the board elsewhere than the others do, and by how far [px]; and those that see it there.
 
-    Six of its corners must be seen. Cameras that few or repetitive points hold can be far off at small reprojection
-    errors.
+    Six corners (3,) that were triangulated must be seen. A bent print has them elsewhere than a flat one.
+    Cameras that few or repetitive points hold can be far off at small reprojection errors.
     """
     errors: dict[str, list[float]] = {}
-    widths = {}
-    for index, seen in views.items():
-        for name, (camera, pixel) in seen.items():
-            error = np.linalg.norm(camera.project(corners[index])[0][0] - pixel)
+    edges = {}
+    for index, point in corners.items():
+        for name, (camera, pixel) in views[index].items():
+            error = np.linalg.norm(camera.project(point)[0][0] - pixel)
             errors.setdefault(name, []).append(float(np.nan_to_num(error, nan=np.inf)))
-            widths[name] = camera.width
-    medians = {name: float(np.median(values)) for name, values in errors.items() if len(values) >= 6}
-    usual = _OUTLYING * float(np.median([medians[name] / widths[name] for name in medians])) if medians else 0.0
-    limit = max(MAX_CONTRADICTION, usual)
-    wrong = {name: error for name, error in medians.items() if error > limit * widths[name]}
-    return wrong, frozenset(medians.keys() - wrong.keys())
+            edges[name] = max(camera.width, camera.height)
+    shares = {name: float(np.median(found)) / edges[name] for name, found in errors.items() if len(found) >= 6}
+    if not shares:
+        return {}, frozenset()
+    outlying = _OUTLYING * float(np.median(list(shares.values())))
+    limit = min(max(MAX_CONTRADICTION, outlying), _CERTAINLY_WRONG)
+    wrong = {name: share * edges[name] for name, share in shares.items() if share > limit}
+    return wrong, frozenset(name for name, share in shares.items() if share <= MAX_CONTRADICTION)
 
 
 def _fit_board(corners: Mapping[int, FloatArray], board: Board) -> tuple[FloatArray, float] | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +17,12 @@ _DOTS = 16
 """Samples along a square's edge."""
 
 _RIM = 3
-"""Samples beyond a square that must be as printed as well: a black square shows nothing but its edges."""
+"""Samples of the squares around one that must be as printed as well: a black square shows nothing but its edges."""
 
 _LIKENESS = 0.9
 """Correlation with the print from which a square is bare."""
 
-_BLOT = 0.4
+_BLOT = 0.3
 """Largest difference from the print anywhere in a bare square, as a share of the contrast of black and white."""
 
 
@@ -28,7 +30,8 @@ def bare_squares(board: Board, world_from_board: FloatArray, camera: Camera, gre
     """Pixels of the squares that an image shows as they are printed, shape (H, W).
 
     Each square is laid flat and compared with the print, up to the brightness and contrast of the light there. A square
-    counts only as a whole, with what surrounds it, so that what covers a part of it leaves none of it.
+    counts only as a whole, with the edges of those around it, so that what covers a part of it leaves none of it. What
+    is thinner than a tenth of a square, or covers a few modules of a marker in a grey like theirs, can go unseen.
 
     Args:
         board: The print.
@@ -38,33 +41,32 @@ def bare_squares(board: Board, world_from_board: FloatArray, camera: Camera, gre
     """
     found = np.zeros(grey.shape, dtype=np.uint8)
     flat, shown = _laid_flat(board, world_from_board, camera, grey)
-    print_ = _blurred(
-        np.pad(cv2.resize(board.draw(4 * _DOTS), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), _RIM)
-    )
-    flat = _blurred(flat)
-    inside = np.zeros(flat.shape, dtype=bool)
-    inside[_RIM:-_RIM, _RIM:-_RIM] = True  # beyond the board anything may lie
+    printed = _printed(board)
     corners = _places(board, np.arange(board.columns + 1.0), np.arange(board.rows + 1.0))
-    pixels, _ = camera.project(corners.reshape(-1, 3) @ world_from_board[:3, :3].T + world_from_board[:3, 3])
-    pixels = pixels.reshape(board.rows + 1, board.columns + 1, 2)
+    pixels = _seen(corners, world_from_board, camera)
     for row in range(board.rows):
         for column in range(board.columns):
-            window = tuple(slice(k * _DOTS, (k + 1) * _DOTS + 2 * _RIM) for k in (row, column))
-            use = inside[window]
-            if shown[window][use].all() and _alike(flat[window][use], print_[window][use]):
+            window = tuple(slice(max(0, k * _DOTS - _RIM), (k + 1) * _DOTS + _RIM) for k in (row, column))
+            if shown[window].all() and _alike(flat[window], printed[window]):
                 outline = pixels[[row, row, row + 1, row + 1], [column, column + 1, column + 1, column]]
                 cv2.fillConvexPoly(found, np.rint((outline - 0.5) * 16).astype(np.int32), 1, shift=4)
     return found > 0
 
 
+@cache
+def _printed(board: Board) -> FloatArray:
+    """The print, 0 to 255, in the samples of :func:`_laid_flat`."""
+    return _blurred(cv2.resize(board.draw(4 * _DOTS), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA))
+
+
 def _alike(values: FloatArray, printed: FloatArray) -> bool:
     """Whether values are those of the print, times and plus something."""
     values, printed = values - values.mean(), printed - printed.mean()
-    spread = float(printed @ printed)
-    contrast = float(values @ printed) / spread
+    spread = float((printed * printed).sum())
+    contrast = float((values * printed).sum()) / spread
     if not contrast > 0:
         return False
-    likeness = contrast * np.sqrt(spread / float(values @ values))
+    likeness = contrast * np.sqrt(spread / float((values * values).sum()))
     # The print is 0 to 255, so the contrast is that of the image's black and white as well.
     return bool(likeness > _LIKENESS and np.abs(values - contrast * printed).max() < _BLOT * 255 * contrast)
 
@@ -75,20 +77,25 @@ def _places(board: Board, x: FloatArray, y: FloatArray) -> FloatArray:
     return np.stack([across - board.columns / 2, board.rows / 2 - down, np.zeros_like(down)], axis=-1) * board.square
 
 
+def _seen(places: FloatArray, world_from_board: FloatArray, camera: Camera) -> FloatArray:
+    """Pixel positions (..., 2) of places on the board (..., 3)."""
+    pixels, _ = camera.project(places.reshape(-1, 3) @ world_from_board[:3, :3].T + world_from_board[:3, 3])
+    return pixels.reshape(*places.shape[:-1], 2)
+
+
 def _laid_flat(
     board: Board, world_from_board: FloatArray, camera: Camera, grey: npt.NDArray[np.uint8]
 ) -> tuple[FloatArray, BoolArray]:
-    """The board and its rim in samples of the image, and which of these the image holds."""
-    x, y = ((np.arange(-_RIM, n * _DOTS + _RIM) + 0.5) / _DOTS for n in (board.columns, board.rows))
-    places = _places(board, x, y)
-    pixels, _ = camera.project(places.reshape(-1, 3) @ world_from_board[:3, :3].T + world_from_board[:3, 3])
-    pixels = pixels.reshape(*places.shape[:2], 2)
+    """The board in samples of the image, and which of these the image holds."""
+    x, y = ((np.arange(n * _DOTS) + 0.5) / _DOTS for n in (board.columns, board.rows))
+    pixels = _seen(_places(board, x, y), world_from_board, camera)
     shown = np.asarray(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1))
-    step = float(np.nanmedian(np.linalg.norm(np.diff(pixels, axis=1), axis=-1))) if shown.any() else 1.0
+    steps = np.linalg.norm(np.diff(pixels, axis=1), axis=-1)[shown[:, 1:] & shown[:, :-1]]
+    step = float(np.median(steps)) if len(steps) else 1.0
     smooth = cv2.GaussianBlur(grey, (0, 0), max(0.3, 0.4 * step))
     grid = np.nan_to_num(pixels - 0.5, nan=-1.0).astype(np.float32)
     flat = cv2.remap(smooth, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return flat.astype(np.float64), shown
+    return _blurred(flat), shown
 
 
 def _blurred(image: npt.NDArray[np.generic]) -> FloatArray:

@@ -42,7 +42,8 @@ class Board:
         square: Edge of a square as printed [m].
 
     Raises:
-        InputError: If there are fewer than 3x3 squares, more than the dictionary has markers, or no size.
+        InputError: If there are fewer than 3x4 squares, which have six inner corners, more than the dictionary has
+            markers, or no size.
     """
 
     columns: int = 7
@@ -50,8 +51,8 @@ class Board:
     square: float = 0.035
 
     def __post_init__(self) -> None:
-        if min(self.columns, self.rows) < 3 or self.columns * self.rows > 500:
-            raise InputError(f"a board must have 3x3 to 500 squares (got {self.columns}x{self.rows})")
+        if min(self.columns, self.rows) < 3 or not 12 <= self.columns * self.rows <= 500:
+            raise InputError(f"a board must have 3x4 to 500 squares (got {self.columns}x{self.rows})")
         if not 0 < self.square < np.inf:
             raise InputError(f"a board's square must be > 0 m (got {self.square})")
 

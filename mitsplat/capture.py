@@ -140,7 +140,7 @@ class Capture:
         colours: Of the points, display-encoded 8-bit, shape (N, 3).
         units: Whether cameras and points are in metres; if not, their scale is arbitrary.
         up: Whether +z points against gravity.
-        table: Whether z = 0 is the plane that the object stands on.
+        table: Whether z = 0 is a plane that things stand on.
         rejected: Why a given photo is not among ``photos``, one clause, by name.
         scale_error: Estimated relative error of the metric scale, if known.
 
@@ -187,7 +187,9 @@ class Capture:
         return tuple(photo for index, photo in enumerate(self.photos) if index % HELD_OUT_EVERY)
 
     def transformed(self, matrix: npt.ArrayLike) -> Capture:
-        """Cameras and points after a similarity transform (4, 4), near distances scaled; what the units are is left.
+        """Cameras and points after a similarity transform (4, 4), near distances scaled; units and up are left.
+
+        Where the table is, is forgotten.
 
         Raises:
             ValueError: If the matrix shears, mirrors or scales unevenly.
@@ -208,6 +210,7 @@ class Capture:
             self,
             photos=tuple(replace(photo, camera=moved(photo.camera)) for photo in self.photos),
             points=self.points @ matrix[:3, :3].T + matrix[:3, 3],
+            table=False,
         )
 
     def save(self, folder: str | PathLike[str]) -> Capture:
@@ -285,8 +288,8 @@ class Capture:
             mask = None if entry.mask is None else _named_file(folder, entry.mask)
             photos.append(Photo(entry.name, file, camera, mask, indices))
         try:
-            known = spec.units, spec.up, spec.rejected, spec.scale_error, spec.table
-            return cls(tuple(photos), points, colours, *known)
+            known = {key: getattr(spec, key) for key in ("units", "up", "rejected", "scale_error", "table")}
+            return cls(tuple(photos), points, colours, **known)
         except ValueError as error:
             raise InputError(f"{folder}: {error}") from error
 

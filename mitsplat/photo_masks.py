@@ -184,14 +184,14 @@ def agreed_masks(masked: Capture, points: FloatArray, bare: Bare | None = None) 
     hull, cell = _agreed_hull([(camera, mask) for camera, _, mask in small.values()], points)
 
     def make(photo: Photo) -> BoolArray:
-        camera, rgb, mask = small[photo.name] if photo.name in small else _reduced(photo)
+        camera, bgr, mask = small[photo.name] if photo.name in small else _reduced(photo)
         silhouette = _silhouette(hull, cell, camera)
         size = float(np.sqrt(np.count_nonzero(silhouette)))
         if size > 0:
             near = _grown(silhouette, _DOUBT * size)
             core = ~_grown(~silhouette, _DOUBT * size)
-            free = _free(bare, camera, rgb)
-            mask = _cut(rgb, near, silhouette & (mask | core), core, free, _DOUBT * size)
+            free = _free(bare, camera, bgr)
+            mask = _cut(bgr, near, silhouette & (mask | core), core, free, _DOUBT * size)
         return _enlarged(mask, photo.camera)
 
     return make

@@ -192,7 +192,7 @@ def undistort(photo: Photo) -> Photo:
     x, y = cv2.initUndistortRectifyMap(*lens, np.eye(3), pinhole, size, cv2.CV_32FC1)
     rgb, _ = photo.picture()
     pixels = cv2.remap(np.rint(255 * rgb).astype(np.uint8), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    file = photo.file.with_suffix(".undistorted.png")
+    file = photo.file.with_name(f"{photo.file.name}.undistorted.png")
     write_file(file, lambda part: Image.fromarray(np.asarray(pixels)).save(part, "PNG"))
     (fx, _, cx), (_, fy, cy), _ = (pinhole + half).tolist()
     return replace(photo, file=file, camera=replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=()))

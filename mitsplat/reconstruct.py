@@ -125,7 +125,7 @@ def reconstruct_asset(
         masks = [view.mask for view in views] if kind == "object" else None
         seen_by = [view.camera for view in views] if kind == "object" else cameras
         telling_surface = telling("finding the surface")
-        floor = 0.0 if kind == "object" and capture.table else None
+        floor = 0.0 if kind == "object" and capture.table and _stands(splats) else None
         mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, floor=floor, progress=telling_surface)
     else:
         mesh, alignment = _placed(imported, splats, cameras)
@@ -152,6 +152,19 @@ def reconstruct_asset(
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
     return Reconstruction(asset, verdict, held_out, isolation, alignment)
+
+
+_BELOW = 0.02
+"""Share of an object that may be found below the table that it stands on, in Gaussians and in height."""
+
+
+def _stands(splats: Splats) -> bool:
+    """Whether z = 0 can be what an object stands on: tags may be on the object itself, a board beside it on a box."""
+    height = splats.means[:, 2]
+    return bool(
+        np.quantile(height, _BELOW)
+        > -_BELOW * np.ptp(np.quantile(splats.means, (_BELOW, 1 - _BELOW), axis=0), axis=0).max()
+    )
 
 
 def _placed(

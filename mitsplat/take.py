@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -141,9 +141,11 @@ def capture_photos(
         progress: Told steps done, of how many, and what is being done.
 
     Raises:
-        InputError: If there are fewer than three usable photographs, or no cameras can be found from them.
+        InputError: If there are fewer than three usable photographs, or no cameras can be found from them, or what is
+            given lies where the capture is written.
         MissingResourceError: If COLMAP or the masks' model fails to run.
     """
+    _keep_apart(out, photos, settings.masks)
     files = find_photos(photos)
     if len(files) < MIN_PHOTOS:
         raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
@@ -152,34 +154,35 @@ def capture_photos(
         return done
     work = out / "sfm"
     (out / _INPUTS).unlink(missing_ok=True)
-    _forget_other_photos(out, inputs)
+    _forget_other_photos(out, inputs, settings)
     prepared, rejected = prepare_photos(
         photos, out / "images", max_size=settings.max_size, upright=settings.poses is None, progress=progress
     )
     if len(prepared) < MIN_PHOTOS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
+    by_file = {photo.file.name: photo for photo in prepared}
     faults: dict[str, str] = {}
     if settings.poses is not None:
         model = read_poses(settings.poses, prepared, work, progress)
     else:
         model, faults = _without_faults(find_cameras(prepared, work, progress))
-    _demand(len(model.cameras), len(prepared), photos)
-    by_file = {photo.file.name: photo for photo in prepared}
+    _demand_cameras(photos, model, by_file, faults)
     anchor = _anchored(model, by_file, settings)
     while anchor.wrong:
         faults |= {
             file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
             for file, error in anchor.wrong.items()
         }
-        model = model.without(anchor.wrong)
-        _demand(len(model.cameras), len(prepared), photos)
+        model, further = _without_faults(model.without(anchor.wrong), least=0 if settings.poses else MIN_POINTS)
+        faults |= further
+        _demand_cameras(photos, model, by_file, faults)
         anchor = _anchored(model, by_file, settings)
-    rejected |= {
-        photo.name: faults.get(file) or _absent(file, model)
-        for file, photo in by_file.items()
-        if file not in model.cameras
-    }
+    absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
+    if model.elsewhere:
+        elsewhere = "it only fits a smaller group of photos, as of another object or side"
+        faults |= {file: elsewhere for file in model.elsewhere if file not in faults}
+    rejected |= {photo.name: faults.get(file, absent) for file, photo in by_file.items() if file not in model.cameras}
     capture = Capture(
         photos=tuple(
             Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
@@ -191,11 +194,10 @@ def capture_photos(
         up=anchor.up,
         rejected=rejected,
         scale_error=anchor.scale_error,
-        # Masks that were given need no table; then z = 0 of given poses may be anything.
-        table=anchor.table and (not settings.metric or settings.masks is settings.mask_model is None),
     ).transformed(anchor.matrix)
     # What is near depends on what the units are; poses carry none.
-    capture = replace(capture, photos=tuple(replace(p, camera=replace(p.camera, near=0.01)) for p in capture.photos))
+    near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
+    capture = replace(capture, photos=near, table=anchor.table)
     if settings.undistorted:
         capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
     if settings.kind == "object":
@@ -211,18 +213,29 @@ def capture_photos(
         if path.name not in used:
             path.unlink()
     write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
+    kept = {photo.name for photo in capture.photos}
     doubtful = {
         by_file[file].name: share
         for file, share in model.agreement.items()
-        if share < SURE_AGREEMENT and file in used and file not in anchor.confirmed
+        if share < SURE_AGREEMENT and file not in anchor.confirmed and by_file[file].name in kept
     }
-    record: dict[str, Any] = {
-        "source": anchor.source,
-        "reprojection_error": model.reprojection_error,
-        "doubtful": doubtful,
-    }
-    write_text(out / _INPUTS, json.dumps({"inputs": inputs} | record, indent=1))
-    return CaptureResult(capture, len(files), **record)
+    result = CaptureResult(capture, len(files), anchor.source, model.reprojection_error, doubtful)
+    record = {key: getattr(result, key) for key in _RECORDED}
+    write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
+    return result
+
+
+_RECORDED = ("source", "reprojection_error", "doubtful")
+
+
+def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
+    """Refuse to write among what was given: files of a capture that are no longer needed are removed."""
+    if out.resolve().is_relative_to(photos.resolve()):
+        raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
+    for given in (photos, masks):
+        for made in ("images", "masks", "sfm"):
+            if given is not None and given.resolve().is_relative_to((out / made).resolve()):
+                raise InputError(f"{given}: must not lie in {out / made}, which is written anew")
 
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
@@ -248,50 +261,46 @@ def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
         if record["inputs"] != inputs:
             return None
         capture = Capture.load(out)
-        return CaptureResult(capture, len(record.pop("inputs")["photos"]), **record)
+        return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
     except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
         return None
 
 
-def _forget_other_photos(out: Path, inputs: dict[str, object]) -> None:
+def _forget_other_photos(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
     """Drop copies and matches that were made of other photographs or at another size."""
-    settings = inputs["settings"]
-    marker = json.dumps([inputs["photos"], settings], sort_keys=True) if isinstance(settings, dict) else ""
+    marker = json.dumps([inputs["photos"], settings.max_size, settings.poses is None], sort_keys=True)
     file = out / "sfm" / "photos.json"
     if not (file.exists() and file.read_text() == marker):
-        for folder in ("sfm", "images", "masks"):
-            shutil.rmtree(out / folder, ignore_errors=True)
+        shutil.rmtree(out / "sfm", ignore_errors=True)
+        shutil.rmtree(out / "images", ignore_errors=True)
         write_text(file, marker)
+    elif settings.undistorted:  # the pictures of an earlier run may bear the names of the copies
+        shutil.rmtree(out / "images", ignore_errors=True)
+    shutil.rmtree(out / "masks", ignore_errors=True)
 
 
-def _demand(found: int, given: int, photos: Path) -> None:
+def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared], faults: Mapping[str, str]) -> None:
     """Refuse too few cameras."""
-    if found < MIN_PHOTOS:
+    if len(model.cameras) < MIN_PHOTOS:
+        reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
         raise InputError(
-            f"{photos}: cameras of only {found} of {given} photos could be found, {MIN_PHOTOS} are needed; take them "
-            "closer together, and with texture on or under the object"
+            f"{photos}: cameras of only {len(model.cameras)} of {len(by_file)} photos could be found, {MIN_PHOTOS} are "
+            f"needed{f' ({reasons})' if reasons else ''}; take them closer together, and with texture on or under the "
+            "object"
         )
 
 
-def _without_faults(model: Model) -> tuple[Model, dict[str, str]]:
-    """The model without cameras that are weakly held or contradict the others, and why each is left out."""
-    model, weak = model.without_weak()
+def _without_faults(model: Model, least: int = MIN_POINTS) -> tuple[Model, dict[str, str]]:
+    """The model without cameras that contradict the others or observe fewer points, and why each is left out."""
+    shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
+    wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
+    model, weak = model.without(wrong).without_weak(least)
     faults = {
-        file: f"only {points} points could be matched in it, {MIN_POINTS} are needed" for file, points in weak.items()
-    }
-    wrong = {file: model.agreement.get(file, 1.0) for file in model.cameras}
-    wrong = {file: share for file, share in wrong.items() if share < MIN_AGREEMENT}
-    faults |= {
         file: f"its camera is wrong: it explains only {share:.0%} of its matches" for file, share in wrong.items()
     }
-    return model.without(wrong), faults
-
-
-def _absent(file: str, model: Model) -> str:
-    """Why structure from motion left a photo out."""
-    if file in model.elsewhere:
-        return "it only fits a smaller group of photos, as of another object or side"
-    return "it shares too few points with the other photos"
+    return model, faults | {
+        file: f"only {points} points could be matched in it, {least} are needed" for file, points in weak.items()
+    }
 
 
 def _anchored(model: Model, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
@@ -342,8 +351,9 @@ def _masked(
         )
     points = object_points(capture)
     bare = None if anchor.board is None else partial(bare_squares, settings.board, anchor.board)
-    masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=points)
+    above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
+    masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
     if len(masked.photos) < MIN_PHOTOS:
         return masked
     # What a photo was rejected for may be what the others set right.
-    return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=points)
+    return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=above)

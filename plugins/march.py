@@ -133,7 +133,7 @@ def respond_along(
         )
     # Rounding can lift the response of a needle over its peak, by any factor.
     most = opacity if cap is None else dr.minimum(opacity, cap)
-    log_alphas = [dr.minimum(log_alpha, most) for log_alpha in result[0::2]]
+    log_alphas = [dr.select(log_alpha > most, most, log_alpha) for log_alpha in result[0::2]]
     return list(zip(log_alphas, result[1::2], strict=True))
 
 

@@ -13,10 +13,14 @@ from mitsplat.camera import Camera
 ALL = BOARD.columns * BOARD.rows
 
 
+PAPER = 20  # dots of white around the board, as printers leave it
+
+
 @pytest.fixture(scope="module", params=[0, 3])
 def photo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Camera, np.ndarray]:
     camera = ring(width=480)[request.param]
-    path = draw(BOARD.draw(200), 200 / BOARD.square, camera, tmp_path_factory.mktemp("photo"), "photo.png")
+    sheet = cv2.copyMakeBorder(BOARD.draw(200), PAPER, PAPER, PAPER, PAPER, cv2.BORDER_CONSTANT, value=255)
+    path = draw(sheet, 200 / BOARD.square, camera, tmp_path_factory.mktemp("photo"), "photo.png")
     return camera, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
 
 
@@ -39,13 +43,14 @@ def test_a_bare_board_is_bare_whatever_light_falls_on_it(photo: tuple[Camera, np
         assert len(squares_of(bare_squares(BOARD, np.eye(4), camera, image), camera)) == ALL
 
 
-def test_what_covers_a_corner_of_a_square_leaves_none_of_it(photo: tuple[Camera, np.ndarray]) -> None:
-    """A thing as black as the board's squares lies over one corner of the board's squares (1, 2) to (2, 3)."""
+@pytest.mark.parametrize("grey_of_it", [5, 50, 120, 180, 250])
+def test_what_covers_a_corner_of_a_square_leaves_none_of_it(photo: tuple[Camera, np.ndarray], grey_of_it: int) -> None:
+    """A thing of any brightness lies over corners of the squares (1, 2) to (2, 3)."""
     camera, grey = photo
     corners = BOARD.square * np.array([[-0.35, -0.3, 0], [0.3, -0.3, 0], [0.3, 0.4, 0], [-0.35, 0.4, 0]])
     covered = grey.copy()
     outline = camera.project(corners)[0]
-    cv2.fillConvexPoly(covered, np.rint(outline).astype(np.int32), 5)
+    cv2.fillConvexPoly(covered, np.rint(outline).astype(np.int32), grey_of_it)
     found = bare_squares(BOARD, np.eye(4), camera, covered)
     thing = np.zeros_like(covered)
     cv2.fillConvexPoly(thing, np.rint(outline).astype(np.int32), 1)

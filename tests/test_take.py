@@ -54,7 +54,7 @@ def test_a_rendered_capture_comes_back(
     _, truth = photos
     _, out, result = captured
     capture = Capture.load(out)
-    assert (capture.units, capture.up) == ("metre", "z")
+    assert (capture.units, capture.up, capture.table) == ("metre", "z", True)
     assert set(capture.rejected) == {"torn.png"}
     assert capture.rejected["torn.png"].startswith("it cannot be read")
     assert result.given == 17
@@ -351,13 +351,50 @@ def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
     said = capsys.readouterr().out
     assert "rejected: photo03.png: its camera is wrong: it explains only 40% of its matches\n" in said
     assert "warning" not in said
+    monkeypatch.setattr("mitsplat.anchor._fit_board", lambda *args: None)
     for _ in range(2):  # made, and kept
-        assert run("capture", given, "-o", tmp_path / "out", "--squares", "3x3", "--kind", "environment") == 0
+        assert run("capture", given, "-o", tmp_path / "out", "--kind", "environment") == 0
         said = capsys.readouterr().out
         assert (
             "warning: cameras explain few of their matches and may be wrong, leave them out or add others: "
             f"{seen} (60%)\n" in said
         )
+
+
+@pytest.mark.parametrize("undistorted", [False, True])
+def test_a_camera_that_the_board_contradicts_is_left_out(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undistorted: bool
+) -> None:
+    """The board stays where the others see it, and what was said of the photo is kept, undistorted or not."""
+    given, _, result = captured
+    model = model_of(result.capture)
+    images = {photo.file.name: photo.file for photo in result.capture.photos}
+    seen, doubted, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed)
+    pose = model.cameras[seen].world_from_camera.copy()
+    pose[:3, 3] += (0.02, 0, 0)
+    cameras = {**model.cameras, seen: replace(model.cameras[seen], world_from_camera=pose)}
+    monkeypatch.setattr(take, "find_cameras", lambda *args: replace(model, cameras=cameras, agreement={doubted: 0.6}))
+    settings = CaptureSettings(board=rendered.BOARD, kind="environment", undistorted=undistorted)
+    found = capture_photos(given, tmp_path / "out", settings)
+    assert found.capture.rejected[seen].startswith("its camera is wrong: it sees the board ")
+    assert found.capture.table
+    assert found.doubtful == {}
+    assert len(found.capture.photos) == len(result.capture.photos) - 1
+    monkeypatch.setattr("mitsplat.anchor._fit_board", lambda *args: None)
+    again = capture_photos(given, tmp_path / "again", settings)
+    assert again.doubtful == {doubted: 0.6}
+
+
+def test_a_capture_is_not_written_among_what_it_is_made_of(photos: tuple[Path, object], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="must not lie in the folder of the photographs"):
+        capture_photos(photos[0], photos[0] / "out")
+    shutil.copytree(photos[0], tmp_path / "out/images")
+    with pytest.raises(InputError, match="images, which is written anew"):
+        capture_photos(tmp_path / "out/images", tmp_path / "out")
+    shutil.copytree(photos[0], tmp_path / "out/masks/mine")
+    with pytest.raises(InputError, match="masks, which is written anew"):
+        capture_photos(photos[0], tmp_path / "out", CaptureSettings(masks=tmp_path / "out/masks/mine"))
+    assert len(list((tmp_path / "out").rglob("*.png"))) == 2 * len(list(photos[0].glob("*.png")))
 
 
 @pytest.mark.slow

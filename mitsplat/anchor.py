@@ -110,7 +110,8 @@ def find_anchor(
     if fitted := _fit_board(corners, board):
         pose, factor = fitted
         board_pose = pose
-        wrong, confirmed = _judge_cameras(views, corners)
+        flat = board.corners / factor @ pose[:3, :3].T + pose[:3, 3]
+        wrong, confirmed = _judge_cameras(views, {**dict(enumerate(flat)), **corners})
 
         def board_scale(names: set[str]) -> float | None:
             fitted = _fit_board(_triangulate_corners(views, names), board)
@@ -406,14 +407,14 @@ def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, FloatArray]:
 def _judge_cameras(views: _Views, corners: Mapping[int, FloatArray]) -> tuple[dict[str, float], frozenset[str]]:
     """Images that see the board elsewhere than the others do, and by how far [px]; and those that see it there.
 
-    Six corners (3,) that were triangulated must be seen. A bent print has them elsewhere than a flat one.
-    Cameras that few or repetitive points hold can be far off at small reprojection errors.
+    At least six of the corners (3,) must be seen. They are best triangulated: a bent print has them elsewhere than a
+    flat one. Cameras that few or repetitive points hold can be far off at small reprojection errors.
     """
     errors: dict[str, list[float]] = {}
     edges = {}
-    for index, point in corners.items():
-        for name, (camera, pixel) in views[index].items():
-            error = np.linalg.norm(camera.project(point)[0][0] - pixel)
+    for index, seen in views.items():
+        for name, (camera, pixel) in seen.items():
+            error = np.linalg.norm(camera.project(corners[index])[0][0] - pixel)
             errors.setdefault(name, []).append(float(np.nan_to_num(error, nan=np.inf)))
             edges[name] = max(camera.width, camera.height)
     shares = {name: float(np.median(found)) / edges[name] for name, found in errors.items() if len(found) >= 6}

@@ -95,7 +95,8 @@ def photograph(
     sensors = _Sensors()
     for number, (name, camera) in enumerate(found.items()):
         radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
-        noisy = np.clip(radiance, 0, 1) ** (1 / 2.2) + rng.normal(0, noise, radiance.shape)
+        # A path that grazes an edge may end in no number.
+        noisy = np.nan_to_num(np.clip(radiance, 0, 1)) ** (1 / 2.2) + rng.normal(0, noise, radiance.shape)
         Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(folder / name)
     return found
 

@@ -162,27 +162,8 @@ def capture_photos(
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
     by_file = {photo.file.name: photo for photo in prepared}
-    faults: dict[str, str] = {}
-    if settings.poses is not None:
-        model = read_poses(settings.poses, prepared, work, progress)
-    else:
-        model, faults = _without_faults(find_cameras(prepared, work, progress))
-    _demand_cameras(photos, model, by_file, faults)
-    anchor = _anchored(model, by_file, settings)
-    while anchor.wrong:
-        faults |= {
-            file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
-            for file, error in anchor.wrong.items()
-        }
-        model, further = _without_faults(model.without(anchor.wrong), least=0 if settings.poses else MIN_POINTS)
-        faults |= further
-        _demand_cameras(photos, model, by_file, faults)
-        anchor = _anchored(model, by_file, settings)
-    absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
-    if model.elsewhere:
-        elsewhere = "it only fits a smaller group of photos, as of another object or side"
-        faults |= {file: elsewhere for file in model.elsewhere if file not in faults}
-    rejected |= {photo.name: faults.get(file, absent) for file, photo in by_file.items() if file not in model.cameras}
+    model, anchor, faults = _find_model(photos, by_file, settings, work, progress)
+    rejected |= {by_file[file].name: fault for file, fault in faults.items()}
     capture = Capture(
         photos=tuple(
             Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
@@ -277,6 +258,33 @@ def _forget_other_photos(out: Path, inputs: dict[str, object], settings: Capture
     elif settings.undistorted:  # the pictures of an earlier run may bear the names of the copies
         shutil.rmtree(out / "images", ignore_errors=True)
     shutil.rmtree(out / "masks", ignore_errors=True)
+
+
+def _find_model(
+    photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
+) -> tuple[Model, Anchor, dict[str, str]]:
+    """Cameras that neither each other nor a board contradicts, where they are put, and why other files have none."""
+    faults: dict[str, str] = {}
+    if settings.poses is not None:
+        model = read_poses(settings.poses, list(by_file.values()), work, progress)
+    else:
+        model, faults = _without_faults(find_cameras(list(by_file.values()), work, progress))
+    _demand_cameras(photos, model, by_file, faults)
+    anchor = _anchored(model, by_file, settings)
+    while anchor.wrong:
+        faults |= {
+            file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
+            for file, error in anchor.wrong.items()
+        }
+        model, further = _without_faults(model.without(anchor.wrong), least=0 if settings.poses else MIN_POINTS)
+        faults |= further
+        _demand_cameras(photos, model, by_file, faults)
+        anchor = _anchored(model, by_file, settings)
+    absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
+    elsewhere = "it only fits a smaller group of photos, as of another object or side"
+    for file in by_file.keys() - model.cameras.keys() - faults.keys():
+        faults[file] = elsewhere if file in model.elsewhere else absent
+    return model, anchor, faults
 
 
 def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared], faults: Mapping[str, str]) -> None:

@@ -33,6 +33,8 @@ FEW_POINTS = 3 * MIN_POINTS
 """A camera that observes fewer points is worth a warning."""
 
 _INPUTS = "inputs.json"
+_RECORDED = ("source", "reprojection_error", "doubtful")
+"""What this file holds of a result beside its inputs."""
 
 
 @dataclass(frozen=True)
@@ -206,9 +208,6 @@ def capture_photos(
     return result
 
 
-_RECORDED = ("source", "reprojection_error", "doubtful")
-
-
 def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
     """Refuse to write among what was given: files of a capture that are no longer needed are removed."""
     if out.resolve().is_relative_to(photos.resolve()):
@@ -248,8 +247,9 @@ def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
 
 
 def _forget_other_photos(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
-    """Drop copies and matches that were made of other photographs or at another size."""
-    marker = json.dumps([inputs["photos"], settings.max_size, settings.poses is None], sort_keys=True)
+    """Drop masks, and copies and matches that were made of other photographs or in another way."""
+    way = settings.max_size, settings.poses is None, settings.undistorted
+    marker = json.dumps([inputs["photos"], *way], sort_keys=True)
     file = out / "sfm" / "photos.json"
     if not (file.exists() and file.read_text() == marker):
         shutil.rmtree(out / "sfm", ignore_errors=True)

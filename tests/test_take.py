@@ -385,6 +385,20 @@ def test_a_camera_that_the_board_contradicts_is_left_out(
     assert again.doubtful == {doubted: 0.6}
 
 
+def test_undistorted_pictures_are_not_taken_for_photos(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without --undistort, in the folder of one with it, starts from the photographs again."""
+    given, _, result = captured
+    model = model_of(result.capture)
+    cameras = {name: replace(camera, distortion=(-0.2, 0.0, 0.0, 0.0)) for name, camera in model.cameras.items()}
+    monkeypatch.setattr(take, "find_cameras", lambda *args: replace(model, cameras=cameras))
+    for undistorted in (True, False):
+        settings = CaptureSettings(board=rendered.BOARD, kind="environment", undistorted=undistorted)
+        photo, *_ = capture_photos(given, tmp_path / "out", settings).capture.photos
+        assert (photo.file.read_bytes() == (given / photo.name).read_bytes()) is not undistorted
+
+
 def test_a_capture_is_not_written_among_what_it_is_made_of(photos: tuple[Path, object], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must not lie in the folder of the photographs"):
         capture_photos(photos[0], photos[0] / "out")

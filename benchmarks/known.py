@@ -154,15 +154,13 @@ class _Sensors:
 
     def like(self, camera: Camera) -> Any:
         """The sensor of a camera, until the next call."""
-        pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
         key = camera.width, camera.height, camera.fx
         if key not in self._made:
             film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
             angle = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
-            to_world = mi.ScalarTransform4f(pose)
-            self._made[key] = mi.load_dict({"type": "perspective", "fov": angle, "to_world": to_world, "film": film})
+            self._made[key] = mi.load_dict({"type": "perspective", "fov": angle, "film": film})
         parameters = mi.traverse(self._made[key])
-        parameters["to_world"] = mi.Transform4f(pose)
+        parameters["to_world"] = mi.Transform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0]))
         parameters.update()
         return self._made[key]
 

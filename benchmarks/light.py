@@ -1,6 +1,6 @@
 """Time against error of traced light: rays where they are needed and a filter, beside as many rays everywhere.
 
-    python -m benchmarks.light [--scene scenes/workcell.yaml] [--frames 4] [--objects 10 --lamps 1]
+    python -m benchmarks.light [--scene scenes/workcell.yaml] [--frames 4] [--truth 2048]
 
 The truth is the ratio of ``--truth`` rays per pixel without a filter. Errors are the standard deviation of the light
 factor (mean of RGB) from it, where it matters: at objects that are lit anew, and where a shadow takes 1 % or more of
@@ -42,6 +42,7 @@ def means(_: LightFilter, estimate: Estimate) -> tuple[Any, Any, Any]:
 
 @contextmanager
 def filtered(by_neighbours: bool) -> Iterator[None]:
+    """Light as it is filtered, or as every pixel has it alone."""
     if by_neighbours:
         yield
         return
@@ -52,8 +53,8 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
 class Pictures:
     """The frames of a scene's first layout, under integrators of the same splats."""
 
-    def __init__(self, path: Path, frames: int, overrides: dict[str, Any]) -> None:
-        self.scene = ms.load_scene(path, overrides=overrides)
+    def __init__(self, path: Path, frames: int) -> None:
+        self.scene = ms.load_scene(path)
         quality = resolve_quality("fast")
         self.studio = _Studio.of(self.scene, quality)
         layout = ms.settle_layout(self.scene, layout_of(self.scene, 0))
@@ -64,7 +65,6 @@ class Pictures:
             self.frames.append((mi.load_dict(self.studio.describe(layout, plan.lights)), plan.camera))
 
     def integrator(self, **properties: Any) -> Any:
-        """The scene's own, with some properties changed."""
         """The scene's own, with some properties changed."""
         return make_integrator(quality=resolve_quality("fast"), **{**light_properties(self.scene), **properties})
 
@@ -85,11 +85,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--truth", type=int, default=2048)
     args = parser.parse_args()
-    pictures = Pictures(args.scene, args.frames, {})
+    pictures = Pictures(args.scene, args.frames)
     with filtered(False):
         exact, _ = pictures.render(pictures.integrator(shadow_error=0, shadow_samples=args.truth), 0)
-    bare, without = pictures.render(pictures.integrator(shadow="none"), 0)
-    del bare
+    without = pictures.render(pictures.integrator(shadow="none"), 0)[1]
 
     def row(name: str, by_neighbours: bool, **properties: Any) -> None:
         with filtered(by_neighbours):

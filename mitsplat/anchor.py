@@ -106,7 +106,6 @@ def find_anchor(
     scale: tuple[float, float | None] | None = None
     plane: tuple[FloatArray, FloatArray] | None = None
     source = ""
-    axes: FloatArray | None = None
     if fitted := _fit_board(corners, board):
         pose, factor = fitted
         board_pose = pose
@@ -118,7 +117,7 @@ def find_anchor(
             return None if fitted is None else fitted[1]
 
         error = _scale_error(factor, board_scale, list(model.cameras), board.square)
-        scale, plane, axes = (factor, error), (pose[:3, 2], pose[:3, 3]), pose[:3, :3]
+        scale, plane = (factor, error), (pose[:3, 2], pose[:3, 3])
         source = f"a ChArUco board ({len(corners)} corners)"
     elif tags and tag is not None:
 
@@ -152,20 +151,18 @@ def find_anchor(
     target = meeting_point(centres, forward)
     if plane is None:
         origin = target
-    elif centred or axes is None:
+    elif centred or board_pose is None:
         origin = target - (target - point) @ normal * normal
     else:
         origin = point
     factor = scale[0] if scale else 1 / float(np.median(np.linalg.norm(centres - target, axis=1)))
-    rotation = _upright(normal, forward[0] if axes is None else axes[:, 0])
+    rotation = _upright(normal, forward[0] if board_pose is None else board_pose[:3, 0])
     matrix = np.eye(4)
     matrix[:3, :3] = factor * rotation
     matrix[:3, 3] = -factor * rotation @ origin
     if board_pose is not None:
-        turned = np.eye(4)
-        turned[:3, :3] = rotation @ board_pose[:3, :3]
-        turned[:3, 3] = matrix[:3, :3] @ board_pose[:3, 3] + matrix[:3, 3]
-        board_pose = turned
+        board_pose = matrix @ board_pose
+        board_pose[:3, :3] /= factor
     return Anchor(
         matrix=matrix,
         units="metre" if scale else "unknown",

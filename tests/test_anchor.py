@@ -80,6 +80,13 @@ def draw(flat: np.ndarray, per_metre: float, camera: Camera, folder: Path, name:
     return folder / name
 
 
+def photos_of_the_board(cameras: list[Camera], folder: Path) -> dict[str, Path]:
+    """Drawn photos of the board alone, by the names of :func:`model_of`."""
+    names = [f"{k:02}.png" for k in range(len(cameras))]
+    flat = BOARD.draw(200)
+    return {n: draw(flat, 200 / BOARD.square, c, folder, n) for n, c in zip(names, cameras, strict=True)}
+
+
 def errors(matrix: np.ndarray) -> tuple[float, float, float]:
     """Relative error of scale, tilt [degrees] and height of the table [m] of a placement of the lost frame."""
     whole = matrix @ LOST
@@ -89,10 +96,7 @@ def errors(matrix: np.ndarray) -> tuple[float, float, float]:
 
 def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
     cameras = ring()
-    images = {
-        f"{k:02}.png": draw(BOARD.draw(200), 200 / BOARD.square, camera, tmp_path, f"{k:02}.png")
-        for k, camera in enumerate(cameras)
-    }
+    images = photos_of_the_board(cameras, tmp_path)
     model = model_of(cameras, table_and_thing())
     found = find_anchor(model, images, board=BOARD)
     scale, tilt, height = errors(found.matrix)
@@ -119,10 +123,7 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
 
 def test_the_board_is_known_where_the_reconstruction_is_put(tmp_path: Path) -> None:
     cameras = ring()
-    images = {
-        f"{k:02}.png": draw(BOARD.draw(200), 200 / BOARD.square, camera, tmp_path, f"{k:02}.png")
-        for k, camera in enumerate(cameras)
-    }
+    images = photos_of_the_board(cameras, tmp_path)
     found = find_anchor(model_of(cameras, table_and_thing()), images, board=BOARD)
     assert found.board is not None
     truth = found.matrix @ LOST  # the board lies where the world's origin is

@@ -1,6 +1,6 @@
 """Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
 
-Gaussians start at the capture's points and are densified by MCMC (:mod:`mitsplat.densify`). A fit lives in a folder:
+Gaussians start at the capture's points and are densified (:mod:`mitsplat.densify`). A fit lives in a folder:
 ``checkpoint.npz`` to go on from, ``splats.ply``, ``fit.json`` (:class:`FitResult` and the settings), and for every
 held-out photo ``held_out/NAME.png``: photo | render | difference.
 """
@@ -22,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.capture import Capture, Photo
-from mitsplat.densify import grow, jitter, relocate, seed_splats
+from mitsplat.densify import Densification, Mcmc, seed_splats
+from mitsplat.densify_classic import Classic
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.metrics import psnr_of
@@ -41,7 +42,9 @@ class FitSettings:
     """How a capture is fitted. Rates are those published for 3DGS, regularisation is that of its MCMC densification.
 
     Attributes:
-        gaussians: Most Gaussians; their number grows to this by the middle of the fit.
+        gaussians: Most Gaussians; with MCMC their number grows to this by the middle of the fit.
+        densification: ``mcmc`` puts Gaussians where others are opaque (Kheradmand et al. 2024); ``classic`` where the
+            photos pull at them (Kerbl et al. 2023), in as many as that takes.
         iterations: Optimiser steps; each takes one photo, all photos in turn.
         budget: Time [s] in which the schedule of the iterations runs off even if it must leave some out; then the
             result depends on the machine.
@@ -58,11 +61,12 @@ class FitSettings:
             Gaussians inside and behind an object explain its photos as well as those on its surface.
         opacity_weight: Weight of the mean opacity. MCMC's authors have 0.01 in fits ten times as long; in short ones it
             leaves surfaces that are seen through.
-        scale_weight: Weight of the mean scale in units of the cameras' extent.
+        scale_weight: Weight of the mean scale in units of the cameras' extent; by default 0.01 with MCMC, as published,
+            and 0 with classic densification, which removes what is large.
         exposure: Whether every photo has an affine colour correction of its own (3 x 4). Their mean stays the identity,
             because photos alone do not say whether splats are bright or corrections are.
         coarse: Share of the fit that sees pictures of half the size.
-        refine_every: Steps between moves of dead Gaussians and additions of new ones.
+        refine_every: Steps between removals or moves of dead Gaussians and additions of new ones.
         rate_means: Learning rate at the start in units of the cameras' extent; falls to a hundredth exponentially.
         rate_quats: Learning rate of the quaternions' components.
         rate_scales: Learning rate of the logarithms of the scales.
@@ -73,6 +77,7 @@ class FitSettings:
     """
 
     gaussians: int = 30_000
+    densification: Literal["mcmc", "classic"] = "mcmc"
     iterations: int = 3000
     budget: float | None = None
     target_psnr: float | None = None
@@ -84,7 +89,7 @@ class FitSettings:
     alpha_weight: float = 0.1
     depth_weight: float = 0.5
     opacity_weight: float = 0.0
-    scale_weight: float = 0.01
+    scale_weight: float | None = None
     exposure: bool = False
     coarse: float = 0.25
     refine_every: int = 100
@@ -161,8 +166,6 @@ QUALITY = Quality(transmittance_min=1e-3)
 _EVERY = 25
 """Steps between reports: reading a loss waits for the device."""
 _EXTENT = 1.1
-_REFINED = (0.02, 0.8)
-_GROWTH = 1.05
 _CHECKPOINT_SECONDS = 60.0
 _DEPTH_EVERY = 4
 """Steps between looks at depth, which double the time of a step."""
@@ -249,7 +252,8 @@ class _Fit:
         points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
         self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
         self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
-        self.start = self.model.count
+        self.densification = _densification(settings, self.model.count)
+        self.scale_weight = self.densification.scale_weight if settings.scale_weight is None else settings.scale_weight
         self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
@@ -279,6 +283,7 @@ class _Fit:
         self.model.track()
         loss, error = self._loss(sight, number, replace(QUALITY, sh_degree=degree), rng)
         dr.backward(loss)
+        self.densification.look(self.model, sight.camera)
         rate = s.rate_means * 0.01**fraction
         self.model.update(
             {
@@ -293,18 +298,8 @@ class _Fit:
             self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
             self.exposure.values["exposure"] = _centred(self.exposure.values["exposure"], len(self.photos))
         self.steps += 1
-        refined = _REFINED[0] <= fraction < _REFINED[1]
-        if refined and self.steps % s.refine_every == 0:
-            relocate(self.model, rng)
-            grow(self.model, self._wanted(fraction), rng)
-        jitter(self.model, rate, (s.seed, self.steps))
+        self.densification.refine(self.model, self.steps, fraction, rate, rng)
         self.errors.append(error)
-
-    def _wanted(self, fraction: float) -> int:
-        """Number of Gaussians by now: 5 % more each time as published, or more if the fit is short."""
-        share = min(1.0, (fraction - _REFINED[0]) / (0.5 - _REFINED[0]))
-        planned = self.start * (self.settings.gaussians / self.start) ** share
-        return min(self.settings.gaussians, int(max(planned, _GROWTH * self.model.count)))
 
     @property
     def _looks_at_depth(self) -> bool:
@@ -341,7 +336,7 @@ class _Fit:
         _, _, scales, opacities, _ = self.model.activated()
         # Means by opaque counts: a literal one would compile the kernels anew whenever Gaussians are added.
         loss += dr.sum(opacities) * dr.opaque(mi.Float, s.opacity_weight / self.model.count)
-        loss += dr.sum(scales) * dr.opaque(mi.Float, s.scale_weight / (3 * self.model.count * self.extent))
+        loss += dr.sum(scales) * dr.opaque(mi.Float, self.scale_weight / (3 * self.model.count * self.extent))
         error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
         dr.schedule(error)
         return loss, error
@@ -370,8 +365,7 @@ class _Fit:
     def save(self, path: Path, inputs: str) -> None:
         """Write a checkpoint."""
         arrays: dict[str, Any] = {"inputs": inputs, "steps": self.steps, "seconds": self.elapsed}
-        arrays |= {f"model.{k}": v for k, v in self.model.state().items()}
-        arrays |= {f"exposure.{k}": v for k, v in self.exposure.state().items()}
+        arrays |= {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
 
         def write(temporary: Path) -> None:
             with temporary.open("wb") as file:
@@ -393,8 +387,21 @@ class _Fit:
         if str(state["inputs"]) != inputs:
             raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
-        self.model.restore({k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")})
-        self.exposure.restore({k.removeprefix("exposure."): v for k, v in state.items() if k.startswith("exposure.")})
+        for name, part in self._parts.items():
+            part.restore({k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")})
+
+    @property
+    def _parts(self) -> dict[str, Adam | Densification]:
+        """What changes from step to step, by its name in checkpoints."""
+        return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
+
+
+def _densification(settings: FitSettings, start: int) -> Densification:
+    """The strategy that is asked for, of so many Gaussians at the start."""
+    s = settings
+    if s.densification == "classic":
+        return Classic(s.gaussians, s.refine_every)
+    return Mcmc(s.gaussians, start, s.refine_every, s.seed)
 
 
 def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from mitsplat import fit
+from mitsplat import densify_classic, fit
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
 from mitsplat.colour import encode_srgb
@@ -117,9 +118,14 @@ def test_finished_fit_is_read_and_not_made_again(fitted: Path, capture: Capture)
     assert again.iterations == 60 and again.psnr == json.loads((fitted / "fit.json").read_text())["psnr"]
 
 
+@pytest.mark.parametrize("densification", ["mcmc", "classic"])
 def test_interrupted_fit_goes_on_to_the_same_bytes(
-    fitted: Path, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, densification: Literal["mcmc", "classic"]
 ) -> None:
+    monkeypatch.setattr(densify_classic, "_RESET_STEPS", 20)  # one before the checkpoint, none soon after
+    settings = replace(SMALL, densification=densification)
+    whole = fit_capture(capture, tmp_path / "whole", settings)
+    assert 600 < len(whole.splats) <= 800
     monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     steps: list[int] = []
 
@@ -128,11 +134,22 @@ def test_interrupted_fit_goes_on_to_the_same_bytes(
         if len(steps) == 2:
             raise KeyboardInterrupt
 
+    out = tmp_path / "interrupted"
     with pytest.raises(KeyboardInterrupt):
-        fit_capture(capture, tmp_path, SMALL, progress=interrupt)
-    fit_capture(capture, tmp_path, SMALL, progress=lambda state: steps.append(state.step))
+        fit_capture(capture, out, settings, progress=interrupt)
+    fit_capture(capture, out, settings, progress=lambda state: steps.append(state.step))
     assert steps == [25, 50, 50, 60]  # the first checkpoint is behind the first report
-    assert (tmp_path / "splats.ply").read_bytes() == (fitted / "splats.ply").read_bytes()
+    assert (out / "splats.ply").read_bytes() == (tmp_path / "whole" / "splats.ply").read_bytes()
+
+
+@pytest.mark.parametrize("densification", ["mcmc", "classic"])
+def test_no_fit_has_more_gaussians_than_asked_for(
+    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
+) -> None:
+    counts: list[int] = []
+    settings = replace(SMALL, densification=densification, gaussians=700, refine_every=5)
+    fit_capture(capture, tmp_path, settings, progress=lambda state: counts.append(state.gaussians))
+    assert counts[0] > 600 and max(counts) == 700
 
 
 def test_another_seed_gives_other_splats(fitted: Path, capture: Capture, tmp_path: Path) -> None:

@@ -86,6 +86,10 @@ def fit(
     capture: CaptureFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
     gaussians: Gaussians = 30000,
+    densification: Annotated[
+        Literal["mcmc", "classic"],
+        typer.Option(help="Add Gaussians where others are opaque, or where the photos pull at them."),
+    ] = "mcmc",
     iterations: Iterations = 3000,
     budget: Budget = None,
     target_psnr: Annotated[float | None, typer.Option(help="End early at this PSNR of held-out photos [dB].")] = None,
@@ -114,6 +118,7 @@ def fit(
 
     settings = FitSettings(
         gaussians=gaussians,
+        densification=densification,
         iterations=iterations,
         budget=None if budget is None else _seconds(budget),
         target_psnr=target_psnr,

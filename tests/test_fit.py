@@ -19,10 +19,12 @@ from mitsplat import densify_classic, fit
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
 from mitsplat.colour import encode_srgb
+from mitsplat.depth_maps import DepthMaps, align_maps
 from mitsplat.errors import InputError
 from mitsplat.fit import FitProgress, FitSettings, fit_capture
 from mitsplat.render import ensure_variant, render_splats
 from mitsplat.seeds import seed_points
+from mitsplat.sight import Sight
 from mitsplat.splats import SH_C0, Splats
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 20
@@ -232,17 +234,79 @@ def test_only_what_is_asked_for_is_read_of_the_masks(capture: Capture, tmp_path:
     assert len(result.held_out) == 3
 
 
-def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:
+def seeing(capture: Capture) -> Capture:
+    """The capture whose photos see the points on their side of the ball."""
     facing = [
         np.flatnonzero(((photo.camera.centre - capture.points[:600]) * capture.points[:600]).sum(axis=1) > 0.1)
         for photo in capture.photos
     ]
     photos = tuple(replace(p, seen=own.astype(np.int32)) for p, own in zip(capture.photos, facing, strict=True))
-    seeing = replace(capture, photos=photos)
+    return replace(capture, photos=photos)
+
+
+def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:
     settings = replace(SMALL, iterations=20, coarse=0.0, depth_weight=1.0)
-    with_depths = fit_capture(seeing, tmp_path / "with", settings).splats
-    without = fit_capture(seeing, tmp_path / "without", replace(settings, depth_weight=0.0)).splats
+    with_depths = fit_capture(seeing(capture), tmp_path / "with", settings).splats
+    without = fit_capture(seeing(capture), tmp_path / "without", replace(settings, depth_weight=0.0)).splats
     assert np.abs(with_depths.means - without.means).max() > 1e-5
+
+
+def depth_maps(capture: Capture, folder: Path) -> DepthMaps:
+    """Inverse depths of the ball's photos as a network would give them: each with a scale and a shift of its own."""
+    files = {}
+    for number, photo in enumerate(capture.photos):
+        layers = render_splats(ball(), photo.camera, quality=fit.QUALITY)
+        inverse = np.where(layers.alpha > 0.9, 1 / np.maximum(layers.depth, 1), 0.1)
+        files[photo.name] = folder / f"{photo.name}.npy"
+        np.save(files[photo.name], (2 + 0.3 * number) * inverse - 0.1 * number)
+    return DepthMaps(files)
+
+
+def test_maps_take_the_place_of_points(capture: Capture, tmp_path: Path) -> None:
+    """A map knows every pixel of the object, the points only theirs."""
+    photo = seeing(capture).training[0]
+    maps = depth_maps(capture, tmp_path)
+    inverse, warnings = align_maps([photo], capture.points, maps, 64)
+    ensure_variant()
+    sparse = Sight(photo, 1.0, masked=True)
+    dense = Sight(photo, 1.0, masked=True, inverse_depth=inverse[photo.name])
+    assert warnings == () and dr.width(sparse.depths(capture.points)[0]) == len(photo.seen)
+    for sight in (dense, dense.half):
+        pixel, found = (np.array(values) for values in sight.depths(capture.points))
+        np.testing.assert_array_equal(pixel, np.flatnonzero(sight.mask > 0.5))
+        depth = render_splats(ball(), sight.camera, quality=fit.QUALITY).depth.ravel()[pixel]
+        assert np.median(np.abs(found * depth - 1)) < 0.02
+
+
+def test_maps_move_the_surface_and_are_part_of_the_fit(capture: Capture, tmp_path: Path) -> None:
+    settings = replace(SMALL, iterations=20, coarse=0.0, depth_weight=1.0)
+    photos, maps = seeing(capture), depth_maps(capture, tmp_path)
+    few = replace(photos.photos[1], seen=photos.photos[1].seen[:5])
+    photos = replace(photos, photos=(photos.photos[0], few, *photos.photos[2:]))
+    first = fit_capture(photos, tmp_path / "fit", settings, depths=maps)
+    assert first.warnings == (
+        "depth maps that are left out: 01.png (5 of the capture's points are in it, 10 are needed)",
+    )
+    assert fit_capture(photos, tmp_path / "fit", settings, depths=maps).warnings == first.warnings
+    without = fit_capture(photos, tmp_path / "without", settings)
+    assert np.abs(first.splats.means - without.splats.means).max() > 1e-5 and without.warnings == ()
+    with pytest.raises(InputError, match="belongs to a fit of other photos or settings"):
+        fit_capture(photos, tmp_path / "fit", settings, depths=replace(maps, kind="metric"))
+    values = np.load(maps.files["03.png"])
+    np.save(maps.files["03.png"], values + np.eye(*values.shape))
+    with pytest.raises(InputError, match="belongs to a fit of other photos or settings"):
+        fit_capture(photos, tmp_path / "fit", settings, depths=maps)
+
+
+def test_weight_of_maps_falls_and_that_of_points_does_not(capture: Capture) -> None:
+    ensure_variant()
+    photo = capture.training[0]
+    state = fit._Fit(capture, (photo,), (photo,), replace(SMALL, depth_weight=2.0), {})
+    sparse, dense = (Sight(photo, 1.0, masked=True, inverse_depth=m) for m in (None, np.ones((3, 4), np.float32)))
+    assert [state._depth_weight(sparse, fraction) for fraction in (0.0, 1.0)] == [2.0, 2.0]
+    assert [state._depth_weight(dense, f) for f in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 0.2, 0.02])
+    state.steps = 1
+    assert state._depth_weight(dense, 0.0) == 0
 
 
 def test_depth_error_is_the_mean_difference_of_inverse_depths() -> None:

@@ -424,8 +424,8 @@ def _densification(settings: FitSettings, start: int) -> Densification:
 
 
 def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:
-    """Mean difference between inverse depths [1/m] at pixels, as splats have them and as they should be."""
-    cover, depth = dr.gather(mi.Float, alpha, pixel), dr.gather(mi.Float, moment, pixel)
+    """Mean difference between inverse depths [1/m] at pixels, all different, as splats have them and should have."""
+    cover, depth = (dr.gather(mi.Float, layer, pixel, mode=dr.ReduceMode.NoConflicts) for layer in (alpha, moment))
     seen = (cover > 0.1) & (depth > 0)
     found = dr.select(seen, cover / dr.select(seen, depth, 1), inverse)
     return dr.sum(dr.abs(found - inverse)) * dr.opaque(mi.Float, 1 / dr.width(pixel))

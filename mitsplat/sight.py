@@ -122,6 +122,10 @@ class Sight:
             shown = self.mask[row, column] > 0.5
             number = (row * self.camera.width + column)[shown]
             inverse = (1 / depth[inside][shown]).astype(np.float32)
+            # One per pixel, the nearest: the gradients of several would be added in any order.
+            order = np.lexsort((-inverse, number))
+            number, first = np.unique(number[order], return_index=True)
+            inverse = inverse[order][first]
             self._depths = wrapped(mi.UInt32, number), wrapped(mi.Float, inverse)
         return self._depths
 

@@ -50,7 +50,9 @@ class DepthMaps:
 
 
 def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse") -> DepthMaps:
-    """The maps in a folder that have the names of photos, but for the suffix: .png, .npy, .exr, .tiff or .tif.
+    """The maps in a folder that have the names of photos, or of their files in a capture, but for the suffix.
+
+    That is .png, .npy, .exr, .tiff or .tif.
 
     Raises:
         InputError: If the folder does not exist or has a map of no photo.
@@ -59,7 +61,8 @@ def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse"
         raise InputError(f"{folder}: no such folder of depth maps")
     files = {}
     for photo in photos:
-        candidates = [(folder / photo.name).with_suffix(suffix) for suffix in SUFFIXES]
+        names = (photo.name, photo.file.name)
+        candidates = ((folder / name).with_suffix(suffix) for name in names for suffix in SUFFIXES)
         path = next((path for path in candidates if path.is_file()), None)
         if path is not None:
             files[photo.name] = path
@@ -120,7 +123,7 @@ def align_maps(
         size: Longest edge of what is kept of a map [px].
 
     Raises:
-        InputError: If a map cannot be read, or is not of its photo.
+        InputError: If a map cannot be read, or is not of its photo, or none is of use.
     """
     found, useless, missing = {}, [], []
     for photo in photos:
@@ -139,6 +142,11 @@ def align_maps(
             height, width = inverse.shape
             scale = min(1.0, size / max(width, height))
             found[photo.name] = resize_map(inverse, max(1, round(scale * width)), max(1, round(scale * height)))
+    if not found:
+        raise InputError(
+            f"no depth map is of use, such as that of {(useless + missing)[0]}: each must be of the kind that is said, "
+            f"and of a photo that sees {POINTS_MIN} points"
+        )
     warnings = []
     if missing:
         warnings.append(f"photos without a depth map: {', '.join(missing)}")

@@ -488,7 +488,7 @@ def _finished(out: Path, inputs: str) -> FitResult | None:
         record = json.loads(path.read_text(encoding="utf-8"))
         held_out = tuple(HeldOut(**photo) for photo in record["held_out"])
         found, iterations, seconds = record["inputs"], int(record["iterations"]), float(record["seconds"])
-        warnings = tuple(record["warnings"])
+        warnings = tuple(record.get("warnings", ()))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not the record of a fit ({error})") from error
     if found != inputs:

@@ -103,6 +103,21 @@ def test_all_maps_of_a_capture(tmp_path: Path) -> None:
     assert warnings[1].startswith("depth maps that are left out: b.jpg (it does not grow") and len(warnings) == 2
 
 
+def test_maps_are_found_by_the_names_of_a_captures_files(tmp_path: Path) -> None:
+    photo = replace(seeing()[0], file=Path("images/a__floor.jpg"))
+    (tmp_path / "a__floor.tif").touch()
+    assert find_maps(tmp_path, [photo], "metric") == DepthMaps({photo.name: tmp_path / "a__floor.tif"}, "metric")
+
+
+def test_maps_of_the_other_kind_are_refused(tmp_path: Path) -> None:
+    photo, points = seeing()
+    np.save(tmp_path / "a.npy", floor_depth(CAMERA, WIDTH, HEIGHT))
+    maps = DepthMaps({photo.name: tmp_path / "a.npy"}, "inverse")
+    with pytest.raises(InputError, match=r"no depth map is of use, such as that of a/floor\.jpg \(it does not grow"):
+        align_maps([photo], points, maps, 64)
+    assert list(align_maps([photo], points, replace(maps, kind="metric"), 64)[0]) == [photo.name]
+
+
 def test_folders_without_maps_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="gone: no such folder of depth maps"):
         find_maps(tmp_path / "gone", [seeing()[0]])

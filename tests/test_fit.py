@@ -170,6 +170,7 @@ def test_folder_of_another_fit_is_refused_unless_overwritten(fitted: Path, captu
 
 
 def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) -> None:
+    """Nor do depths, whatever number of Gaussians or points a photo shows."""
     seen: list[set[int]] = []
     counts: list[int] = []
 
@@ -182,7 +183,7 @@ def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) ->
     settings = replace(SMALL, iterations=200, sh_degree=0, refine_every=5, gaussians=2000, coarse=0.0)
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), pytest.raises(KeyboardInterrupt):
-        fit_capture(capture, tmp_path, settings, progress=keep)
+        fit_capture(seeing(capture), tmp_path, settings, progress=keep)
     assert 600 < counts[1] < counts[2] < counts[3]
     assert seen[2] and seen[3] and seen[2] | seen[3] <= seen[0] | seen[1]
 

@@ -125,38 +125,32 @@ def align_maps(
     Raises:
         InputError: If a map cannot be read, or is not of its photo, or none is of use.
     """
-    found, useless, missing = {}, [], []
+    found: dict[str, DepthMap] = {}
+    without: dict[str, list[str]] = {}
     for photo in photos:
-        if photo.name not in maps.files:
-            missing.append(photo.name)
+        path = maps.files.get(photo.name)
+        if path is None:
+            without.setdefault("photos without a depth map", []).append(photo.name)
             continue
-        path = maps.files[photo.name]
         values = read_map(path)
         try:
             inverse = align_map(photo, points, values, maps.kind)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         if isinstance(inverse, str):
-            useless.append(f"{photo.name} ({inverse})")
+            without.setdefault(f"depth maps that are left out, because {inverse}", []).append(photo.name)
         else:
             height, width = inverse.shape
             scale = min(1.0, size / max(width, height))
             found[photo.name] = resize_map(inverse, max(1, round(scale * width)), max(1, round(scale * height)))
+    warnings = tuple(f"{what}: {', '.join(names)}" for what, names in without.items())
     if not found:
-        raise InputError(
-            f"no depth map is of use, such as that of {(useless + missing)[0]}: each must be of the kind that is said, "
-            f"and of a photo that sees {POINTS_MIN} points"
-        )
-    warnings = []
-    if missing:
-        warnings.append(f"photos without a depth map: {', '.join(missing)}")
-    if useless:
-        warnings.append(f"depth maps that are left out: {', '.join(useless)}")
-    return found, tuple(warnings)
+        raise InputError(f"no depth map is of use: {'; '.join(warnings)}")
+    return found, warnings
 
 
 def align_map(photo: Photo, points: FloatArray, values: npt.NDArray[np.float32], kind: DepthKind) -> DepthMap | str:
-    """The values of a photo's map as inverse depths in the capture's unit, or a clause on why they are of no use.
+    """The values of a photo's map as inverse depths in the capture's unit, or why maps like it are of no use.
 
     Args:
         photo: Whose map it is.
@@ -182,10 +176,10 @@ def align_map(photo: Photo, points: FloatArray, values: npt.NDArray[np.float32],
     found = map_coordinates(values.astype(np.float64), (row, column), order=1, mode="nearest")
     known = np.isfinite(found)
     if known.sum() < POINTS_MIN:
-        return f"{known.sum()} of the capture's points are in it, {POINTS_MIN} are needed"
+        return f"fewer than {POINTS_MIN} of the capture's points are in them"
     scale, shift = fit_line(found[known], 1 / depth[inside][known], shift=kind == "inverse")
     if not scale > 0:
-        return "it does not grow with the inverse depths of the points in it"
+        return f"their values as {kind} depths do not agree with the points in them"
     return np.asarray(np.maximum(scale * values + shift, 0), dtype=np.float32)
 
 

@@ -82,10 +82,10 @@ def test_maps_that_say_nothing_are_left_out_by_name() -> None:
     truth = floor_depth(CAMERA, WIDTH, HEIGHT).astype(np.float32)
     photo, points = seeing()
     few, _ = seeing(9)
-    assert align_map(few, points, 1 / truth, "inverse") == "9 of the capture's points are in it, 10 are needed"
+    assert align_map(few, points, 1 / truth, "inverse") == "fewer than 10 of the capture's points are in them"
     for values in (truth, np.ones_like(truth)):  # depth for inverse depth, and nothing at all
         assert align_map(photo, points, values, "inverse") == (
-            "it does not grow with the inverse depths of the points in it"
+            "their values as inverse depths do not agree with the points in them"
         )
 
 
@@ -99,8 +99,10 @@ def test_all_maps_of_a_capture(tmp_path: Path) -> None:
     assert maps == DepthMaps({"a/floor.jpg": tmp_path / "a/floor.npy", "b.jpg": tmp_path / "b.npy"}, "inverse")
     found, warnings = align_maps(photos, points, maps, 32)
     assert list(found) == ["a/floor.jpg"] and found["a/floor.jpg"].shape == (24, 32)
-    assert warnings[0] == "photos without a depth map: c.jpg, d.jpg"
-    assert warnings[1].startswith("depth maps that are left out: b.jpg (it does not grow") and len(warnings) == 2
+    assert warnings == (
+        "depth maps that are left out, because their values as inverse depths do not agree with the points in them: b.jpg",
+        "photos without a depth map: c.jpg, d.jpg",
+    )
 
 
 def test_maps_are_found_by_the_names_of_a_captures_files(tmp_path: Path) -> None:
@@ -113,7 +115,7 @@ def test_maps_of_the_other_kind_are_refused(tmp_path: Path) -> None:
     photo, points = seeing()
     np.save(tmp_path / "a.npy", floor_depth(CAMERA, WIDTH, HEIGHT))
     maps = DepthMaps({photo.name: tmp_path / "a.npy"}, "inverse")
-    with pytest.raises(InputError, match=r"no depth map is of use, such as that of a/floor\.jpg \(it does not grow"):
+    with pytest.raises(InputError, match=r"no depth map is of use: .* as inverse depths do not agree .*: a/floor\.jpg"):
         align_maps([photo], points, maps, 64)
     assert list(align_maps([photo], points, replace(maps, kind="metric"), 64)[0]) == [photo.name]
 

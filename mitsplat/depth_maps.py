@@ -86,7 +86,8 @@ def read_map(path: Path) -> npt.NDArray[np.float32]:
         else:
             with Image.open(path) as image:
                 values = np.asarray(image)
-        values = np.asarray(values, dtype=np.float32)
+        with np.errstate(over="ignore"):
+            values = np.asarray(values, dtype=np.float32)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (*IMAGE_ERRORS, RuntimeError, EOFError, zipfile.BadZipFile) as error:
@@ -167,7 +168,7 @@ def align_map(photo: Photo, points: FloatArray, values: npt.NDArray[np.float32],
     if kind == "metric":
         if values.min() < 0:
             raise InputError(f"depths must be >= 0 (got {values.min():g})")
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             values = np.where(values > 0, 1 / values, np.float32(np.nan))
     pixels, depth = photo.camera.project(points[photo.seen])
     inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)

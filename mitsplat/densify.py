@@ -2,12 +2,14 @@
 
 Kheradmand et al. 2024 see the Gaussians as samples of a distribution. Noise moves those that are hardly opaque; dead
 ones are put where others are opaque, and new ones as well, all so that the picture stays what it was: n Gaussians in
-the place of one have the opacity ``1 - (1 - o)^(1/n)`` and scales by eq. 9 of the paper.
+the place of one have the opacity ``1 - (1 - o)^(1/n)`` and scales by eq. 9 of the paper. The densification that 3DGS
+was published with is :mod:`mitsplat.densify_classic`; a fit knows both as a :class:`Densification`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +18,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 from scipy.special import comb
 
+from mitsplat.camera import Camera
 from mitsplat.optimise import Model
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.gaussian import rotation_axes
@@ -26,6 +29,9 @@ FloatArray = npt.NDArray[np.float64]
 DEAD = 0.005
 """Opacity below which a Gaussian is moved to where it is of use."""
 
+_REFINED = (0.02, 0.8)
+"""Shares of the fit between which MCMC moves and adds Gaussians."""
+_GROWTH = 1.05
 _COPIES_MAX = 51
 _NOISE = 5e5
 """Size of the noise per learning rate of the means; they and the covariance are in the model's unit."""
@@ -33,6 +39,75 @@ _NOISE = 5e5
 _BINOMIALS = np.array(
     [[comb(n, k) * (-1) ** k / np.sqrt(k + 1) for k in range(_COPIES_MAX)] for n in range(_COPIES_MAX)]
 )
+
+
+class Densification(Protocol):
+    """How a fit changes the number and the places of its Gaussians.
+
+    Attributes:
+        scale_weight: Weight of the mean scale that it needs in the loss.
+    """
+
+    scale_weight: float
+
+    def look(self, model: Model, camera: Camera) -> None:
+        """Note what the gradients of a photo by this camera say, before they are used up."""
+
+    def refine(self, model: Model, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
+        """Change the Gaussians after a step.
+
+        Args:
+            model: The Gaussians.
+            step: Steps made.
+            fraction: Share of the fit's schedule that had run off before this one.
+            rate: Learning rate of the means.
+            rng: The step's random numbers.
+        """
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """What it has noted, as arrays that :meth:`restore` takes."""
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what :meth:`state` gave."""
+
+
+class Mcmc:
+    """Markov chain Monte Carlo.
+
+    Args:
+        most: Most Gaussians; their number grows to this by the middle of the fit.
+        start: Their number at the start.
+        every: Steps between moves and additions.
+        seed: Decides the jitter.
+    """
+
+    scale_weight = 0.01
+
+    def __init__(self, most: int, start: int, every: int, seed: int) -> None:
+        self._most, self._start, self._every, self._seed = most, start, every, seed
+
+    def look(self, model: Model, camera: Camera) -> None:
+        """Nothing: opacity alone decides."""
+
+    def refine(self, model: Model, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
+        """Move dead Gaussians and add new ones now and then, and always jitter."""
+        if _REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0:
+            relocate(model, rng)
+            grow(model, self._wanted(model.count, fraction), rng)
+        jitter(model, rate, (self._seed, step))
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Nothing."""
+        return {}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Nothing."""
+
+    def _wanted(self, count: int, fraction: float) -> int:
+        """Number of Gaussians by now: 5 % more each time as published, or more if the fit is short."""
+        share = min(1.0, (fraction - _REFINED[0]) / (0.5 - _REFINED[0]))
+        planned = self._start * (self._most / self._start) ** share
+        return min(self._most, int(max(planned, _GROWTH * count)))
 
 
 def seed_splats(

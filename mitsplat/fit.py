@@ -1,6 +1,6 @@
 """Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
 
-Gaussians start at the capture's points and are densified by MCMC (:mod:`mitsplat.densify`). A fit lives in a folder:
+Gaussians start at the capture's points and are densified (:mod:`mitsplat.densify`). A fit lives in a folder:
 ``checkpoint.npz`` to go on from, ``splats.ply``, ``fit.json`` (:class:`FitResult` and the settings), and for every
 held-out photo ``held_out/NAME.png``: photo | render | difference.
 """
@@ -11,7 +11,7 @@ import hashlib
 import json
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.capture import Capture, Photo
-from mitsplat.densify import grow, jitter, relocate, seed_splats
+from mitsplat.densify import Densification, Mcmc, seed_splats
+from mitsplat.densify_classic import Classic
+from mitsplat.depth_maps import DepthMap, DepthMaps, align_maps
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.metrics import psnr_of
@@ -41,7 +43,9 @@ class FitSettings:
     """How a capture is fitted. Rates are those published for 3DGS, regularisation is that of its MCMC densification.
 
     Attributes:
-        gaussians: Most Gaussians; their number grows to this by the middle of the fit.
+        gaussians: Most Gaussians; with MCMC their number grows to this by the middle of the fit.
+        densification: ``mcmc`` puts Gaussians where others are opaque (Kheradmand et al. 2024); ``classic`` where the
+            photos pull at them (Kerbl et al. 2023), in as many as that takes.
         iterations: Optimiser steps; each takes one photo, all photos in turn.
         budget: Time [s] in which the schedule of the iterations runs off even if it must leave some out; then the
             result depends on the machine.
@@ -53,16 +57,18 @@ class FitSettings:
         background: Behind splats and mask: a random colour in every step, or black.
         ssim_share: Weight of D-SSIM against L1.
         alpha_weight: Weight of the difference between alpha and mask.
-        depth_weight: Weight of the difference between inverse depths of the splats and of the points a photo sees,
-            relative to the inverse of the fit's length unit, in every fourth step; 0 leaves depths out. Without it,
-            Gaussians inside and behind an object explain its photos as well as those on its surface.
+        depth_weight: Weight of the difference between inverse depths of the splats and of the points a photo sees, or
+            of its depth map, relative to the inverse of the fit's length unit, in every fourth step; 0 leaves depths
+            out. Without it, Gaussians inside and behind an object explain its photos as well as those on its surface.
+            The weight of maps falls to a hundredth exponentially, as published: they are smooth and may be bent.
         opacity_weight: Weight of the mean opacity. MCMC's authors have 0.01 in fits ten times as long; in short ones it
             leaves surfaces that are seen through.
-        scale_weight: Weight of the mean scale in units of the cameras' extent.
+        scale_weight: Weight of the mean scale in units of the cameras' extent; by default 0.01 with MCMC, as published,
+            and 0 with classic densification, which removes what is large.
         exposure: Whether every photo has an affine colour correction of its own (3 x 4). Their mean stays the identity,
             because photos alone do not say whether splats are bright or corrections are.
         coarse: Share of the fit that sees pictures of half the size.
-        refine_every: Steps between moves of dead Gaussians and additions of new ones.
+        refine_every: Steps between removals or moves of dead Gaussians and additions of new ones.
         rate_means: Learning rate at the start in units of the cameras' extent; falls to a hundredth exponentially.
         rate_quats: Learning rate of the quaternions' components.
         rate_scales: Learning rate of the logarithms of the scales.
@@ -73,6 +79,7 @@ class FitSettings:
     """
 
     gaussians: int = 30_000
+    densification: Literal["mcmc", "classic"] = "mcmc"
     iterations: int = 3000
     budget: float | None = None
     target_psnr: float | None = None
@@ -84,7 +91,7 @@ class FitSettings:
     alpha_weight: float = 0.1
     depth_weight: float = 0.5
     opacity_weight: float = 0.0
-    scale_weight: float = 0.01
+    scale_weight: float | None = None
     exposure: bool = False
     coarse: float = 0.25
     refine_every: int = 100
@@ -118,7 +125,8 @@ class FitResult:
         iterations: Steps made.
         seconds: Time that they took, over all runs.
         held_out: Photos that were not fitted.
-        inputs: SHA-256 of photos, masks, cameras, points and settings.
+        inputs: SHA-256 of photos, masks, depth maps, cameras, points and settings.
+        warnings: What was given and is of no use, a sentence each.
     """
 
     splats: Splats
@@ -126,6 +134,7 @@ class FitResult:
     seconds: float
     held_out: tuple[HeldOut, ...]
     inputs: str
+    warnings: tuple[str, ...] = ()
 
     @property
     def psnr(self) -> float:
@@ -161,11 +170,11 @@ QUALITY = Quality(transmittance_min=1e-3)
 _EVERY = 25
 """Steps between reports: reading a loss waits for the device."""
 _EXTENT = 1.1
-_REFINED = (0.02, 0.8)
-_GROWTH = 1.05
 _CHECKPOINT_SECONDS = 60.0
 _DEPTH_EVERY = 4
 """Steps between looks at depth, which double the time of a step."""
+_MAPS_FALL_TO = 0.01
+"""What is left at the end of the weight of depth maps (Kerbl et al. 2024, as published for 3DGS)."""
 
 
 def fit_capture(
@@ -173,6 +182,7 @@ def fit_capture(
     out: str | Path,
     settings: FitSettings = FitSettings(),
     *,
+    depths: DepthMaps | None = None,
     overwrite: bool = False,
     progress: Callable[[FitProgress], None] | None = None,
 ) -> FitResult:
@@ -184,11 +194,13 @@ def fit_capture(
         capture: Photos, cameras, points.
         out: Folder of the fit.
         settings: How to fit.
+        depths: Depth maps of photos, which take the place of the points that these see in the loss.
         overwrite: Whether a fit of other inputs in the folder is replaced.
         progress: Told every few steps where the fit stands.
 
     Raises:
-        InputError: If there are fewer than two photos, a photo cannot be read, or the folder holds another fit.
+        InputError: If there are fewer than two photos, a photo or a depth map cannot be read, or the folder holds
+            another fit.
     """
     training, held_out = _usable(capture.training, settings), _usable(capture.held_out, settings)
     if not (training and held_out):
@@ -198,11 +210,12 @@ def fit_capture(
         )
     ensure_variant()
     out = Path(out)
-    inputs = _digest(capture, settings)
+    inputs = _digest(capture, settings, depths)
     done = None if overwrite else _finished(out, inputs)
     if done is not None:
         return done
-    fit = _Fit(capture, training, held_out, settings)
+    maps, warnings = ({}, ()) if depths is None else align_maps(training, capture.points, depths, settings.size)
+    fit = _Fit(capture, training, held_out, settings, maps)
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not overwrite:
         fit.load(checkpoint, inputs)
@@ -220,9 +233,9 @@ def fit_capture(
                 fit.save(checkpoint, inputs)
                 saved = time.monotonic()
     seconds = fit.elapsed
-    result = FitResult(fit.model.splats(), fit.steps, seconds, fit.check(out / "held_out"), inputs)
+    result = FitResult(fit.model.splats(), fit.steps, seconds, fit.check(out / "held_out"), inputs, warnings)
     result.splats.save(out / "splats.ply")
-    record = {name: getattr(result, name) for name in ("inputs", "iterations", "seconds", "psnr", "ssim")}
+    record = {name: getattr(result, name) for name in ("inputs", "iterations", "seconds", "psnr", "ssim", "warnings")}
     record |= {"gaussians": len(result.splats), "units": capture.units, "variant": mi.variant()}
     record |= {"held_out": [asdict(photo) for photo in result.held_out], "settings": asdict(settings)}
     write_text(out / "fit.json", json.dumps(record, indent=1) + "\n")
@@ -234,10 +247,15 @@ class _Fit:
     """A fit between two steps."""
 
     def __init__(
-        self, capture: Capture, training: tuple[Photo, ...], held_out: tuple[Photo, ...], settings: FitSettings
+        self,
+        capture: Capture,
+        training: tuple[Photo, ...],
+        held_out: tuple[Photo, ...],
+        settings: FitSettings,
+        maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        self.photos = [_sight(photo, settings) for photo in training]
+        self.photos = [_sight(photo, settings, maps.get(photo.name)) for photo in training]
         self.held_out = [_sight(photo, settings) for photo in held_out]
         centres = np.array([photo.camera.centre for photo in training])
         self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
@@ -249,7 +267,8 @@ class _Fit:
         points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
         self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
         self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
-        self.start = self.model.count
+        self.densification = _densification(settings, self.model.count)
+        self.scale_weight = self.densification.scale_weight if settings.scale_weight is None else settings.scale_weight
         self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
@@ -277,8 +296,9 @@ class _Fit:
         sight = self.photos[number].half if fraction < s.coarse else self.photos[number]
         degree = min(s.sh_degree, int(5 * fraction))
         self.model.track()
-        loss, error = self._loss(sight, number, replace(QUALITY, sh_degree=degree), rng)
+        loss, error = self._loss(sight, number, replace(QUALITY, sh_degree=degree), fraction, rng)
         dr.backward(loss)
+        self.densification.look(self.model, sight.camera)
         rate = s.rate_means * 0.01**fraction
         self.model.update(
             {
@@ -293,35 +313,29 @@ class _Fit:
             self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
             self.exposure.values["exposure"] = _centred(self.exposure.values["exposure"], len(self.photos))
         self.steps += 1
-        refined = _REFINED[0] <= fraction < _REFINED[1]
-        if refined and self.steps % s.refine_every == 0:
-            relocate(self.model, rng)
-            grow(self.model, self._wanted(fraction), rng)
-        jitter(self.model, rate, (s.seed, self.steps))
+        self.densification.refine(self.model, self.steps, fraction, rate, rng)
         self.errors.append(error)
 
-    def _wanted(self, fraction: float) -> int:
-        """Number of Gaussians by now: 5 % more each time as published, or more if the fit is short."""
-        share = min(1.0, (fraction - _REFINED[0]) / (0.5 - _REFINED[0]))
-        planned = self.start * (self.settings.gaussians / self.start) ** share
-        return min(self.settings.gaussians, int(max(planned, _GROWTH * self.model.count)))
+    def _depth_weight(self, sight: Sight, fraction: float) -> float:
+        """Weight of the depths of a photo in this step."""
+        if self.steps % _DEPTH_EVERY:
+            return 0.0
+        return self.settings.depth_weight * (1 if sight.inverse_depth is None else _MAPS_FALL_TO**fraction)
 
-    @property
-    def _looks_at_depth(self) -> bool:
-        return self.settings.depth_weight > 0 and self.steps % _DEPTH_EVERY == 0
-
-    def _loss(self, sight: Sight, number: int, quality: Quality, rng: np.random.Generator) -> tuple[Any, Any]:
+    def _loss(
+        self, sight: Sight, number: int, quality: Quality, fraction: float, rng: np.random.Generator
+    ) -> tuple[Any, Any]:
         """The loss, and the mean squared error alone."""
         from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
         from mitsplat.plugins.photometric import photometric_loss
 
         s = self.settings
         loss = mi.Float(0)
-        if self._looks_at_depth and dr.width(sight.depths(self.points)[0]):
+        weight = self._depth_weight(sight, fraction)
+        depths = sight.depths(self.points) if weight > 0 else ()
+        if depths and dr.width(depths[0]):
             rgb, alpha, moment = render_depth_differentiable(self.model.cloud(), sight.view, quality)
-            loss += dr.opaque(mi.Float, s.depth_weight * self.extent) * _depth_error(
-                alpha, moment, *sight.depths(self.points)
-            )
+            loss += dr.opaque(mi.Float, weight * self.extent) * _depth_error(alpha, moment, *depths)
         else:
             rgb, alpha = render_differentiable(self.model.cloud(), sight.view, quality)
         target, mask = sight.pixels()
@@ -341,7 +355,7 @@ class _Fit:
         _, _, scales, opacities, _ = self.model.activated()
         # Means by opaque counts: a literal one would compile the kernels anew whenever Gaussians are added.
         loss += dr.sum(opacities) * dr.opaque(mi.Float, s.opacity_weight / self.model.count)
-        loss += dr.sum(scales) * dr.opaque(mi.Float, s.scale_weight / (3 * self.model.count * self.extent))
+        loss += dr.sum(scales) * dr.opaque(mi.Float, self.scale_weight / (3 * self.model.count * self.extent))
         error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
         dr.schedule(error)
         return loss, error
@@ -370,8 +384,7 @@ class _Fit:
     def save(self, path: Path, inputs: str) -> None:
         """Write a checkpoint."""
         arrays: dict[str, Any] = {"inputs": inputs, "steps": self.steps, "seconds": self.elapsed}
-        arrays |= {f"model.{k}": v for k, v in self.model.state().items()}
-        arrays |= {f"exposure.{k}": v for k, v in self.exposure.state().items()}
+        arrays |= {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
 
         def write(temporary: Path) -> None:
             with temporary.open("wb") as file:
@@ -393,13 +406,26 @@ class _Fit:
         if str(state["inputs"]) != inputs:
             raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
-        self.model.restore({k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")})
-        self.exposure.restore({k.removeprefix("exposure."): v for k, v in state.items() if k.startswith("exposure.")})
+        for name, part in self._parts.items():
+            part.restore({k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")})
+
+    @property
+    def _parts(self) -> dict[str, Adam | Densification]:
+        """What changes from step to step, by its name in checkpoints."""
+        return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
+
+
+def _densification(settings: FitSettings, start: int) -> Densification:
+    """The strategy that is asked for, of so many Gaussians at the start."""
+    s = settings
+    if s.densification == "classic":
+        return Classic(s.gaussians, s.refine_every)
+    return Mcmc(s.gaussians, start, s.refine_every, s.seed)
 
 
 def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:
-    """Mean difference between inverse depths [1/m] at pixels, as splats have them and as they should be."""
-    cover, depth = dr.gather(mi.Float, alpha, pixel), dr.gather(mi.Float, moment, pixel)
+    """Mean difference between inverse depths [1/m] at pixels, all different, as splats have them and should have."""
+    cover, depth = (dr.gather(mi.Float, layer, pixel, mode=dr.ReduceMode.NoConflicts) for layer in (alpha, moment))
     seen = (cover > 0.1) & (depth > 0)
     found = dr.select(seen, cover / dr.select(seen, depth, 1), inverse)
     return dr.sum(dr.abs(found - inverse)) * dr.opaque(mi.Float, 1 / dr.width(pixel))
@@ -427,12 +453,12 @@ def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ..
     return photos if settings.masks == "off" or not masked else masked
 
 
-def _sight(photo: Photo, settings: FitSettings) -> Sight:
+def _sight(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None) -> Sight:
     scale = min(1.0, settings.size / max(photo.camera.width, photo.camera.height))
-    return Sight(photo, scale, masked=settings.masks != "off")
+    return Sight(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth)
 
 
-def _digest(capture: Capture, settings: FitSettings) -> str:
+def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
     """SHA-256 of everything that decides a fit."""
     digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
     for photo in capture.photos:
@@ -442,6 +468,10 @@ def _digest(capture: Capture, settings: FitSettings) -> str:
         for file in (photo.file, photo.mask):
             digest.update(b"-" if file is None else file.read_bytes())
     digest.update(capture.points.tobytes() + capture.colours.tobytes())
+    if depths is not None:
+        digest.update(depths.kind.encode())
+        for name, file in sorted(depths.files.items()):
+            digest.update(name.encode() + file.read_bytes())
     return digest.hexdigest()
 
 
@@ -458,8 +488,9 @@ def _finished(out: Path, inputs: str) -> FitResult | None:
         record = json.loads(path.read_text(encoding="utf-8"))
         held_out = tuple(HeldOut(**photo) for photo in record["held_out"])
         found, iterations, seconds = record["inputs"], int(record["iterations"]), float(record["seconds"])
+        warnings = tuple(record.get("warnings", ()))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not the record of a fit ({error})") from error
     if found != inputs:
         raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
-    return FitResult(Splats.load(out / "splats.ply"), iterations, seconds, held_out, inputs)
+    return FitResult(Splats.load(out / "splats.ply"), iterations, seconds, held_out, inputs, warnings)

@@ -114,10 +114,10 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
         except IMAGE_ERRORS as error:
             raise InputError(f"{path}: not a readable image ({error})") from error
         size = (photo.camera.width, photo.camera.height)
-        if _differ(mask.size, size) and not _differ(mask.size[::-1], size):
+        if shapes_differ(mask.size, size) and not shapes_differ(mask.size[::-1], size):
             mask.getexif()[ExifTags.Base.Orientation] = prepared[photo.name].orientation
             mask = ImageOps.exif_transpose(mask)
-        if _differ(mask.size, size):
+        if shapes_differ(mask.size, size):
             raise InputError(
                 f"{path}: must have the shape of its photo, {size[0]}x{size[1]} px (got {mask.width}x{mask.height})"
             )
@@ -345,7 +345,7 @@ def _grown(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
 
 
-def _differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
+def shapes_differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two image sizes are of different shape, up to the rounding of a reduced copy."""
     return abs(one[0] * other[1] - one[1] * other[0]) > max(*one, *other)
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from mitsplat.camera import Camera
 from mitsplat.capture import Photo
+from mitsplat.depth_maps import DepthMap, resize_map
 from mitsplat.files import write_file
 from mitsplat.metrics import psnr, ssim
 from mitsplat.optimise import Model
@@ -52,13 +53,15 @@ class Sight:
         photo: The photo.
         scale: Size relative to it.
         masked: Whether its mask is used.
+        inverse_depth: Of its pixels, in any size, if they are known.
 
     Attributes:
         camera: Its camera at that size.
         masked: Whether it has a mask that is used.
+        inverse_depth: Of its pixels [1/m], (H, W), NaN where unknown; or None.
     """
 
-    def __init__(self, photo: Photo, scale: float, *, masked: bool) -> None:
+    def __init__(self, photo: Photo, scale: float, *, masked: bool, inverse_depth: DepthMap | None = None) -> None:
         rgb, mask = photo.picture(scale)
         height, width, _ = rgb.shape
         self.camera: Camera = photo.camera.resized(width, height)
@@ -68,12 +71,13 @@ class Sight:
         # Four bytes per pixel, so that hundreds of photos fit in memory; made to floats in the kernels.
         self._packed = pixels.view(np.uint32).ravel()
         self._photo, self._scale, self._mask_used = photo, scale, masked
+        self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
         self._depths: tuple[Any, Any] | None = None
 
     @cached_property
     def half(self) -> Sight:
         """The same photo at half the size."""
-        return Sight(self._photo, 0.5 * self._scale, masked=self._mask_used)
+        return Sight(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
 
     @cached_property
     def view(self) -> Any:
@@ -104,7 +108,11 @@ class Sight:
         return [red * mask, green * mask, blue * mask], mask
 
     def depths(self, points: npt.NDArray[np.float64]) -> tuple[Any, Any]:
-        """Pixels and inverse depths [1/m] of those of the points (N, 3) that the photo sees, on the device."""
+        """Pixels and inverse depths [1/m] on the device: of its map, else of the points (N, 3) that the photo sees."""
+        if self.inverse_depth is not None:
+            # Made anew each time: on the device, maps of hundreds of photos would not fit.
+            number = np.flatnonzero(np.isfinite(self.inverse_depth) & (self.mask > 0.5))
+            return wrapped(mi.UInt32, number.astype(np.uint32)), wrapped(mi.Float, self.inverse_depth.ravel()[number])
         if self._depths is None:
             pixels, depth = self.camera.project(points[self._photo.seen])
             inside = (
@@ -114,6 +122,10 @@ class Sight:
             shown = self.mask[row, column] > 0.5
             number = (row * self.camera.width + column)[shown]
             inverse = (1 / depth[inside][shown]).astype(np.float32)
+            # One per pixel, the nearest: the gradients of several would be added in any order.
+            order = np.lexsort((-inverse, number))
+            number, first = np.unique(number[order], return_index=True)
+            inverse = inverse[order][first]
             self._depths = wrapped(mi.UInt32, number), wrapped(mi.Float, inverse)
         return self._depths
 

@@ -55,7 +55,8 @@ def render_depth_differentiable(cloud: Cloud, view: View, quality: Quality) -> t
     rgb, alpha = _march(lists.records, lists, view, quality)
     row = dr.arange(mi.UInt32, max(1, lists.visible)) * RECORD
     tinted = dr.copy(lists.records)
-    dr.scatter(tinted, dr.gather(mi.Float, lists.records, row + 9), row + 6)
+    depth = dr.gather(mi.Float, lists.records, row + 9, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(tinted, depth, row + 6)
     (moment, _, _), _ = _march(tinted, lists, view, quality)
     return rgb, alpha, moment
 

@@ -19,11 +19,12 @@ from conftest import WriteScene, box_asset
 from PIL import Image, ImageSequence
 from ruamel.yaml import YAML
 
-from mitsplat import bake, chart, dataset, fit, frame, pipeline, settle, xml_scene
+from mitsplat import bake, chart, dataset, depth_maps, depth_model, fit, frame, pipeline, settle, xml_scene
 from mitsplat.bake import BakeResult, BakeSettings
 from mitsplat.capture import Capture
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
+from mitsplat.depth_maps import DepthMaps
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.fit import FitProgress, FitResult, FitSettings
 from mitsplat.pipeline import Finished
@@ -213,15 +214,15 @@ def fit_capture(monkeypatch: pytest.MonkeyPatch) -> Calls:
 
 def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     status = run(
-        "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--iterations", 80, "--budget", "1.5min",
-        "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--masks", "ignore", "--background", "black",
-        "--depth", 0.5, "--exposure", "--seed", 4, "--overwrite",
+        "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--densification", "classic", "--iterations", 80,
+        "--budget", "1.5min", "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--masks", "ignore",
+        "--background", "black", "--depth", 0.7, "--exposure", "--seed", 4, "--overwrite",
     )  # fmt: skip
     assert status == 0
     assert fit_capture.args[:2] == (Path("photos"), tmp_path) and fit_capture.kwargs["overwrite"]
     assert fit_capture.args[2] == FitSettings(
-        gaussians=70, iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2, masks="ignore",
-        background="black", depth_weight=0.5, exposure=True, seed=4,
+        gaussians=70, densification="classic", iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2,
+        masks="ignore", background="black", depth_weight=0.7, exposure=True, seed=4,
     )  # fmt: skip
     assert "(12 Gaussians; 1 held-out photos: 28.00 dB, SSIM 0.900)" in capsys.readouterr().out
     fit_capture.kwargs["progress"](FitProgress(40, 0.5, 24.5, 23.0, 60))
@@ -230,6 +231,25 @@ def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFi
 def test_fit_defaults_are_those_of_the_settings(fit_capture: Calls, tmp_path: Path) -> None:
     assert run("fit", "photos", "-o", tmp_path) == 0
     assert fit_capture.args[2] == FitSettings() and not fit_capture.kwargs["overwrite"]
+
+
+def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
+    fit_capture: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Capture, "load", lambda folder: SimpleNamespace(training="photos"))
+    fit_capture.result = replace(fit_capture.result, warnings=("depth maps that are left out: a.jpg (…)",))
+    given, made = (Path("maps"), "photos", "metric"), ("photos", Path("a.onnx"), tmp_path / "depths", "metric")
+    for module, name, options, args in (
+        (depth_maps, "find_maps", ("--depths", "maps"), given),
+        (depth_model, "model_maps", ("--depth-model", "a.onnx"), made),
+    ):
+        found = Calls(DepthMaps({}, "metric"))
+        monkeypatch.setattr(module, name, found)
+        assert run("fit", "photos", "-o", tmp_path, "--depth-kind", "metric", *options) == 0
+        assert found.args == args and fit_capture.kwargs["depths"] is found.result
+        assert "warning: depth maps that are left out: a.jpg" in capsys.readouterr().out
+    assert run("fit", "photos", "-o", tmp_path, "--depths", "maps", "--depth-model", "a.onnx") == 2
+    assert "give --depths or --depth-model" in capsys.readouterr().err
 
 
 def test_fit_below_its_target_exits_with_4(

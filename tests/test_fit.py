@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -14,14 +15,16 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from mitsplat import fit
+from mitsplat import densify_classic, fit
 from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
 from mitsplat.colour import encode_srgb
+from mitsplat.depth_maps import DepthMaps, align_maps
 from mitsplat.errors import InputError
 from mitsplat.fit import FitProgress, FitSettings, fit_capture
 from mitsplat.render import ensure_variant, render_splats
 from mitsplat.seeds import seed_points
+from mitsplat.sight import Sight
 from mitsplat.splats import SH_C0, Splats
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 20
@@ -117,9 +120,14 @@ def test_finished_fit_is_read_and_not_made_again(fitted: Path, capture: Capture)
     assert again.iterations == 60 and again.psnr == json.loads((fitted / "fit.json").read_text())["psnr"]
 
 
+@pytest.mark.parametrize("densification", ["mcmc", "classic"])
 def test_interrupted_fit_goes_on_to_the_same_bytes(
-    fitted: Path, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, densification: Literal["mcmc", "classic"]
 ) -> None:
+    monkeypatch.setattr(densify_classic, "_RESET_STEPS", 20)  # one before the checkpoint, none soon after
+    settings, capture = replace(SMALL, densification=densification), seeing(capture)
+    whole = fit_capture(capture, tmp_path / "whole", settings)
+    assert 600 < len(whole.splats) <= 800
     monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     steps: list[int] = []
 
@@ -128,11 +136,22 @@ def test_interrupted_fit_goes_on_to_the_same_bytes(
         if len(steps) == 2:
             raise KeyboardInterrupt
 
+    out = tmp_path / "interrupted"
     with pytest.raises(KeyboardInterrupt):
-        fit_capture(capture, tmp_path, SMALL, progress=interrupt)
-    fit_capture(capture, tmp_path, SMALL, progress=lambda state: steps.append(state.step))
+        fit_capture(capture, out, settings, progress=interrupt)
+    fit_capture(capture, out, settings, progress=lambda state: steps.append(state.step))
     assert steps == [25, 50, 50, 60]  # the first checkpoint is behind the first report
-    assert (tmp_path / "splats.ply").read_bytes() == (fitted / "splats.ply").read_bytes()
+    assert (out / "splats.ply").read_bytes() == (tmp_path / "whole" / "splats.ply").read_bytes()
+
+
+@pytest.mark.parametrize("densification", ["mcmc", "classic"])
+def test_no_fit_has_more_gaussians_than_asked_for(
+    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
+) -> None:
+    counts: list[int] = []
+    settings = replace(SMALL, densification=densification, gaussians=700, refine_every=5)
+    fit_capture(capture, tmp_path, settings, progress=lambda state: counts.append(state.gaussians))
+    assert counts[0] > 600 and max(counts) == 700
 
 
 def test_another_seed_gives_other_splats(fitted: Path, capture: Capture, tmp_path: Path) -> None:
@@ -151,6 +170,7 @@ def test_folder_of_another_fit_is_refused_unless_overwritten(fitted: Path, captu
 
 
 def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) -> None:
+    """Nor do depths, whatever number of Gaussians or points a photo shows."""
     seen: list[set[int]] = []
     counts: list[int] = []
 
@@ -163,7 +183,7 @@ def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) ->
     settings = replace(SMALL, iterations=200, sh_degree=0, refine_every=5, gaussians=2000, coarse=0.0)
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), pytest.raises(KeyboardInterrupt):
-        fit_capture(capture, tmp_path, settings, progress=keep)
+        fit_capture(seeing(capture), tmp_path, settings, progress=keep)
     assert 600 < counts[1] < counts[2] < counts[3]
     assert seen[2] and seen[3] and seen[2] | seen[3] <= seen[0] | seen[1]
 
@@ -215,17 +235,93 @@ def test_only_what_is_asked_for_is_read_of_the_masks(capture: Capture, tmp_path:
     assert len(result.held_out) == 3
 
 
-def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:
+def seeing(capture: Capture) -> Capture:
+    """The capture whose photos see the points on their side of the ball."""
     facing = [
         np.flatnonzero(((photo.camera.centre - capture.points[:600]) * capture.points[:600]).sum(axis=1) > 0.1)
         for photo in capture.photos
     ]
     photos = tuple(replace(p, seen=own.astype(np.int32)) for p, own in zip(capture.photos, facing, strict=True))
-    seeing = replace(capture, photos=photos)
+    return replace(capture, photos=photos)
+
+
+def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:
     settings = replace(SMALL, iterations=20, coarse=0.0, depth_weight=1.0)
-    with_depths = fit_capture(seeing, tmp_path / "with", settings).splats
-    without = fit_capture(seeing, tmp_path / "without", replace(settings, depth_weight=0.0)).splats
+    with_depths = fit_capture(seeing(capture), tmp_path / "with", settings).splats
+    without = fit_capture(seeing(capture), tmp_path / "without", replace(settings, depth_weight=0.0)).splats
     assert np.abs(with_depths.means - without.means).max() > 1e-5
+
+
+def test_of_points_in_one_pixel_the_nearest_counts(capture: Capture) -> None:
+    """Gradients of several would be added in any order, and no two fits would be the same."""
+    ensure_variant()
+    camera = look(np.array([1.0, 0, 0]))
+    depths = np.array([3.0, 1.0, 2.0, 1.0])
+    slopes = np.array([[0, 0], [0, 0], [0, 0], [0.1, 0]])
+    local = np.column_stack([slopes, np.ones(4)]) * depths[:, None] + (1e-4, 1e-4, 0)
+    points = local @ camera.world_from_camera[:3, :3].T + camera.centre
+    photo = replace(capture.photos[0], camera=camera, seen=np.arange(4, dtype=np.int32))
+    pixel, inverse = (np.array(values) for values in Sight(photo, 1.0, masked=False).depths(points))
+    middle = HEIGHT // 2 * WIDTH + WIDTH // 2
+    np.testing.assert_array_equal(pixel, [middle, middle + int(0.1 * camera.fx)])
+    np.testing.assert_allclose(inverse, [1, 1], rtol=1e-4)
+
+
+def depth_maps(capture: Capture, folder: Path) -> DepthMaps:
+    """Inverse depths of the ball's photos as a network would give them: each with a scale and a shift of its own."""
+    files = {}
+    for number, photo in enumerate(capture.photos):
+        layers = render_splats(ball(), photo.camera, quality=fit.QUALITY)
+        inverse = np.where(layers.alpha > 0.9, 1 / np.maximum(layers.depth, 1), 0.1)
+        files[photo.name] = folder / f"{photo.name}.npy"
+        np.save(files[photo.name], (2 + 0.3 * number) * inverse - 0.1 * number)
+    return DepthMaps(files)
+
+
+def test_maps_take_the_place_of_points(capture: Capture, tmp_path: Path) -> None:
+    """A map knows every pixel of the object, the points only theirs."""
+    photo = seeing(capture).training[0]
+    maps = depth_maps(capture, tmp_path)
+    inverse, warnings = align_maps([photo], capture.points, maps, 64)
+    ensure_variant()
+    dense = Sight(photo, 1.0, masked=True, inverse_depth=inverse[photo.name])
+    assert warnings == ()
+    for sight in (dense, dense.half):
+        pixel, found = (np.array(values) for values in sight.depths(capture.points))
+        np.testing.assert_array_equal(pixel, np.flatnonzero(sight.mask > 0.5))
+        depth = render_splats(ball(), sight.camera, quality=fit.QUALITY).depth.ravel()[pixel]
+        assert np.median(np.abs(found * depth - 1)) < 0.02
+
+
+def test_maps_move_the_surface_and_are_part_of_the_fit(capture: Capture, tmp_path: Path) -> None:
+    settings = replace(SMALL, iterations=20, coarse=0.0, depth_weight=1.0)
+    photos, maps = seeing(capture), depth_maps(capture, tmp_path)
+    few = replace(photos.photos[1], seen=photos.photos[1].seen[:5])
+    photos = replace(photos, photos=(photos.photos[0], few, *photos.photos[2:]))
+    first = fit_capture(photos, tmp_path / "fit", settings, depths=maps)
+    assert first.warnings == (
+        "depth maps that are left out, because fewer than 10 of the capture's points are in them: 01.png",
+    )
+    assert fit_capture(photos, tmp_path / "fit", settings, depths=maps).warnings == first.warnings
+    without = fit_capture(photos, tmp_path / "without", settings)
+    assert np.abs(first.splats.means - without.splats.means).max() > 1e-5 and without.warnings == ()
+    with pytest.raises(InputError, match="belongs to a fit of other photos or settings"):
+        fit_capture(photos, tmp_path / "fit", settings, depths=replace(maps, kind="metric"))
+    values = np.load(maps.files["03.png"])
+    np.save(maps.files["03.png"], values + np.eye(*values.shape))
+    with pytest.raises(InputError, match="belongs to a fit of other photos or settings"):
+        fit_capture(photos, tmp_path / "fit", settings, depths=maps)
+
+
+def test_weight_of_maps_falls_and_that_of_points_does_not(capture: Capture) -> None:
+    ensure_variant()
+    photo = capture.training[0]
+    state = fit._Fit(capture, (photo,), (photo,), replace(SMALL, depth_weight=2.0), {})
+    sparse, dense = (Sight(photo, 1.0, masked=True, inverse_depth=m) for m in (None, np.ones((3, 4), np.float32)))
+    assert [state._depth_weight(sparse, fraction) for fraction in (0.0, 1.0)] == [2.0, 2.0]
+    assert [state._depth_weight(dense, f) for f in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 0.2, 0.02])
+    state.steps = 1
+    assert state._depth_weight(dense, 0.0) == 0
 
 
 def test_depth_error_is_the_mean_difference_of_inverse_depths() -> None:

@@ -86,6 +86,10 @@ def fit(
     capture: CaptureFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
     gaussians: Gaussians = 30000,
+    densification: Annotated[
+        Literal["mcmc", "classic"],
+        typer.Option(help="Add Gaussians where others are opaque, or where the photos pull at them."),
+    ] = "mcmc",
     iterations: Iterations = 3000,
     budget: Budget = None,
     target_psnr: Annotated[float | None, typer.Option(help="End early at this PSNR of held-out photos [dB].")] = None,
@@ -96,7 +100,17 @@ def fit(
         typer.Option(help="Fit only what masks show, ignore what they leave out, or do not read them."),
     ] = "alpha",
     background: Annotated[Literal["random", "black"], typer.Option(help="Colour behind the splats.")] = "random",
-    depth: Annotated[float, typer.Option(help="Weight of the depths of the capture's points.")] = 0.5,
+    depth: Annotated[float, typer.Option(help="Weight of the depths of the capture's points, or of depth maps.")] = 0.5,
+    depths: Annotated[
+        Path | None, typer.Option(help="Folder of depth maps, PHOTO.png (16-bit), .npy, .exr or .tiff.")
+    ] = None,
+    depth_kind: Annotated[
+        Literal["inverse", "metric"],
+        typer.Option(help="Whether these are of inverse depth, as of a network, or of depth, 0 where unknown."),
+    ] = "inverse",
+    depth_model: Annotated[
+        Path | None, typer.Option(help="Network (.onnx, such as Depth Anything v2) that makes the depth maps.")
+    ] = None,
     exposure: Annotated[
         bool, typer.Option("--exposure/--no-exposure", help="Give each photo a colour correction of its own.")
     ] = False,
@@ -110,10 +124,15 @@ def fit(
     Every eighth photo is held out to check the result.
     """
     from mitsplat.capture import Capture
+    from mitsplat.depth_maps import find_maps
+    from mitsplat.depth_model import model_maps
     from mitsplat.fit import FitProgress, FitSettings, fit_capture
 
+    if depths is not None and depth_model is not None:
+        raise InputError("depth maps come from a folder or from a network: give --depths or --depth-model")
     settings = FitSettings(
         gaussians=gaussians,
+        densification=densification,
         iterations=iterations,
         budget=None if budget is None else _seconds(budget),
         target_psnr=target_psnr,
@@ -126,13 +145,19 @@ def fit(
         seed=seed,
     )
     loaded = Capture.load(capture)
+    maps = None if depths is None else find_maps(depths, loaded.training, depth_kind)
+    if depth_model is not None:
+        with progress_bar("photos/s") as show:
+            maps = model_maps(loaded.training, depth_model, out / "depths", depth_kind, progress=show)
     with progress_bar("steps/s") as show:
 
         def progress(now: FitProgress) -> None:
             checked = "" if now.held_out is None else f" ({now.held_out:.1f} held out)"
             show(int(now.fraction * iterations), iterations, f"{now.psnr:.1f} dB{checked}, {now.gaussians} Gaussians")
 
-        result = fit_capture(loaded, out, settings, overwrite=overwrite, progress=progress)
+        result = fit_capture(loaded, out, settings, depths=maps, overwrite=overwrite, progress=progress)
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}")
     typer.echo(
         f"splats: {out / 'splats.ply'} ({len(result.splats)} Gaussians; {len(result.held_out)} held-out photos: "
         f"{result.psnr:.2f} dB, SSIM {result.ssim:.3f})"

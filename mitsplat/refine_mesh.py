@@ -40,7 +40,8 @@ _BATCH = 2
 _CHECKS = 10
 """Times that the mesh is judged on the way."""
 _SAMPLES = 4
-"""Rays per pixel of a step; four times as many judge."""
+"""Rays per pixel of a silhouette, and four times as many where it judges; its gradient takes one sample of the outline
+per pixel of the picture, which is a hundred for each that the outline passes through."""
 _STANDING = 0.005
 """Height above the table up to which vertices are what the object stands on, in radii."""
 _THINNEST = 1e-3
@@ -254,7 +255,7 @@ class _Silhouettes:
 
     def _shown(self, view: _Outline, samples: int, seed: int, params: Any = None) -> Any:
         picture = mi.render(
-            self.scene, params, sensor=view.sensor, integrator=self.integrator, spp=samples, seed=seed
+            self.scene, params, view.sensor, self.integrator, seed=seed, spp=samples, spp_grad=1
         )
         return picture.array
 

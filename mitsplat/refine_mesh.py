@@ -26,6 +26,7 @@ import trimesh
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.isolate import MaskedView
+from mitsplat.mend import mend_motion
 from mitsplat.plugins.device import plain_mesh, wrapped
 from mitsplat.render import ensure_variant
 
@@ -44,10 +45,6 @@ _SAMPLES = 4
 per pixel of the picture, which is a hundred for each that the outline passes through."""
 _STANDING = 0.005
 """Height above the table up to which vertices are what the object stands on, in radii."""
-_THINNEST = 1e-3
-"""Share of a face's area that must be left to its side of the old plane."""
-_ROUNDS = 12
-"""Times that vertices of faces which went wrong are taken half of their way back."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +79,27 @@ class RefinedMesh:
     """What came of a refinement.
 
     Attributes:
-        mesh: Refined, or as it was.
+        mesh: Refined if that was kept, or as it was.
+        kept: Whether it is the refined one.
         before: Mean of 1 - IoU between the silhouettes of the mesh and the masks of the views that judge.
-        after: The same of the best that was found; it is kept where this is less.
+        after: The same of the best refined mesh; infinite if none was valid.
+        judges: Number of these views.
     """
 
     mesh: trimesh.Trimesh
+    kept: bool
     before: float
     after: float
+    judges: int
+
+    def __str__(self) -> str:
+        """What came of it in one clause."""
+        if not np.isfinite(self.after):
+            return "dropped: it broke the mesh"
+        return (
+            f"{'kept' if self.kept else 'dropped'}: silhouettes and masks of {self.judges} photos set aside differ by "
+            f"{self.before:.2%} of the object before and by {self.after:.2%} after"
+        )
 
 
 def refine_mesh(
@@ -102,15 +112,15 @@ def refine_mesh(
 ) -> RefinedMesh:
     """Move the vertices of a mesh to where masks want its outlines.
 
-    Every sixth view takes no part, and judges: the best mesh on the way is returned where its error there is below that
-    of the given one, which is returned otherwise. The faces stay what they are, and none turns over or newly passes
-    through another.
+    Every sixth view takes no part, and judges: the best mesh on the way is kept if its error there is below that of the
+    given one, by more than the standard error of the mean over these views. The faces stay what they are, and none
+    turns over or newly passes through another.
 
     Args:
         mesh: Close to what the masks show, in the frame of the cameras.
         views: Cameras of any lens, and their masks.
         settings: Number and size of steps.
-        floor: Height z of the table that the object stands on, if it does: what is on it stays there, and nothing sinks.
+        floor: Height z of the table that the object stands on, if it does: what is on it stays, and nothing sinks.
         progress: Told after every step how many of how many are done.
 
     Raises:
@@ -122,15 +132,15 @@ def refine_mesh(
     outside = [view for view in views if np.linalg.norm(view.camera.centre - middle) > 1.05 * _ROOM * radius]
     if len(outside) < 4:
         raise InputError(f"a mesh is refined by masks from at least 4 places outside of it (got {len(outside)})")
-    held, shown = [], []
-    for number, view in enumerate(outside):
-        kind = held if number % _VALIDATION_EVERY == _VALIDATION_EVERY // 2 else shown
-        kind.append(_Outline(view, middle, radius, settings.size))
+    outlines = [Outline(view, middle, radius, settings.size) for view in outside]
+    judges = range(_VALIDATION_EVERY // 2, len(outlines), _VALIDATION_EVERY)
+    held = [outlines[index] for index in judges]
+    shown = [outline for index, outline in enumerate(outlines) if index not in judges]
     start = trimesh.Trimesh((mesh.vertices - middle) / radius, mesh.faces, process=False)
     lowest = -np.inf if floor is None else (floor - middle[2]) / radius
     standing = np.abs(start.vertices[:, 2] - lowest) < _STANDING
 
-    scene = _Silhouettes(start)
+    scene = Silhouettes(start)
     steps = mi.ad.LargeSteps(scene.vertices, scene.faces, settings.smoothness)
     descent = mi.ad.Adam(lr=settings.rate, uniform=True, params={"latent": steps.to_differential(scene.vertices)})
     height, stays = (wrapped(mi.Float, v.astype(np.float32)) for v in (start.vertices[:, 2], standing))
@@ -142,30 +152,32 @@ def refine_mesh(
         return dr.ravel(vertices)
 
     rng = np.random.default_rng(settings.seed)
-    before, after, kept = scene.error(start.vertices, held), np.inf, mesh
-    old = _crossings(start, start.vertices)
+    before = scene.errors(start.vertices, held)
+    refined, after = start.vertices, np.full(len(held), np.inf)
     for step in range(settings.steps):
         descent.set_learning_rate(settings.rate * (1 - step / settings.steps))
         chosen = rng.choice(len(shown), min(_BATCH, len(shown)), replace=False)
         dr.backward(scene.loss(moved(), [shown[index] for index in chosen], seed=step + settings.seed * settings.steps))
         descent.step()
         if (step + 1) % max(1, settings.steps // _CHECKS) == 0 or step + 1 == settings.steps:
-            found = _mended(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3), old)
-            error = np.inf if found is None else scene.error(found, held)
-            if found is not None and error < after:
-                after = error
-                if after < before:
-                    kept = trimesh.Trimesh(found * radius + middle, mesh.faces, process=False)
+            found = mend_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
+            if found is not None and (errors := scene.errors(found, held)).mean() < after.mean():
+                refined, after = found, errors
         if progress is not None:
             progress(step + 1, settings.steps)
-    return RefinedMesh(kept, before, after)
+    gain = before - after
+    kept = bool(np.isfinite(gain).all() and gain.mean() > gain.std() / np.sqrt(max(len(held) - 1, 1)))
+    if kept:
+        mesh = trimesh.Trimesh(refined * radius + middle, mesh.faces, process=False)
+    return RefinedMesh(mesh, kept, float(before.mean()), float(after.mean()), len(held))
 
 
-class _Outline:
+class Outline:
     """What a mask shows of the unit ball around the mesh, as a pinhole that looks at it sees it.
 
     Attributes:
         sensor: Mitsuba's pinhole, in radii about the middle.
+        focal: Its focal length [px].
         mask: Share of each pixel that is the object, (size * size,).
         known: 1 where the photo shows the pixel, else 0.
     """
@@ -173,22 +185,25 @@ class _Outline:
     def __init__(self, view: MaskedView, middle: FloatArray, radius: float, size: int) -> None:
         given = view.camera
         distance = float(np.linalg.norm(given.centre - middle))
+        fov = 2 * float(np.degrees(np.arcsin(_ROOM * radius / distance)))
         camera = Camera.look_at(
             given.centre,
             middle,
             up=-given.world_from_camera[:3, 1],
             width=size,
             height=size,
-            fov_x=2 * float(np.degrees(np.arcsin(_ROOM * radius / distance))),
+            fov_x=fov,
         )
+        self.focal = camera.fx
         y, x = np.mgrid[:size, :size] + 0.5
         slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
         pose = camera.world_from_camera
         ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ pose[:3, :3].T
-        pixels = given.project(given.centre + distance * ahead)[0].astype(np.float32).reshape(size, size, 2) - 0.5
-        height, width = view.mask.shape
-        known = ((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5))).all(axis=2)
-        mask = cv2.remap(view.mask, np.where(known[..., None], pixels, -9), None, cv2.INTER_LINEAR)
+        # Pixel centres are at +0.5 here, and whole in OpenCV.
+        pixels = np.nan_to_num(given.project(given.centre + distance * ahead)[0], nan=-9.0) - 0.5
+        known = ((pixels > -0.5) & (pixels < np.array([given.width, given.height]) - 0.5)).all(axis=1)
+        x, y = pixels.T.astype(np.float32).reshape(2, size, size)
+        mask = cv2.remap(view.mask, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         self.mask, self.known = (wrapped(mi.Float, v.ravel().astype(np.float32)) for v in (mask, known))
         pose = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
         pose[:3, 3] = (given.centre - middle) / radius
@@ -196,7 +211,7 @@ class _Outline:
             {
                 "type": "perspective",
                 "to_world": mi.ScalarTransform4f(pose),
-                "fov": 2 * float(np.degrees(np.arctan(0.5 * size / camera.fx))),
+                "fov": fov,
                 "film": {
                     "type": "hdrfilm",
                     "width": size,
@@ -208,7 +223,7 @@ class _Outline:
         )
 
 
-class _Silhouettes:
+class Silhouettes:
     """A mesh that shines evenly, whose vertices can be moved."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -230,74 +245,31 @@ class _Silhouettes:
         """Vertices of the triangles, flat."""
         return self.params["mesh.faces"]
 
-    def loss(self, vertices: Any, views: Sequence[_Outline], seed: int) -> Any:
+    def loss(self, vertices: Any, views: Sequence[Outline], seed: int) -> Any:
         """Mean squared difference of silhouettes and masks, with gradients."""
-        self._move(vertices)
+        self.move(vertices)
         total = mi.Float(0)
         for number, view in enumerate(views):
-            shown = self._shown(view, _SAMPLES, _BATCH * seed + number, self.params)
+            shown = self.shown(view, _SAMPLES, _BATCH * seed + number, self.params)
             total += dr.mean(dr.square(shown - view.mask) * view.known)
         return total
 
-    def error(self, vertices: FloatArray, views: Sequence[_Outline]) -> float:
-        """Mean of 1 - IoU of silhouettes and masks, of which every pixel has a share."""
-        self._move(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
+    def errors(self, vertices: FloatArray, views: Sequence[Outline]) -> FloatArray:
+        """1 - IoU of silhouette and mask, of which every pixel has a share, per view."""
+        self.move(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
         errors = []
         for view in views:
-            shown = self._shown(view, 4 * _SAMPLES, 0)
+            shown = self.shown(view, 4 * _SAMPLES, 0)
             both, either = (dr.sum(pick(shown, view.mask) * view.known)[0] for pick in (dr.minimum, dr.maximum))
             errors.append(1 - both / max(either, 1e-9))
-        return float(np.mean(errors))
+        return np.array(errors, dtype=np.float64)
 
-    def _move(self, vertices: Any) -> None:
+    def move(self, vertices: Any) -> None:
+        """Put the vertices elsewhere."""
         self.params["mesh.vertex_positions"] = vertices
         self.params.update()
 
-    def _shown(self, view: _Outline, samples: int, seed: int, params: Any = None) -> Any:
-        picture = mi.render(
-            self.scene, params, view.sensor, self.integrator, seed=seed, spp=samples, spp_grad=1
-        )
+    def shown(self, view: Outline, samples: int, seed: int, params: Any = None) -> Any:
+        """Share of each pixel that the mesh covers, (size * size,); gradients reach ``params``."""
+        picture = mi.render(self.scene, params, view.sensor, self.integrator, seed=seed, spp=samples, spp_grad=1)
         return picture.array
-
-
-def _mended(start: trimesh.Trimesh, vertices: FloatArray, old: npt.NDArray[np.intp]) -> FloatArray | None:
-    """Moved vertices, held back where faces turn over, vanish, or newly cross; None if that does not help.
-
-    Args:
-        start: Mesh that they belong to.
-        vertices: Where they moved to, (V, 3).
-        old: Edges that cross faces of ``start``.
-    """
-    share = np.ones((len(vertices), 1))
-    across = np.cross(*_sides(start.vertices, start.faces))
-    for _ in range(_ROUNDS):
-        found = start.vertices + share * (vertices - start.vertices)
-        left = (np.cross(*_sides(found, start.faces)) * across).sum(axis=1)
-        turned = left < _THINNEST * (across**2).sum(axis=1)
-        crossing = np.setdiff1d(_crossings(start, found), old)
-        wrong = np.union1d(start.faces[turned], start.edges_unique[crossing])
-        if not len(wrong):
-            return found
-        share[wrong] /= 2
-    return None
-
-
-def _sides(vertices: FloatArray, faces: npt.NDArray[np.integer[Any]]) -> tuple[FloatArray, FloatArray]:
-    """Two sides of every face."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return b - a, c - a
-
-
-def _crossings(mesh: trimesh.Trimesh, vertices: FloatArray) -> npt.NDArray[np.intp]:
-    """Edges, as rows of ``edges_unique``, that pass through a face which they do not touch."""
-    edges, faces = mesh.edges_unique, np.asarray(mesh.faces)
-    scene = mi.load_dict({"type": "scene", "mesh": plain_mesh(trimesh.Trimesh(vertices, faces, process=False))})
-    a, b = (np.asarray(vertices, dtype=np.float32)[end].T for end in edges.T)
-    origin = mi.Point3f(np.ascontiguousarray(0.999 * a + 0.001 * b))
-    hit = scene.ray_intersect_preliminary(
-        mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(0.998 * (b - a))), 1.0, 0.0, [])
-    )
-    face = np.array(hit.prim_index)
-    valid = np.flatnonzero(np.array(hit.is_valid()))
-    apart = ~(faces[face[valid]][:, :, None] == edges[valid][:, None, :]).any(axis=(1, 2))
-    return valid[apart]

@@ -113,8 +113,8 @@ def refine_mesh(
     """Move the vertices of a mesh to where masks want its outlines.
 
     Every sixth view takes no part, and judges: the best mesh on the way is kept if its error there is below that of the
-    given one, by more than the standard error of the mean over these views. The faces stay what they are, and none
-    turns over or newly passes through another.
+    given one, by more than the standard error of the mean over these views. If the given one was made of all masks, it
+    has an advantage. The faces stay what they are, and none turns over or newly passes through another.
 
     Args:
         mesh: Close to what the masks show, in the frame of the cameras.
@@ -141,12 +141,13 @@ def refine_mesh(
     standing = np.abs(start.vertices[:, 2] - lowest) < _STANDING
 
     scene = Silhouettes(start)
-    steps = mi.ad.LargeSteps(scene.vertices, scene.faces, settings.smoothness)
-    descent = mi.ad.Adam(lr=settings.rate, uniform=True, params={"latent": steps.to_differential(scene.vertices)})
+    positions, faces = (scene.params[f"mesh.{name}"] for name in ("vertex_positions", "faces"))
+    smoothing = mi.ad.LargeSteps(positions, faces, settings.smoothness)
+    descent = mi.ad.Adam(lr=settings.rate, uniform=True, params={"latent": smoothing.to_differential(positions)})
     height, stays = (wrapped(mi.Float, v.astype(np.float32)) for v in (start.vertices[:, 2], standing))
 
     def moved() -> Any:
-        vertices = dr.unravel(mi.Point3f, steps.from_differential(descent["latent"]))
+        vertices = dr.unravel(mi.Point3f, smoothing.from_differential(descent["latent"]))
         above = dr.maximum(vertices.z, dr.minimum(height, float(lowest)))
         vertices.z = dr.select(stays > 0, height, above)
         return dr.ravel(vertices)
@@ -157,7 +158,7 @@ def refine_mesh(
     for step in range(settings.steps):
         descent.set_learning_rate(settings.rate * (1 - step / settings.steps))
         chosen = rng.choice(len(shown), min(_BATCH, len(shown)), replace=False)
-        dr.backward(scene.loss(moved(), [shown[index] for index in chosen], seed=step + settings.seed * settings.steps))
+        dr.backward(scene.loss(moved(), [shown[index] for index in chosen], rng))
         descent.step()
         if (step + 1) % max(1, settings.steps // _CHECKS) == 0 or step + 1 == settings.steps:
             found = mend_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
@@ -207,20 +208,15 @@ class Outline:
         self.mask, self.known = (wrapped(mi.Float, v.ravel().astype(np.float32)) for v in (mask, known))
         pose = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
         pose[:3, 3] = (given.centre - middle) / radius
-        self.sensor = mi.load_dict(
-            {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f(pose),
-                "fov": fov,
-                "film": {
-                    "type": "hdrfilm",
-                    "width": size,
-                    "height": size,
-                    "pixel_format": "luminance",
-                    "rfilter": {"type": "box"},
-                },
-            }
-        )
+        film = {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "pixel_format": "luminance",
+            "rfilter": {"type": "box"},
+        }
+        placed = {"to_world": mi.ScalarTransform4f(pose), "fov": fov}
+        self.sensor = mi.load_dict({"type": "perspective", "film": film, **placed})
 
 
 class Silhouettes:
@@ -235,22 +231,12 @@ class Silhouettes:
         self.integrator.sample_border_warning = False
         self.params = mi.traverse(self.scene)
 
-    @property
-    def vertices(self) -> Any:
-        """Positions, flat."""
-        return mi.Float(self.params["mesh.vertex_positions"])
-
-    @property
-    def faces(self) -> Any:
-        """Vertices of the triangles, flat."""
-        return self.params["mesh.faces"]
-
-    def loss(self, vertices: Any, views: Sequence[Outline], seed: int) -> Any:
+    def loss(self, vertices: Any, views: Sequence[Outline], rng: np.random.Generator) -> Any:
         """Mean squared difference of silhouettes and masks, with gradients."""
         self.move(vertices)
         total = mi.Float(0)
-        for number, view in enumerate(views):
-            shown = self.shown(view, _SAMPLES, _BATCH * seed + number, self.params)
+        for view in views:
+            shown = self.shown(view, _SAMPLES, int(rng.integers(2**31)), self.params)
             total += dr.mean(dr.square(shown - view.mask) * view.known)
         return total
 

@@ -22,10 +22,12 @@ from mitsplat.plugins.device import plain_mesh
 from mitsplat.reconstruct import ImportedMesh, reconstruct_asset
 from mitsplat.refine_mesh import MeshRefineSettings, Outline, Silhouettes, refine_mesh
 from mitsplat.render import ensure_variant
+from mitsplat.surface import SurfaceSettings
 from mitsplat.verdict import iou
 
 SIZE = 72
-QUICK = MeshRefineSettings(steps=60, size=SIZE, rate=5e-3)
+QUICK = MeshRefineSettings(steps=40, size=SIZE, rate=5e-3)
+DETAIL = replace(QUICK, rate=1e-2, smoothness=1.0)
 
 
 def bumpy(bumps: float = 0.1, scale: float = 1.0) -> trimesh.Trimesh:
@@ -69,15 +71,22 @@ def views(truth: trimesh.Trimesh) -> list[MaskedView]:
     return masked(truth, orbit(24, width=SIZE, height=SIZE))
 
 
-@pytest.mark.parametrize("bumps, scale, factor", [(0.1, 1.03, 5.0), (0.05, 1.0, 1.5)], ids=["swollen", "smoothed"])
+@pytest.mark.parametrize(
+    "bumps, scale, settings, factor", [(0.1, 1.03, QUICK, 5.0), (0.05, 1.0, DETAIL, 1.8)], ids=["swollen", "smoothed"]
+)
 def test_a_disturbed_mesh_comes_back_to_the_solid(
-    truth: trimesh.Trimesh, views: list[MaskedView], bumps: float, scale: float, factor: float
+    truth: trimesh.Trimesh,
+    views: list[MaskedView],
+    bumps: float,
+    scale: float,
+    settings: MeshRefineSettings,
+    factor: float,
 ) -> None:
     start = bumpy(bumps, scale)
     told: list[tuple[int, int]] = []
-    found = refine_mesh(start, views, QUICK, progress=lambda done, total: told.append((done, total)))
+    found = refine_mesh(start, views, settings, progress=lambda done, total: told.append((done, total)))
     assert found.kept and found.after < found.before
-    assert (found.judges, told[-1]) == (4, (60, 60))
+    assert (found.judges, told[-1]) == (4, (40, 40))
     assert chamfer(start, truth) > factor * chamfer(found.mesh, truth)
     assert overlap(found.mesh, truth) > overlap(start, truth)
     assert found.mesh.is_volume
@@ -148,7 +157,7 @@ def test_area_of_a_balls_silhouette_grows_as_its_radius_says() -> None:
     scene = Silhouettes(ball)
     radius = mi.Float(1)
     dr.enable_grad(radius)
-    scene.move(scene.vertices * radius)
+    scene.move(mi.Float(scene.params["mesh.vertex_positions"]) * radius)
     area = dr.sum(scene.shown(outline, 4, 0, scene.params))
     dr.backward(area)
     focal, distance = outline.focal, 4.0
@@ -158,21 +167,20 @@ def test_area_of_a_balls_silhouette_grows_as_its_radius_says() -> None:
 
 
 @pytest.mark.parametrize(
-    "distortion, lens", [((-0.2, 0.05, 0.002, -0.003), "opencv"), ((0.05, -0.01, 0.0, 0.0), "fisheye")]
+    "distortion, lens", [((-0.35, 0.12, 0.004, -0.006), "opencv"), ((0.05, -0.01, 0.0, 0.0), "fisheye")]
 )
 def test_masks_through_a_lens_are_those_of_a_pinhole(
     truth: trimesh.Trimesh, distortion: tuple[float, ...], lens: str
 ) -> None:
-    """From beside, so that the object is where the lens bends most; what lies outside of the photo is not known."""
-    aside = Camera.look_at((0.3, 0, 0.1), (0, 0.05, 0), width=160, height=160, fov_x=50)
+    """Seen aside, where the lens bends most: taken for those of a pinhole they would be ten times as wrong."""
+    aside = Camera.look_at((0.3, 0, 0.1), (0, 0.05, 0), width=480, height=480, fov_x=50)
     cameras = [aside, replace(aside, distortion=distortion, lens=lens)]
-    pinhole, bent = (Outline(view, np.zeros(3), 0.07, SIZE) for view in masked(truth, cameras))
+    pinhole, bent = (Outline(view, np.zeros(3), 0.07, SIZE) for view in masked(truth, cameras, 2))
     known = np.array(pinhole.known) * np.array(bent.known)
-    difference = np.abs(np.array(pinhole.mask) - np.array(bent.mask))[known > 0]
-    assert 0.9 < known.mean() <= 1.0
-    assert difference.mean() < 0.005
-    straight = np.array(Outline(replace(masked(truth, cameras[1:])[0], camera=aside), np.zeros(3), 0.07, SIZE).mask)
-    assert np.abs(np.array(pinhole.mask) - straight).mean() > 0.02
+    straight = Outline(replace(masked(truth, cameras[1:], 2)[0], camera=aside), np.zeros(3), 0.07, SIZE)
+    error, taken = (np.abs((np.array(pinhole.mask) - np.array(o.mask)) * known).mean() for o in (bent, straight))
+    assert known.mean() > 0.9
+    assert error < 0.1 * taken
 
 
 @pytest.mark.parametrize(("field", "value"), [("steps", 0), ("size", 8), ("rate", 0.0), ("smoothness", np.nan)])
@@ -190,7 +198,8 @@ def test_assets_say_what_came_of_it(
     known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mitsplat.reconstruct.convex_pieces", lambda mesh: (mesh.convex_hull,))
-    settings = replace(SETTINGS, refine=replace(QUICK, steps=10))
+    surface = SurfaceSettings(voxels=48, faces=1000)
+    settings = replace(SETTINGS, surface=surface, view_size=64, verdict_size=64, refine=replace(QUICK, steps=1))
     found = reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=settings)
     assert found.refinement is not None
     assert found.verdict.refinement == str(found.refinement)

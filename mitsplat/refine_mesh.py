@@ -8,6 +8,10 @@ surface by "Large Steps in Inverse Rendering of Geometry" (Nicolet et al. 2021),
 Mitsuba samples the outlines of pinhole cameras only. Every mask is therefore resampled, through whatever lens it was
 taken, to a pinhole at the same place that looks at the middle of the mesh and is filled by it: turning a camera about
 its centre changes nothing of what it sees, and views of one size share their kernels.
+
+The photos' colours are left out by measurement. On a solid whose photos a colour per vertex explains without light,
+colours that were found together with the vertices raised the error of the silhouettes in views set aside from 0.35 to
+0.37 %, and the distance to the solid from 0.035 to 0.037 % (weight 0.3) and 0.042 % (weight 1) of the diagonal.
 """
 
 from __future__ import annotations
@@ -62,7 +66,7 @@ class MeshRefineSettings:
     steps: int = 200
     size: int = 400
     rate: float = 2e-3
-    smoothness: float = 19.0
+    smoothness: float = 5.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -187,14 +191,8 @@ class Outline:
         given = view.camera
         distance = float(np.linalg.norm(given.centre - middle))
         fov = 2 * float(np.degrees(np.arcsin(_ROOM * radius / distance)))
-        camera = Camera.look_at(
-            given.centre,
-            middle,
-            up=-given.world_from_camera[:3, 1],
-            width=size,
-            height=size,
-            fov_x=fov,
-        )
+        up = -given.world_from_camera[:3, 1]
+        camera = Camera.look_at(given.centre, middle, up=up, width=size, height=size, fov_x=fov)
         self.focal = camera.fx
         y, x = np.mgrid[:size, :size] + 0.5
         slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
@@ -208,13 +206,8 @@ class Outline:
         self.mask, self.known = (wrapped(mi.Float, v.ravel().astype(np.float32)) for v in (mask, known))
         pose = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
         pose[:3, 3] = (given.centre - middle) / radius
-        film = {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "pixel_format": "luminance",
-            "rfilter": {"type": "box"},
-        }
+        box = {"type": "box"}
+        film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "luminance", "rfilter": box}
         placed = {"to_world": mi.ScalarTransform4f(pose), "fov": fov}
         self.sensor = mi.load_dict({"type": "perspective", "film": film, **placed})
 

@@ -60,7 +60,7 @@ class MeshRefineSettings:
         size: Edge of the square pictures that masks are resampled to [px].
         rate: Step of the optimiser, in radii of the mesh; it falls to nothing by the end.
         smoothness: Weight λ of the Laplacian that gradients are spread by.
-        seed: Of the choice of views and of the samples.
+        seed: Of the choice of views and of the samples; runs of the same seed agree to the rounding of float32.
     """
 
     steps: int = 200

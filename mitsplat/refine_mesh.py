@@ -100,8 +100,9 @@ class RefinedMesh:
         """What came of it in one clause."""
         if not np.isfinite(self.after):
             return "dropped: it broke the mesh"
+        fate = "kept" if self.kept else "dropped" if self.after >= self.before else "dropped, as it may be chance"
         return (
-            f"{'kept' if self.kept else 'dropped'}: silhouettes and masks of {self.judges} photos set aside differ by "
+            f"{fate}: silhouettes and masks of {self.judges} photos set aside differ by "
             f"{self.before:.2%} of the object before and by {self.after:.2%} after"
         )
 

@@ -17,6 +17,7 @@ from mitsplat.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.isolate import Isolation, MaskedView, isolate_object
 from mitsplat.mesh import convex_pieces
+from mitsplat.refine_mesh import MeshRefineSettings, RefinedMesh, refine_mesh
 from mitsplat.splats import Splats
 from mitsplat.surface import SurfaceSettings, reconstruct_surface, simplify_surface
 from mitsplat.verdict import HeldOutView, Verdict, judge, show_held_out, sized_photo
@@ -34,12 +35,14 @@ class ReconstructSettings:
         view_size: Longest edge of the pictures that masks and depth are read from [px].
         verdict_size: Longest edge of the held-out pictures [px].
         size: Longest extent of the mesh [m], which then decides the units.
+        refine: How the mesh of an object is refined by its masks; None leaves it as it is reconstructed.
     """
 
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     view_size: int = 640
     verdict_size: int = 800
     size: float | None = None
+    refine: MeshRefineSettings | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,7 @@ class Reconstruction:
         held_out: The views that this was judged by.
         isolation: What was removed, or None for surroundings.
         alignment: Where a registered mesh was found.
+        refinement: What came of refining the mesh, in the capture's frame, or None where that was not asked for.
     """
 
     asset: Asset
@@ -74,6 +78,7 @@ class Reconstruction:
     held_out: Sequence[HeldOutView]
     isolation: Isolation | None
     alignment: Alignment | None
+    refinement: RefinedMesh | None
 
 
 def reconstruct_asset(
@@ -102,8 +107,8 @@ def reconstruct_asset(
         progress: Told what is being done.
 
     Raises:
-        InputError: If an object has no masks, a size is given to a capture in metres, or masks and splats do not belong
-            together.
+        InputError: If an object has no masks, a size is given to a capture in metres, what is to be refined was not
+            reconstructed by masks, or masks and splats do not belong together.
     """
 
     def telling(text: str) -> Callable[[int, int], None]:
@@ -111,6 +116,8 @@ def reconstruct_asset(
 
     if settings.size is not None and capture.units == "metre":
         raise InputError(f"{name}: the capture is in metres already: it takes no size (got {settings.size:g} m)")
+    if settings.refine is not None and (kind != "object" or imported is not None):
+        raise InputError(f"{name}: only the mesh of an object that is reconstructed by its masks is refined")
     pictures = [sized_photo(photo, settings.view_size) for photo in capture.training]
     isolation = None
     views: Sequence[MaskedView] = [MaskedView(camera, mask) for camera, _, mask in pictures if mask is not None]
@@ -120,19 +127,22 @@ def reconstruct_asset(
         isolation = isolate_object(splats, views, progress=telling("isolating the object"))
         splats = isolation.splats
     cameras = [camera for camera, _, _ in pictures]
-    alignment = None
+    alignment = refinement = None
     if imported is None:
         masks = [view.mask for view in views] if kind == "object" else None
         seen_by = [view.camera for view in views] if kind == "object" else cameras
         telling_surface = telling("finding the surface")
         floor = 0.0 if kind == "object" and capture.table and _stands(splats) else None
         mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, floor=floor, progress=telling_surface)
+        if settings.refine is not None:
+            refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=telling("refining the mesh"))
+            mesh = refinement.mesh
     else:
         mesh, alignment = _placed(imported, splats, cameras)
         mesh = simplify_surface(mesh, settings.surface.faces)
     telling("judging by held-out photos")(0, 1)
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
-    verdict = judge(capture, splats, mesh, held_out, isolation=isolation, psnr=psnr)
+    verdict = judge(capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement)
     asset = Asset(
         name=name,
         class_name=class_name or name,
@@ -151,7 +161,7 @@ def reconstruct_asset(
         telling("splitting the mesh into convex pieces")(0, 1)
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
-    return Reconstruction(asset, verdict, held_out, isolation, alignment)
+    return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement)
 
 
 _BELOW = 0.02

@@ -14,6 +14,7 @@ from mitsplat.camera import Camera
 from mitsplat.capture import Capture, Photo
 from mitsplat.colour import encode_srgb
 from mitsplat.isolate import Isolation
+from mitsplat.refine_mesh import RefinedMesh
 from mitsplat.render import make_integrator, make_splats_shape, render_layers
 from mitsplat.splats import Splats
 
@@ -102,6 +103,7 @@ class Verdict:
         faces: Number of faces of the mesh.
         watertight: Whether the mesh encloses a volume.
         solid: Whether it must, as that of an object.
+        refinement: What came of refining the mesh, as one clause, or None where that was not asked for.
     """
 
     photos: int
@@ -119,6 +121,7 @@ class Verdict:
     faces: int
     watertight: bool
     solid: bool
+    refinement: str | None = None
 
     @property
     def registered(self) -> float:
@@ -194,6 +197,7 @@ def judge(
     *,
     isolation: Isolation | None,
     psnr: float | None,
+    refinement: RefinedMesh | None = None,
 ) -> Verdict:
     """Figures from held-out views of splats and mesh."""
     masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
@@ -217,6 +221,7 @@ def judge(
         faces=0 if mesh is None else len(mesh.faces),
         watertight=mesh is not None and _closed(mesh),
         solid=isolation is not None,
+        refinement=None if refinement is None else str(refinement),
     )
 
 

@@ -43,6 +43,9 @@ Budget = Annotated[
 ]
 Edge = Annotated[int, typer.Option(help="Longest edge of the photos in the fit [px].")]
 Faces = Annotated[int, typer.Option(help="Most faces of the mesh.")]
+Refine = Annotated[
+    bool, typer.Option("--refine", help="Refine the mesh by the masks, where photos set aside say that it helps.")
+]
 
 
 def bake(
@@ -260,6 +263,7 @@ def mesh(
         typer.Option(help="Matrix (3x4 or 4x4, text) that its tool applied to the cameras: its inverse places it."),
     ] = None,
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
+    refine: Refine = False,
 ) -> None:
     """Make an asset of SPLATS that were fitted to CAPTURE.
 
@@ -270,6 +274,7 @@ def mesh(
     from mitsplat.assets import read_mesh
     from mitsplat.pipeline import AssetJob, make_asset
     from mitsplat.reconstruct import ImportedMesh, ReconstructSettings
+    from mitsplat.refine_mesh import MeshRefineSettings
     from mitsplat.surface import SurfaceSettings
 
     if take is None and (normalisation is not None or units is not None):
@@ -283,7 +288,7 @@ def mesh(
         name=name or out.resolve().name,
         class_name=class_name,
         kind=kind,
-        settings=ReconstructSettings(surface=surface, size=size),
+        settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
     )
     with progress_bar("steps") as progress:
@@ -307,6 +312,7 @@ def asset(
     budget: Budget = None,
     edge: Edge = 800,
     faces: Faces = 10000,
+    refine: Refine = False,
     seed: Seed = 0,
 ) -> None:
     """Make an asset of PHOTOS.
@@ -317,6 +323,7 @@ def asset(
     from mitsplat.fit import FitSettings
     from mitsplat.pipeline import AssetJob, make_photo_asset
     from mitsplat.reconstruct import ReconstructSettings
+    from mitsplat.refine_mesh import MeshRefineSettings
     from mitsplat.surface import SurfaceSettings
     from mitsplat.take import CaptureSettings
 
@@ -324,7 +331,9 @@ def asset(
         name=name or out.resolve().name,
         class_name=class_name,
         kind=kind,
-        settings=ReconstructSettings(surface=SurfaceSettings(faces=faces), size=size),
+        settings=ReconstructSettings(
+            surface=SurfaceSettings(faces=faces), size=size, refine=MeshRefineSettings(seed=seed) if refine else None
+        ),
     )
     with progress_bar("steps") as progress:
         done = make_photo_asset(
@@ -362,6 +371,8 @@ def _tell_asset(done: Finished) -> None:
         typer.echo(f"warning: {warning}")
     typer.echo(f"photos: {found.photos} of {found.photos + found.rejected} with a camera; units: {found.units}")
     typer.echo(f"splats: {found.gaussians}; mesh: {found.faces} faces, {closed}")
+    if found.refinement is not None:
+        typer.echo(f"refinement: {found.refinement}")
     figures = {
         "held-out PSNR": None if found.psnr is None else f"{found.psnr:.2f} dB",
         "IoU with held-out masks": None

@@ -23,8 +23,10 @@ SMALL = 64 / 9
 """Pixels of equal weight that have the noise of a mean over 3 x 3 with halves at the ends."""
 
 GAIN = 5.0
-"""By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3.
-With this, ``python -m benchmarks.light`` finds the wanted error over all shadows, and a third more in penumbrae."""
+"""By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3
+pixels. With this, ``python -m benchmarks.light`` finds the wanted error over all shadows, and a third more in
+penumbrae."""
+
 
 NOWHERE = 0xFFFFFFFF
 """Place of a pixel at which no light was traced."""

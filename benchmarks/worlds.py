@@ -123,7 +123,10 @@ def has_rested(
         def velocities(self) -> FloatArray:
             return np.zeros((len(bodies), 2, 3))
 
-        def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None:
+        def _reset(self, coordinates: FloatArray) -> None:
+            raise NotImplementedError
+
+        def _set_velocities(self, velocities: FloatArray) -> None:
             raise NotImplementedError
 
         def _advance(self) -> None:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,7 +19,7 @@ from mitsplat.clearance import Clearance, PlacedSurface, Surface, all_clearances
 from mitsplat.contacts import ContactFinder
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
-from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, WarpWorld, World, all_pieces, run_to_rest
+from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, Outcome, WarpWorld, World, all_pieces, run_to_rest
 from mitsplat.place import Item, draw_poses, fixed_pose
 from mitsplat.scene import ENCLOSURE, Scene, bin_walls
 from mitsplat.settle import NOTHING_TO_REST, FloatArray, Instance, Layout, Progress, RestCertificate
@@ -33,6 +34,7 @@ _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
 # Simulations of which the remains may pile up. Newton leaves the model of each, a MiB and more, in reference cycles,
 # which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
 _GARBAGE = 24
+_POURED = 1.0  # speed of objects that are poured in piles [m/s]: faster, light ones are flung out by heavy ones
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
 
 
@@ -101,7 +103,7 @@ class Drop:
             start = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt), given)
             world = self._world(assets, frictions, capacity)
             world.reset(start)
-            outcome = run_to_rest(world, max_time=spec.settle.max_time, bounds=self._bounds)
+            outcome = self._run(world)
             reason = outcome.refused
             if reason == OVERFLOW:
                 capacity *= 2
@@ -153,8 +155,13 @@ class Drop:
             if len(moments) * interval <= time <= certificate.time_to_rest:
                 moments.append(poses)
 
-        run_to_rest(world, max_time=self.scene.spec.settle.max_time, bounds=self._bounds, observe=observe)
+        self._run(world, observe=observe)
         yield from moments
+
+    def _run(self, world: World, **options: Any) -> Outcome:
+        settle = self.scene.spec.settle
+        fastest = _POURED if settle.arrangement == "pile" else np.inf
+        return run_to_rest(world, max_time=settle.max_time, bounds=self._bounds, fastest=fastest, **options)
 
     def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[FloatArray | None, ...]]:
         """Which entry each object of a layout is of, and the pose that the file gives it, if any."""

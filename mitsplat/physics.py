@@ -26,17 +26,15 @@ from mitsplat.mesh import MassProperties, join_meshes
 
 FloatArray = NDArray[np.float64]
 
-QUIET_SPEED, QUIET_SPIN = 1e-3, 0.05
-"""A body below both [m/s, rad/s], on the mean over ``_MEAN_TIME``, may be at rest."""
-
 OVERFLOW = "contact buffer overflow"
 """Why :func:`run_to_rest` refuses a drop that a larger capacity may save."""
 
 _GRAVITY = (0.0, 0.0, -9.81)
-# Contacts of rounded hulls flicker from step to step: velocities of bodies that stay where they are.
-_MEAN_TIME = 0.05  # [s]
-_QUIET_TIME = 0.25  # how long every body must be quiet [s]
-_MOTION, _WATCH_TIME = 5e-4, 1.0  # how far no surface may move [m] in how long [s]
+# How far no surface may move [m] in how long [s] for all to be at rest, and before what may still roll is let go.
+# Speeds say less: contacts of rounded hulls flicker from step to step, and with them what stays where it is.
+_MOTION, _WATCH_TIME = 5e-4, 1.0
+_QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
+_MEAN_TIME = 0.05  # over which speeds are told [s]
 # Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
 # 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
 _CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
@@ -157,11 +155,12 @@ class World(ABC):
         """
         self.time = 0.0
         self.let_roll(False)
-        coordinates = _coordinates(self.bodies, poses)
-        motion = np.zeros((len(coordinates), 2, 3))
-        if velocities is not None:
-            motion[: len(velocities)] = velocities
-        self._reset(coordinates, motion)
+        self._reset(_coordinates(self.bodies, poses))
+        self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
+
+    def set_velocities(self, velocities: FloatArray) -> None:
+        """Give the bodies other velocities, as :attr:`velocities`, where they are."""
+        self._set_velocities(np.pad(velocities, ((0, -len(velocities) % _BATCH), (0, 0), (0, 0))))
 
     def advance(self) -> None:
         """Step a few times.
@@ -193,7 +192,11 @@ class World(ABC):
         """Linear velocity of the centre of mass [m/s] and angular velocity [rad/s] in world axes, shape (N, 2, 3)."""
 
     @abstractmethod
-    def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None: ...
+    def _reset(self, coordinates: FloatArray) -> None: ...
+
+    @abstractmethod
+    def _set_velocities(self, velocities: FloatArray) -> None:
+        """Velocities of every body, those without shape included, shape (M, 2, 3)."""
 
     @abstractmethod
     def _advance(self) -> None: ...
@@ -255,13 +258,16 @@ class WarpWorld(World):
             self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
             here, there = there, here
 
-    def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None:
+    def _reset(self, coordinates: FloatArray) -> None:
         state = self._states[0]
         self._solver.reset(state)
         _assign(state.joint_q, coordinates.ravel())
         _assign(state.body_q, coordinates)
-        _assign(state.joint_qd, motion.ravel())
-        _assign(state.body_qd, motion.reshape(-1, 6))
+
+    def _set_velocities(self, velocities: FloatArray) -> None:
+        state = self._states[0]
+        _assign(state.joint_qd, velocities.ravel())
+        _assign(state.body_qd, velocities.reshape(-1, 6))
 
     def _advance(self) -> None:
         wp.capture_launch(self._graph)
@@ -296,11 +302,13 @@ class MujocoWorld(World):
         arms = np.einsum("nij,nj->ni", rotations, self._centres)
         return np.stack([of_origin[:, 0] + np.cross(spin, arms), spin], axis=1)
 
-    def _reset(self, coordinates: FloatArray, motion: FloatArray) -> None:
+    def _reset(self, coordinates: FloatArray) -> None:
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = coordinates[:, [0, 1, 2, 6, 3, 4, 5]].ravel()
+
+    def _set_velocities(self, velocities: FloatArray) -> None:
         rotations = self.poses[:, :3, :3]
-        of_centre, spin = motion[: len(self.bodies), 0], motion[: len(self.bodies), 1]
+        of_centre, spin = velocities[: len(self.bodies), 0], velocities[: len(self.bodies), 1]
         arms = np.einsum("nij,nj->ni", rotations, self._centres)
         of_origin = np.stack([of_centre - np.cross(spin, arms), np.einsum("nji,nj->ni", rotations, spin)], axis=1)
         self._data.qvel[: of_origin.size] = of_origin.ravel()
@@ -323,21 +331,23 @@ def run_to_rest(
     *,
     max_time: float,
     bounds: tuple[FloatArray, FloatArray],
+    fastest: float = np.inf,
     observe: Callable[[float, FloatArray], None] = lambda time, poses: None,
 ) -> Outcome:
     """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
 
-    At rest every body is slow for a quarter of a second, and no surface moves by half a millimetre in the second that
-    begins with it. From that quarter on nothing rolls with friction, which would let a box balance on its edge.
+    At rest no surface moves by half a millimetre in a second, and by a tenth in its first quarter. After that quarter
+    nothing rolls with friction, which would let a box balance on its edge.
 
     Args:
         world: Changed in place.
         max_time: When they must have come to rest [s].
         bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+        fastest: Speed to which faster bodies are slowed down after each advance [m/s].
         observe: Told the time [s] and the poses (N, 4, 4) after each advance.
     """
     try:
-        return _run_to_rest(world, max_time, bounds, observe)
+        return _run_to_rest(world, max_time, bounds, fastest, observe)
     except ContactOverflow:
         reason = OVERFLOW
     except _Refused as refused:
@@ -353,6 +363,7 @@ def _run_to_rest(
     world: World,
     max_time: float,
     bounds: tuple[FloatArray, FloatArray],
+    fastest: float,
     observe: Callable[[float, FloatArray], None],
 ) -> Outcome:
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
@@ -360,25 +371,28 @@ def _run_to_rest(
     since, rest, motion = 0.0, world.poses, 0.0
     while world.time - since < _WATCH_TIME:
         world.let_roll(world.time - since >= _QUIET_TIME)
-        poses = _advance_within(world, bounds)
+        poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)
-        speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
-        fast = speed >= QUIET_SPEED or spin >= QUIET_SPIN
         motion = max(motion, _surface_motion(world.bodies, rest, poses))
-        if motion > _MOTION or (fast and world.time - since < _QUIET_TIME):
+        if motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _MOTION):
             since, rest, motion = world.time, poses, 0.0
         if since >= max_time:
             raise _Refused(f"not at rest within {max_time:g} s")
+    speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
     return Outcome("", since, speed, spin, motion, world.poses)
 
 
-def _advance_within(world: World, bounds: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _advance_within(world: World, bounds: tuple[FloatArray, FloatArray], fastest: float) -> FloatArray:
     """Advance, and return the poses."""
     world.advance()
-    poses = world.poses
-    if not np.isfinite(poses).all() or not np.isfinite(world.velocities).all():
+    poses, velocities = world.poses, world.velocities
+    if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
         raise _Refused("the simulation diverged")
+    speeds = np.linalg.norm(velocities[:, 0], axis=1)
+    if speeds.max() > fastest:
+        velocities[:, 0] *= np.minimum(1.0, fastest / np.maximum(speeds, fastest))[:, None]
+        world.set_velocities(velocities)
     centres = _centres(world.bodies, poses)
     outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
     if outside.any():

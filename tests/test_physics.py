@@ -361,7 +361,7 @@ def test_bodies_are_thrown_as_said(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
-    """At 0.9 mm/s a block is quiet, but moves by more than 0.5 mm in a second; at 0.4 mm/s, slowing down, by less."""
+    """At 0.9 mm/s a block moves by more than 0.5 mm in a second; at 0.4 mm/s, slowing down, by less."""
     from mitsplat import physics
 
     block = trimesh.creation.box((0.04, 0.04, 0.01))
@@ -375,3 +375,22 @@ def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
     outcome = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE)
     assert outcome.refused == ""
     assert 2e-4 < outcome.surface_motion < 4.5e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_what_is_poured_falls_no_faster_than_it_may(stepper):
+    """A ball falls 0.5 m in h / v + v / 2 g = 0.55 s at v = 1 m/s, and no faster."""
+    from mitsplat import physics
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    world = world_of(stepper, [body_of(ball)], [table()], [pose_at((0, 0, 0.52))])
+    speeds, heights = [], []
+
+    def observe(time, poses):
+        speeds.append(np.linalg.norm(world.velocities[0, 0]))
+        heights.append((time, poses[0, 2, 3]))
+
+    physics.run_to_rest(world, max_time=3.0, bounds=EVERYWHERE, fastest=1.0, observe=observe)
+    assert max(speeds) == pytest.approx(1.0, rel=1e-3)
+    landed = next(time for time, height in heights if height < 0.025)
+    assert landed == pytest.approx(0.5 / 1.0 + 1.0 / (2 * GRAVITY), abs=0.04)

@@ -141,7 +141,7 @@ def model_masks(model: Path) -> MaskMaker:
         raise MissingResourceError(f"masks by a model need rembg: pip install 'mitsplat[masks]' ({error})") from error
     try:
         session: Any = rembg.new_session("dis_custom", model_path=str(model.resolve()))
-    except (RuntimeError, ValueError, OSError) as error:
+    except Exception as error:  # onnxruntime's have no other base
         raise InputError(f"{model}: not a segmentation network in ONNX ({' '.join(str(error).split())})") from error
 
     def make(photo: Photo) -> BoolArray:

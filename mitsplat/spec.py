@@ -168,9 +168,9 @@ class ObjectSpec(StrictModel):
 class Settle(StrictModel):
     """How objects are laid out and come to rest.
 
-    ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes, and
-    poured in at 1 m/s. ``scatter``: apart, so that none touches another. ``stack``: all of one entry above one another on their largest face.
-    ``upright``: put down as the asset stands, turned about the vertical.
+    ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes, poured in at
+    1 m/s. ``scatter``: apart, so that none touches another. ``stack``: all of one entry above one another on their
+    largest face. ``upright``: put down as the asset stands, turned about the vertical.
     """
 
     arrangement: Arrangement = Field("drop", description="Random drop, pile, sparse scatter, stacks or upright.")

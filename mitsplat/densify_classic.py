@@ -69,7 +69,7 @@ class Classic:
             return
         pull = np.array(self._pull / dr.maximum(self._photos, 1), dtype=np.float64)
         control_density(model, pull, self._most, rng, remove_large=self._reset_step > 0)
-        self._pull = self._photos = mi.Float(0)
+        self._pull, self._photos = mi.Float(0), mi.Float(0)  # two, for they are added to in place
         if fraction - self._reset_fraction >= _RESET_EVERY and step - self._reset_step >= _RESET_STEPS:
             self._reset_step, self._reset_fraction = step, fraction
             lower_opacities(model)

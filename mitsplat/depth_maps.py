@@ -33,6 +33,9 @@ SUFFIXES = (".png", ".npy", ".exr", ".tiff", ".tif")
 POINTS_MIN = 10
 """Points that a photo must see for its map to be used."""
 _TRIALS = 500
+_UNEXPLAINED = 0.5
+"""Median difference of a map from the points in it, in that of the points from their own median, from which it says
+nothing of them."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +55,10 @@ class DepthMaps:
 def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse") -> DepthMaps:
     """The maps in a folder that have the names of photos, or of their files in a capture, but for the suffix.
 
-    That is .png, .npy, .exr, .tiff or .tif.
+    That is .png, .npy, .exr, .tiff or .tif; other files do not matter.
 
     Raises:
-        InputError: If the folder does not exist or has a map of no photo.
+        InputError: If the folder does not exist or has no map of any photo.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of depth maps")
@@ -178,8 +181,10 @@ def align_map(photo: Photo, points: FloatArray, values: npt.NDArray[np.float32],
     known = np.isfinite(found)
     if known.sum() < POINTS_MIN:
         return f"fewer than {POINTS_MIN} of the capture's points are in them"
-    scale, shift = fit_line(found[known], 1 / depth[inside][known], shift=kind == "inverse")
-    if not scale > 0:
+    found, wanted = found[known], 1 / depth[inside][known]
+    scale, shift = fit_line(found, wanted, shift=kind == "inverse")
+    left = np.median(np.abs(scale * found + shift - wanted))
+    if not scale > 0 or left > _UNEXPLAINED * np.median(np.abs(wanted - np.median(wanted))):
         return f"their values as {kind} depths do not agree with the points in them"
     return np.asarray(np.maximum(scale * values + shift, 0), dtype=np.float32)
 

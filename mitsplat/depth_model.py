@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat import __version__
 from mitsplat.capture import Photo, stored_name
 from mitsplat.depth_maps import DepthKind, DepthMaps
 from mitsplat.errors import InputError, MissingResourceError
@@ -37,7 +38,7 @@ def model_maps(
     *,
     progress: Progress | None = None,
 ) -> DepthMaps:
-    """Depth maps of photos by a network, kept in a folder until the photo or the network changes.
+    """Depth maps of photos by a network, kept in a folder until the photo, the network or this package changes.
 
     Args:
         photos: Whose maps to make.
@@ -53,7 +54,7 @@ def model_maps(
     if not model.is_file():
         raise InputError(f"{model}: no such file")
     with model.open("rb") as opened:
-        weights = hashlib.file_digest(opened, "sha256").digest()
+        weights = __version__.encode() + hashlib.file_digest(opened, "sha256").digest()
     files: dict[str, Path] = {}
     network = None
     for done, photo in enumerate(photos, start=1):

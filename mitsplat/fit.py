@@ -111,6 +111,13 @@ class FitSettings:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"budget must be > 0 s (got {self.budget})")
+        for name, kinds in (
+            ("densification", ("mcmc", "classic")),
+            ("masks", ("alpha", "ignore", "off")),
+            ("background", ("random", "black")),
+        ):
+            if getattr(self, name) not in kinds:
+                raise InputError(f"{name} must be {', '.join(kinds[:-1])} or {kinds[-1]} (got {getattr(self, name)})")
         for name in ("ssim_share", "coarse"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} must be in [0, 1] (got {getattr(self, name)})")
@@ -471,7 +478,10 @@ def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -
     if depths is not None:
         digest.update(depths.kind.encode())
         for name, file in sorted(depths.files.items()):
-            digest.update(name.encode() + file.read_bytes())
+            try:
+                digest.update(name.encode() + file.read_bytes())
+            except OSError as error:
+                raise InputError(f"{file}: cannot be read ({error.strerror})") from error
     return digest.hexdigest()
 
 

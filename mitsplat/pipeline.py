@@ -18,7 +18,13 @@ from mitsplat.asset_report import REPORT_FILE, write_asset_report
 from mitsplat.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.files import write_text
-from mitsplat.reconstruct import ImportedMesh, Reconstruction, ReconstructSettings, reconstruct_asset
+from mitsplat.reconstruct import (
+    ImportedMesh,
+    Reconstruction,
+    ReconstructSettings,
+    check_refinable,
+    reconstruct_asset,
+)
 from mitsplat.splats import Splats
 from mitsplat.verdict import VERDICT_FILE, Verdict
 
@@ -49,6 +55,9 @@ class AssetJob:
     kind: Literal["object", "environment"] = "object"
     settings: ReconstructSettings = field(default_factory=ReconstructSettings)
     imported: ImportedMesh | None = None
+
+    def __post_init__(self) -> None:
+        check_refinable(self.settings, self.kind, self.imported)
 
 
 @dataclass(frozen=True)

@@ -116,8 +116,7 @@ def reconstruct_asset(
 
     if settings.size is not None and capture.units == "metre":
         raise InputError(f"{name}: the capture is in metres already: it takes no size (got {settings.size:g} m)")
-    if settings.refine is not None and (kind != "object" or imported is not None):
-        raise InputError(f"{name}: only the mesh of an object that is reconstructed by its masks is refined")
+    check_refinable(settings, kind, imported)
     pictures = [sized_photo(photo, settings.view_size) for photo in capture.training]
     isolation = None
     views: Sequence[MaskedView] = [MaskedView(camera, mask) for camera, _, mask in pictures if mask is not None]
@@ -162,6 +161,16 @@ def reconstruct_asset(
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
     return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement)
+
+
+def check_refinable(settings: ReconstructSettings, kind: str, imported: ImportedMesh | None) -> None:
+    """Refuse to refine what has no masks or was not reconstructed.
+
+    Raises:
+        InputError: If that is asked for.
+    """
+    if settings.refine is not None and (kind != "object" or imported is not None):
+        raise InputError("only the mesh of an object that is reconstructed by its masks is refined")
 
 
 _BELOW = 0.02

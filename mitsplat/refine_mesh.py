@@ -39,7 +39,9 @@ FloatArray = npt.NDArray[np.float64]
 _ROOM = 1.1
 """Radius that a view shows around the middle of the mesh, in radii of the mesh."""
 _VALIDATION_EVERY = 6
-"""One view in so many judges what the others ask for."""
+"""One view in so many judges what the others ask for, or one in fewer, so that two do of four and three of more."""
+_LEAST = 4
+"""Views without which nothing is refined."""
 _BATCH = 2
 """Views that a step looks at."""
 _CHECKS = 10
@@ -87,7 +89,7 @@ class RefinedMesh:
         kept: Whether it is the refined one.
         before: Mean of 1 - IoU between the silhouettes of the mesh and the masks of the views that judge.
         after: The same of the best refined mesh; infinite if none was valid.
-        judges: Number of these views.
+        judges: Number of these views; 0 if there were too few views to try.
     """
 
     mesh: trimesh.Trimesh
@@ -98,6 +100,8 @@ class RefinedMesh:
 
     def __str__(self) -> str:
         """What came of it in one clause."""
+        if not self.judges:
+            return f"dropped: it takes masks from {_LEAST} places outside of the mesh"
         if not np.isfinite(self.after):
             return "dropped: it broke the mesh"
         fate = "kept" if self.kept else "dropped" if self.after >= self.before else "dropped, as it may be chance"
@@ -117,9 +121,9 @@ def refine_mesh(
 ) -> RefinedMesh:
     """Move the vertices of a mesh to where masks want its outlines.
 
-    Every sixth view takes no part, and judges: the best mesh on the way is kept if its error there is below that of the
-    given one, by more than the standard error of the mean over these views. If the given one was made of all masks, it
-    has an advantage. The faces stay what they are, and none turns over or newly passes through another.
+    Every sixth view, or more of few, takes no part, and judges: the best mesh on the way is kept if its error there is
+    below that of the given one, by more than the standard error of the mean over these views. If the given one was made
+    of all masks, it has an advantage. Faces stay what they are, and none turns over or newly passes through another.
 
     Args:
         mesh: Close to what the masks show, in the frame of the cameras.
@@ -127,18 +131,16 @@ def refine_mesh(
         settings: Number and size of steps.
         floor: Height z of the table that the object stands on, if it does: what is on it stays, and nothing sinks.
         progress: Told after every step how many of how many are done.
-
-    Raises:
-        InputError: If fewer than four views see the mesh from outside.
     """
     ensure_variant()
     middle = mesh.bounds.mean(axis=0)
     radius = float(np.linalg.norm(mesh.vertices - middle, axis=1).max())
     outside = [view for view in views if np.linalg.norm(view.camera.centre - middle) > 1.05 * _ROOM * radius]
-    if len(outside) < 4:
-        raise InputError(f"a mesh is refined by masks from at least 4 places outside of it (got {len(outside)})")
+    if len(outside) < _LEAST:
+        return RefinedMesh(mesh, False, np.inf, np.inf, 0)
     outlines = [Outline(view, middle, radius, settings.size) for view in outside]
-    judges = range(_VALIDATION_EVERY // 2, len(outlines), _VALIDATION_EVERY)
+    every = min(_VALIDATION_EVERY, max(2, len(outlines) // 3))
+    judges = range(every // 2, len(outlines), every)
     held = [outlines[index] for index in judges]
     shown = [outline for index, outline in enumerate(outlines) if index not in judges]
     start = trimesh.Trimesh((mesh.vertices - middle) / radius, mesh.faces, process=False)

@@ -156,3 +156,11 @@ def test_gradients_are_averaged_over_the_photos_that_show_a_gaussian() -> None:
     again = Classic(100, 10)
     again.restore(classic.state())
     np.testing.assert_allclose(again.state()["pull"] / again.state()["photos"], once, rtol=1e-6)
+    # After a change, which forgets them, as before it.
+    classic.refine(own, 10, 0.2, 1e-3, np.random.default_rng(0))
+    changed = tracked(own.splats())
+    expected = np.array(image_gradient(changed, CAMERA)[0])
+    for _ in range(3):
+        classic.look(changed, CAMERA)
+    assert (classic.state()["photos"] == 3).all()
+    np.testing.assert_allclose(classic.state()["pull"] / 3, expected, rtol=1e-6)

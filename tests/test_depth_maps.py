@@ -88,6 +88,11 @@ def test_maps_that_say_nothing_are_left_out_by_name() -> None:
         assert align_map(photo, points, values, "inverse") == (
             "their values as inverse depths do not agree with the points in them"
         )
+    noise = np.random.default_rng(0).uniform(1, 2, truth.shape).astype(np.float32)
+    for values in (1 / truth, noise):  # inverse depth for depth
+        assert align_map(photo, points, values, "metric") == (
+            "their values as metric depths do not agree with the points in them"
+        )
 
 
 def test_all_maps_of_a_capture(tmp_path: Path) -> None:

@@ -189,9 +189,11 @@ def test_settings_are_checked(field: str, value: float) -> None:
         MeshRefineSettings(**{field: value})
 
 
-def test_few_views_are_refused(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
-    with pytest.raises(InputError, match=r"at least 4 places outside of it \(got 3\)"):
-        refine_mesh(truth, views[:3], QUICK)
+def test_of_few_views_two_judge_and_of_fewer_nothing_comes(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
+    found = refine_mesh(truth, views[:3], QUICK)
+    assert found.mesh is truth and str(found) == "dropped: it takes masks from 4 places outside of the mesh"
+    for count, judges in ((4, 2), (9, 3)):
+        assert refine_mesh(truth, views[:count], replace(QUICK, steps=1)).judges == judges
 
 
 def test_assets_say_what_came_of_it(

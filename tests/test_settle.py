@@ -80,7 +80,6 @@ def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
         assert lowest(mesh, instance.world_from_object) == pytest.approx(0.0, abs=3e-4)
     certificate = layout.certificate
     assert certificate.rested
-    assert certificate.max_speed < 1e-3
     assert certificate.surface_motion < 5e-4
     assert certificate.inside
     assert not certificate.overflow

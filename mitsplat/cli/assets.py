@@ -133,6 +133,11 @@ def fit(
 
     if depths is not None and depth_model is not None:
         raise InputError("depth maps come from a folder or from a network: give --depths or --depth-model")
+    mapped = depths is not None or depth_model is not None
+    if depth_kind != "inverse" and not mapped:
+        raise InputError(f"--depth-kind {depth_kind} is of depth maps: give --depths or --depth-model")
+    if depth == 0 and mapped:
+        raise InputError("depth maps are of no use with --depth 0: leave them out, or give them weight")
     settings = FitSettings(
         gaussians=gaussians,
         densification=densification,

@@ -248,8 +248,13 @@ def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
         assert run("fit", "photos", "-o", tmp_path, "--depth-kind", "metric", *options) == 0
         assert found.args == args and fit_capture.kwargs["depths"] is found.result
         assert "warning: depth maps that are left out: a.jpg" in capsys.readouterr().out
-    assert run("fit", "photos", "-o", tmp_path, "--depths", "maps", "--depth-model", "a.onnx") == 2
-    assert "give --depths or --depth-model" in capsys.readouterr().err
+    for options, text in (
+        (("--depths", "maps", "--depth-model", "a.onnx"), "give --depths or --depth-model"),
+        (("--depth-kind", "metric"), "--depth-kind metric is of depth maps: give --depths or --depth-model"),
+        (("--depths", "maps", "--depth", 0), "depth maps are of no use with --depth 0"),
+    ):
+        assert run("fit", "photos", "-o", tmp_path, *options) == 2
+        assert text in capsys.readouterr().err
 
 
 def test_fit_below_its_target_exits_with_4(

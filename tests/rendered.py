@@ -27,7 +27,7 @@ def cameras(count: int) -> list[Camera]:
     return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
 
 
-def render_capture(folder: Path, count: int = 16, *, samples: int = 8) -> dict[str, Camera]:
+def render_capture(folder: Path, count: int = 24, *, samples: int = 8) -> dict[str, Camera]:
     """Render photos into a folder; returns their cameras by name, in the board's frame [m]."""
     return photograph(box_scene(5), cameras(count), folder, samples=samples)
 

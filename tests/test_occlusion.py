@@ -109,7 +109,8 @@ def test_light_falls_through_a_hole_that_the_mesh_does_not_have() -> None:
     centres = (np.arange(64) + 0.5 - 32) / 64 * 2 * 0.6 * np.tan(np.radians(10))
     radius = np.hypot(*np.meshgrid(centres, centres))
     through = seen(shapes).light[..., 0]
-    assert through[radius < 0.028].min() > 0.97
+    assert through[radius < 0.028].mean() > 0.99
+    assert through[radius < 0.028].min() > 1 - 3 * 0.03  # of the standard error that rays are spent for
     assert through[(radius > 0.052) & (radius < 0.09)].mean() < 0.02
     integrator = make_integrator()
     camera = Camera.look_at((0, 0, 0.6), (0, 0, 0), up=(0, 1, 0), width=64, height=64, fov_x=20, near=0.001)

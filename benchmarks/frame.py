@@ -1,6 +1,6 @@
 """Seconds per stage of a frame of the default scene, peak memory, and the renderer against Mitsuba's own splat path.
 
-    python -m benchmarks.frame [--scene scenes/workcell.yaml] [--frames 8] [--no-volprim]
+    python -m benchmarks.frame [--scene scenes/workcell.yaml] [--frames 8] [--ten] [--no-volprim]
 
 Timings are medians of frames after the first (which compiles); quote the ratios, and the load, which is printed too.
 """
@@ -13,6 +13,9 @@ import resource
 import statistics
 import time
 from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
 
 import mitsplat as ms
 from benchmarks.captures import CAMERA, crowd
@@ -22,9 +25,17 @@ from mitsplat.volprim import render_volprim, volprim_scene
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def time_frames(path: Path, frames: int) -> None:
+def ten_objects(path: Path) -> dict[str, Any]:
+    """What makes a scene one of ten objects, of the first assets, under its first light and its environment."""
+    scene = YAML(typ="safe").load(path)
+    objects = [{**entry, "count": 1} for entry in scene["objects"]][:10]
+    lights = [scene["lights"][0], *(light for light in scene["lights"][1:] if light["kind"] == "environment")]
+    return {"objects": objects, "lights": lights}
+
+
+def time_frames(path: Path, frames: int, overrides: dict[str, Any]) -> None:
     """Print medians per stage over frames of one layout."""
-    scene = ms.load_scene(path)
+    scene = ms.load_scene(path, overrides=overrides)
     start = time.perf_counter()
     layout = ms.settle_layout(scene, layout_of(scene, 0))
     print(f"settle one layout ({len(layout.instances)} objects): {time.perf_counter() - start:.2f} s")
@@ -40,9 +51,9 @@ def time_frames(path: Path, frames: int) -> None:
         print(f"  {stage:12s} {statistics.median(row[stage] for row in rows[1:]):.3f}")
 
 
-def time_light(path: Path, repeats: int = 8) -> None:
+def time_light(path: Path, overrides: dict[str, Any], repeats: int = 8) -> None:
     """Print what shadows and highlights cost: the same frames with and without, in turns."""
-    scenes = [ms.load_scene(path, overrides={"composite.shadow": shadow}) for shadow in ("none", "traced")]
+    scenes = [ms.load_scene(path, overrides={**overrides, "composite.shadow": kind}) for kind in ("none", "traced")]
     layout = ms.settle_layout(scenes[0], layout_of(scenes[0], 0))
     wall, processor = [], []
     for index in range(repeats + 1):
@@ -80,11 +91,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", type=Path, default=ROOT / "scenes/workcell.yaml")
     parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--ten", action="store_true", help="ten objects, one light, and the environment")
     parser.add_argument("--no-volprim", action="store_true")
     options = parser.parse_args()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    time_frames(options.scene, options.frames)
-    time_light(options.scene)
+    overrides = ten_objects(options.scene) if options.ten else {}
+    time_frames(options.scene, options.frames, overrides)
+    time_light(options.scene, overrides)
     print(f"peak memory of the frames: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     if not options.no_volprim:
         compare_with_volprim()

@@ -27,6 +27,19 @@ IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+def add_content(digest: hashlib._Hash, path: Path) -> None:
+    """Add the SHA-256 of a file's content to a digest.
+
+    Raises:
+        InputError: If the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
 def write_file(path: Path, write: Callable[[Path], object]) -> str:
     """Make a file by ``write(temporary path)``, then move it to ``path`` at once and for good; its folder is made.
 

@@ -26,7 +26,7 @@ from mitsplat.densify import Densification, Mcmc, seed_splats
 from mitsplat.densify_classic import Classic
 from mitsplat.depth_maps import DepthMap, DepthMaps, align_maps
 from mitsplat.errors import InputError
-from mitsplat.files import write_file, write_text
+from mitsplat.files import add_content, write_file, write_text
 from mitsplat.metrics import psnr_of
 from mitsplat.optimise import Adam, Model
 from mitsplat.quality import Quality
@@ -478,10 +478,8 @@ def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -
     if depths is not None:
         digest.update(depths.kind.encode())
         for name, file in sorted(depths.files.items()):
-            try:
-                digest.update(name.encode() + file.read_bytes())
-            except OSError as error:
-                raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+            digest.update(name.encode())
+            add_content(digest, file)
     return digest.hexdigest()
 
 

@@ -17,7 +17,7 @@ from mitsplat import __version__
 from mitsplat.asset_report import REPORT_FILE, write_asset_report
 from mitsplat.capture import Capture
 from mitsplat.errors import InputError
-from mitsplat.files import write_text
+from mitsplat.files import add_content, write_text
 from mitsplat.reconstruct import (
     ImportedMesh,
     Reconstruction,
@@ -147,7 +147,7 @@ def _fit_inputs(folder: Path, capture: Capture, settings: FitSettings) -> str:
     """Hash of what decides a fit."""
     digest = hashlib.sha256(json.dumps([__version__, asdict(settings)], sort_keys=True).encode())
     for path in _files(folder, capture):
-        _add_file(digest, path)
+        add_content(digest, path)
     return digest.hexdigest()
 
 
@@ -220,7 +220,7 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
     decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported]
     digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
     for path in (*_files(folder, capture), splats):
-        _add_file(digest, path)
+        add_content(digest, path)
     return digest.hexdigest()
 
 
@@ -228,14 +228,6 @@ def _files(folder: Path, capture: Capture) -> list[Path]:
     """Everything that a capture is on disk."""
     pictures = [path for photo in capture.photos for path in (photo.file, photo.mask) if path is not None]
     return [folder / "capture.json", folder / "points.npz", *pictures]
-
-
-def _add_file(digest: hashlib._Hash, path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _finished(out: Path, inputs: str) -> Finished | None:

@@ -11,17 +11,16 @@ import pytest
 import trimesh
 from conftest import KnownObject, orbit
 from test_pipeline import SETTINGS
-from test_surface import chamfer
 
+from benchmarks.known import chamfer
+from benchmarks.refine_mesh import masked
 from mitsplat.asset_report import write_asset_report
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.isolate import MaskedView
 from mitsplat.mend import edges_through_faces, mend_motion
-from mitsplat.plugins.device import plain_mesh
 from mitsplat.reconstruct import ImportedMesh, reconstruct_asset
 from mitsplat.refine_mesh import MeshRefineSettings, Outline, Silhouettes, refine_mesh
-from mitsplat.render import ensure_variant
 from mitsplat.surface import SurfaceSettings
 from mitsplat.verdict import iou
 
@@ -36,22 +35,6 @@ def bumpy(bumps: float = 0.1, scale: float = 1.0) -> trimesh.Trimesh:
     x, y, z = ball.vertices.T
     radius = 1 + bumps * np.sin(4 * x + 1) * np.sin(5 * y) * np.cos(3 * z)
     return trimesh.Trimesh(0.05 * scale * ball.vertices * radius[:, None] * (1.2, 1, 0.8), ball.faces, process=False)
-
-
-def masked(mesh: trimesh.Trimesh, cameras: list[Camera], finer: int = 4) -> list[MaskedView]:
-    """What the cameras see of it, traced through ``finer`` squared points of every pixel."""
-    ensure_variant()
-    scene = mi.load_dict({"type": "scene", "mesh": plain_mesh(mesh)})
-    views = []
-    for camera in cameras:
-        fine = camera.resized(finer * camera.width, finer * camera.height)
-        y, x = np.mgrid[: fine.height, : fine.width] + 0.5
-        slopes = fine.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
-        ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.world_from_camera[:3, :3].T
-        ray = mi.Ray3f(mi.Point3f(camera.centre), mi.Vector3f(np.ascontiguousarray(ahead.T, dtype=np.float32)))
-        hit = np.array(scene.ray_test(ray)).reshape(camera.height, finer, camera.width, finer)
-        views.append(MaskedView(camera, hit.mean(axis=(1, 3)).astype(np.float32)))
-    return views
 
 
 def overlap(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
+from benchmarks.known import chamfer
 from mitsplat.align import invert_transform, measure_offset, register_mesh, surface_points
 from mitsplat.assets import read_mesh
 from mitsplat.camera import Camera
@@ -25,13 +26,6 @@ from mitsplat.verdict import sized_photo
 def views_of(known: KnownObject) -> tuple[list[Camera], list[np.ndarray]]:
     sized = [sized_photo(photo, 160) for photo in known.capture.training]
     return [camera for camera, _, _ in sized], [mask for _, _, mask in sized if mask is not None]
-
-
-def chamfer(one: trimesh.Trimesh, other: trimesh.Trimesh) -> float:
-    """Mean distance both ways, as a share of the diagonal of ``other``."""
-    there = np.abs(Surface(other).signed_distances(one.sample(5000, seed=1))).mean()
-    back = np.abs(Surface(one).signed_distances(other.sample(5000, seed=2))).mean()
-    return float((there + back) / 2 / other.scale)
 
 
 @pytest.fixture(scope="module")

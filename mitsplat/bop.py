@@ -14,7 +14,6 @@ numbers. The one difference: what is visible is known exactly, where the toolkit
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from scipy.spatial.distance import pdist
 
 from mitsplat.coco import camera_of
 from mitsplat.files import Record, write_file, write_text
+from mitsplat.json_stream import EntriesFile
 from mitsplat.label import Labels
 from mitsplat.maps import encode_mask_png
 
@@ -45,17 +45,39 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
         yield "mask_visib", position, encode_mask_png(label.mask, label.box, size)
 
 
-def write_scenes(root: Path, records: Iterable[Record]) -> None:
-    """Write the annotations of all scenes."""
-    scenes: dict[str, dict[str, dict[str, Any]]] = defaultdict(lambda: {"camera": {}, "gt": {}, "gt_info": {}})
-    for record in records:
-        scene, index = scenes[scene_folder(record)], str(record["index"])
-        scene["camera"][index] = camera_entry(record)
-        scene["gt"][index] = pose_entries(record)
-        scene["gt_info"][index] = info_entries(record)
-    for folder, parts in scenes.items():
-        for part, content in parts.items():
-            write_text(root / folder / f"scene_{part}.json", json.dumps(content))
+class ScenesWriter:
+    """Writes the annotations of all scenes, each when its last frame was added: frames come by layout."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._folder, self._layout = "", -1
+        self._files: dict[str, EntriesFile] = {}
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        folder = scene_folder(record)
+        if folder != self._folder:
+            if record["layout"] <= self._layout:
+                raise ValueError(f"frames must come by layout (got {record['layout']} after {self._layout})")
+            self.keep()
+            self._folder, self._layout = folder, record["layout"]
+            self._files = {
+                part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
+            }
+        index = str(record["index"])
+        self._files["camera"].append(index, camera_entry(record))
+        self._files["gt"].append(index, pose_entries(record))
+        self._files["gt_info"].append(index, info_entries(record))
+
+    def keep(self) -> None:
+        """Give the files of the last scene their names."""
+        for file in self._files.values():
+            file.keep()
+
+    def discard(self) -> None:
+        """Remove what was not kept."""
+        for file in self._files.values():
+            file.discard()
 
 
 def write_models(root: Path, meshes: Sequence[trimesh.Trimesh]) -> None:

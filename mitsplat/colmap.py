@@ -6,31 +6,46 @@ names are relative to ``images/``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
 from mitsplat.coco import camera_of, image_file
-from mitsplat.files import Record, write_text
+from mitsplat.files import GrowingFile, Record
 
 
-def write_colmap(root: Path, records: Iterable[Record]) -> None:
-    """Write the three files."""
-    models: dict[str, int] = {}
-    images = []
-    for record in records:
+class ModelWriter:
+    """Writes the three files."""
+
+    def __init__(self, root: Path) -> None:
+        self._cameras, self._images, self._points = (
+            GrowingFile(root / f"colmap/{name}.txt") for name in ("cameras", "images", "points3D")
+        )
+        self._models: dict[str, int] = {}
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
         camera = camera_of(record)
-        number = models.setdefault(camera_model(camera), len(models) + 1)
+        model = camera_model(camera)
+        if model not in self._models:
+            self._models[model] = len(self._models) + 1
+            self._cameras.write(f"{self._models[model]} {model}\n")
         pose = camera.camera_from_world
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
         values = " ".join(repr(float(value)) for value in (w, x, y, z, *pose[:3, 3]))
         name = image_file(record).removeprefix("images/")
-        images.append(f"{record['index'] + 1} {values} {number} {name}\n\n")
-    write_text(root / "colmap/cameras.txt", "".join(f"{number} {model}\n" for model, number in models.items()))
-    write_text(root / "colmap/images.txt", "".join(images))
-    write_text(root / "colmap/points3D.txt", "")
+        self._images.write(f"{record['index'] + 1} {values} {self._models[model]} {name}\n\n")
+
+    def keep(self) -> None:
+        """Give the files their names."""
+        for file in (self._cameras, self._images, self._points):
+            file.keep()
+
+    def discard(self) -> None:
+        """Remove what was written, unless it was kept."""
+        for file in (self._cameras, self._images, self._points):
+            file.discard()
 
 
 def camera_model(camera: Camera) -> str:

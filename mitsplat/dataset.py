@@ -25,7 +25,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,7 @@ from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, storage_errors
 from mitsplat.folder import RUNS, SHEET, TIMINGS, Shard, content_of, finish_folder, open_folder
 from mitsplat.frame_maker import FrameMaker, RemoteFrames, Render, Settle
-from mitsplat.manifest import Manifest, append_line
+from mitsplat.manifest import append_line
 from mitsplat.writers import FORMATS, Catalogue
 
 if TYPE_CHECKING:
@@ -146,8 +146,9 @@ def write_dataset(
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
                 note(f"frame {record['index']}")
-        finish_folder(out, manifest, content, catalogue)
-        return summarise(out, manifest, rendered=sum(map(len, layouts.values())))
+        counts = FrameCounts()
+        finish_folder(out, manifest, content, catalogue, counts.add)
+        return counts.summary(out, rendered=sum(map(len, layouts.values())))
 
 
 def _results(
@@ -178,21 +179,32 @@ def _default_settle() -> Settle:
     return settle_layout
 
 
-def summarise(out: Path, manifest: Manifest, rendered: int) -> DatasetSummary:
-    """What is in a finished dataset, ``rendered`` frames of it new."""
-    images, instances, dropped, marked = (Counter[str]() for _ in range(4))
-    for record in manifest:
-        images[record["split"]] += 1
-        instances.update(label["class"] for label in record["labels"]["instances"])
-        dropped.update(record["labels"]["dropped"])
-        marked.update(mark for label in record["labels"]["instances"] for mark in label["marks"])
-    return DatasetSummary(
-        path=out,
-        frames=len(manifest),
-        rendered=rendered,
-        images={split: images[split] for split in SPLITS},
-        instances=dict(sorted(instances.items())),
-        dropped=dict(dropped),
-        marked=dict(sorted(marked.items())),
-        contact_sheet=out / SHEET,
-    )
+@dataclass
+class FrameCounts:
+    """What is counted while a dataset's records are read once."""
+
+    images: Counter[str] = field(default_factory=Counter)
+    instances: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    marked: Counter[str] = field(default_factory=Counter)
+
+    def add(self, record: Record) -> None:
+        """Count a frame."""
+        labels = record["labels"]
+        self.images[record["split"]] += 1
+        self.instances.update(label["class"] for label in labels["instances"])
+        self.dropped.update(labels["dropped"])
+        self.marked.update(mark for label in labels["instances"] for mark in label["marks"])
+
+    def summary(self, out: Path, rendered: int) -> DatasetSummary:
+        """What is in a finished dataset, ``rendered`` frames of it new."""
+        return DatasetSummary(
+            path=out,
+            frames=self.images.total(),
+            rendered=rendered,
+            images={split: self.images[split] for split in SPLITS},
+            instances=dict(sorted(self.instances.items())),
+            dropped=dict(self.dropped),
+            marked=dict(sorted(self.marked.items())),
+            contact_sheet=out / SHEET,
+        )

@@ -56,6 +56,42 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
     return digest
 
 
+class GrowingFile:
+    """A text file that is written bit by bit under a temporary name, and gets its own at once and for good.
+
+    Args:
+        path: The file; its folder is made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path, self._temporary = path, path.with_name(f".{path.name}.{os.getpid()}.part")
+        self._file = self._temporary.open("w+b", buffering=1 << 16)
+
+    def write(self, text: str) -> None:
+        """Add UTF-8 text."""
+        self._file.write(text.encode())
+
+    def take(self, other: GrowingFile) -> None:
+        """Add what another one holds, which is given up."""
+        other._file.seek(0)
+        shutil.copyfileobj(other._file, self._file, 1 << 20)
+        other.discard()
+
+    def keep(self) -> None:
+        """Give the file its name; it is on disk then."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        self._temporary.replace(self._path)
+
+    def discard(self) -> None:
+        """Remove what was written, unless it was kept."""
+        if not self._file.closed:
+            self._file.close()
+            self._temporary.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> str:
     """Write UTF-8 text by :func:`write_file`."""
     return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))

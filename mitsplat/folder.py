@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +19,10 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from mitsplat.errors import InputError, PartialResultError
-from mitsplat.files import storage_errors, write_file, write_text
+from mitsplat.files import Record, storage_errors, write_file, write_text
 from mitsplat.manifest import Manifest, cut_torn_line
-from mitsplat.sheet import contact_sheet
-from mitsplat.writers import Catalogue, write_collection
+from mitsplat.sheet import ContactSheet
+from mitsplat.writers import Catalogue, CollectionWriter
 
 if TYPE_CHECKING:
     from mitsplat.assets import Asset
@@ -131,11 +131,7 @@ def open_folder(
                     _remove_dataset(out)
                 _check_resumable(out, content, shard, resume=resume)
                 _prepare(out, scene_file, content, shard)
-                manifest = Manifest(out / MANIFEST)
-                for record in manifest:
-                    if not all((out / file).is_file() for file in record["files"]):
-                        manifest.forget(record["index"])
-                yield manifest
+                yield Manifest(out / MANIFEST, keep=lambda record: missing_file(out, record) is None)
         finally:
             _remove_partial(out)
 
@@ -165,19 +161,48 @@ def _take_lock(out: Path, lock: IO[str]) -> None:
         raise InputError(f"{out} is being written by another run ({lock.read()})") from None
 
 
-def finish_folder(out: Path, manifest: Manifest, content: dict[str, Any], catalogue: Catalogue) -> None:
-    """Sort the manifest and describe the whole dataset, all of whose frames are there.
+def finish_folder(
+    out: Path,
+    manifest: Manifest,
+    content: dict[str, Any],
+    catalogue: Catalogue,
+    hear: Callable[[Record], object],
+) -> None:
+    """Sort the manifest and describe the whole dataset, all of whose frames are there, in one pass over its records.
+
+    Args:
+        out: The dataset.
+        manifest: Its records.
+        content: What ``dataset.json`` says.
+        catalogue: What the labels refer to.
+        hear: Is told every record.
 
     Raises:
         PartialResultError: If a file was removed in the meantime.
     """
-    removed = [out / CONTENT] if not (out / CONTENT).is_file() else []
-    removed += [out / file for record in manifest for file in record["files"] if not (out / file).is_file()]
-    if removed:
-        raise PartialResultError(f"{removed[0]}: must not be removed while its dataset is written; run again")
-    manifest.sort()
-    write_collection(out, manifest, catalogue, content["scene"]["output"]["formats"])
-    contact_sheet(out, manifest, out / SHEET)
+
+    def check(missing: Path | None) -> None:
+        if missing is not None:
+            raise PartialResultError(f"{missing}: must not be removed while its dataset is written; run again")
+
+    def describe(record: Record) -> None:
+        check(missing_file(out, record))
+        collection.add(record)
+        sheet.add(record)
+        hear(record)
+
+    check(None if (out / CONTENT).is_file() else out / CONTENT)
+    sheet = ContactSheet(out, len(manifest))
+    with CollectionWriter(out, catalogue, content["scene"]["output"]["formats"]) as collection:
+        manifest.sort(describe)
+        collection.keep()
+    sheet.write(out / SHEET)
+
+
+def missing_file(out: Path, record: Record) -> Path | None:
+    """The first of a frame's files that is not there, or None."""
+    missing = next((file for file in record["files"] if not os.path.isfile(f"{out}/{file}")), None)  # noqa: PTH113
+    return None if missing is None else out / missing
 
 
 def _check_own(out: Path) -> None:
@@ -252,8 +277,10 @@ def _remove_dataset(out: Path) -> None:
 
 
 def _remove_partial(out: Path) -> None:
-    for part in out.rglob(".*.part"):
-        part.unlink(missing_ok=True)
+    for folder, _, names in os.walk(out):
+        for name in names:
+            if name.startswith(".") and name.endswith(".part"):
+                (Path(folder) / name).unlink(missing_ok=True)
 
 
 def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:

@@ -9,7 +9,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from array import array
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,29 +21,33 @@ _CHECKED = re.compile(rb'(\{.*),"check":"([0-9a-f]{16})"\}')
 
 
 class Manifest:
-    """The records of a dataset's frames, on disk; only their places in the file are held in memory.
+    """The records of a dataset's frames, on disk; only their places in the file are held in memory, 8 bytes for each.
 
     Iteration is by ascending frame index. Where two lines have one index, the later counts.
 
     Args:
         path: The file; made if missing. A last line that is not whole is cut off: whoever wrote it was stopped.
+        keep: Whether a record counts, asked once while the file is read; all do if None.
 
     Raises:
         InputError: If any other line is not as it was written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, keep: Callable[[Record], bool] | None = None) -> None:
         self.path = path
-        self._places: dict[int, int] = {}
+        self._places = _Places()
+        self._in_order = True
         cut_torn_line(path)
         place = 0
+        last = -1
         torn: InputError | None = None
         with path.open("rb") as file:
             for number, line in enumerate(file, start=1):
                 if torn is not None:
                     raise torn
                 try:
-                    self._places[parse_line(line)["index"]] = place
+                    record = parse_line(line)
+                    index = int(record["index"])
                 except ValueError as error:
                     torn = InputError(
                         f"{path}, line {number}: must be the record of a frame ({error}); "
@@ -50,27 +55,32 @@ class Manifest:
                     )
                     torn.__cause__ = error
                 else:
+                    self._in_order &= index > last
+                    last = max(last, index)
+                    if keep is None or keep(record):
+                        self._places[index] = place
+                    else:
+                        self._in_order = False
+                        self._places.pop(index)
                     place += len(line)
         if torn is not None:
             os.truncate(path, place)
-        self._end = place
+        self._end, self._last = place, last
 
     def __len__(self) -> int:
         return len(self._places)
 
     def __contains__(self, index: object) -> bool:
-        return index in self._places
+        return isinstance(index, int) and index in self._places
 
     def __iter__(self) -> Iterator[Record]:
-        with self.path.open("rb") as file:
-            for index in sorted(self._places):
-                file.seek(self._places[index])
-                yield parse_line(file.readline())
+        for _, line in self._lines():
+            yield parse_line(line)
 
     @property
-    def indices(self) -> list[int]:
+    def indices(self) -> Iterator[int]:
         """Indices of the frames, ascending."""
-        return sorted(self._places)
+        return (index for index, _ in self._places)
 
     def append(self, record: Record) -> None:
         """Add a record; it is on disk when this returns.
@@ -87,24 +97,78 @@ class Manifest:
             )
         self._places[record["index"]] = place
         self._end = place + len(line)
+        self._in_order &= record["index"] > self._last
+        self._last = max(self._last, record["index"])
 
-    def forget(self, index: int) -> None:
-        """Act as if the file had no record of this frame."""
-        del self._places[index]
+    def sort(self, hear: Callable[[Record], object] = lambda record: None) -> None:
+        """Leave the file with one line per frame, by ascending index, and tell the records on the way.
 
-    def sort(self) -> None:
-        """Rewrite the file with one line per frame, by ascending index."""
+        It is rewritten if that is needed, after all records were told.
+        """
+        if self._in_order:
+            for record in self:
+                hear(record)
+            return
 
         def write(temporary: Path) -> None:
-            with self.path.open("rb") as old, temporary.open("wb") as new:
-                for index in sorted(self._places):
-                    old.seek(self._places[index])
-                    places[index] = new.tell()
-                    new.write(old.readline())
+            place = 0
+            with temporary.open("wb") as new:
+                for index, line in self._lines():
+                    hear(parse_line(line))
+                    new.write(line)
+                    places[index] = place
+                    place += len(line)
 
-        places: dict[int, int] = {}
+        places = _Places()
         write_file(self.path, write)
-        self._places, self._end = places, self.path.stat().st_size
+        self._places, self._end, self._in_order = places, self.path.stat().st_size, True
+
+    def _lines(self) -> Iterator[tuple[int, bytes]]:
+        with self.path.open("rb") as file:
+            position = 0
+            for index, place in self._places:
+                if place != position:  # seeking throws away what was read ahead
+                    file.seek(place)
+                line = file.readline()
+                position = place + len(line)
+                yield index, line
+
+
+class _Places:
+    """Where each frame's line begins, by frame index; iterated by ascending index.
+
+    Pages of places, because frames are numbered without gaps, but a shard's do not begin at 0, and a file that is not
+    to be trusted may name any index.
+    """
+
+    _PAGE = 4096
+    _BLANK = array("q", [-1]) * _PAGE
+
+    def __init__(self) -> None:
+        self._pages: dict[int, array[int]] = {}
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __contains__(self, index: int) -> bool:
+        page = self._pages.get(index // self._PAGE)
+        return page is not None and page[index % self._PAGE] >= 0
+
+    def __setitem__(self, index: int, place: int) -> None:
+        self._count += index not in self
+        self._pages.setdefault(index // self._PAGE, self._BLANK[:])[index % self._PAGE] = place
+
+    def pop(self, index: int) -> None:
+        if index in self:
+            self._pages[index // self._PAGE][index % self._PAGE] = -1
+            self._count -= 1
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        for number in sorted(self._pages):
+            for position, place in enumerate(self._pages[number]):
+                if place >= 0:
+                    yield number * self._PAGE + position, place
 
 
 def encode_line(record: Record) -> bytes:

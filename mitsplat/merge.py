@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -10,11 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mitsplat.dataset import DatasetSummary, Progress, summarise
+from mitsplat.dataset import DatasetSummary, FrameCounts, Progress
 from mitsplat.errors import InputError
 from mitsplat.files import Record, file_inside, link_file, write_file
 from mitsplat.folder import RUNS, TIMINGS, finish_folder, first_difference, open_finished, open_folder, read_shard
-from mitsplat.manifest import Manifest, append_line
+from mitsplat.manifest import Manifest
 from mitsplat.stored import read_content
 from mitsplat.writers import Catalogue
 
@@ -42,10 +43,10 @@ def merge_shards(
     if out.resolve() in [folder.resolve() for folder in folders]:
         raise InputError(f"{out}: must not be one of the shards")
     content = _common_content(folders)
-    total = _check_complete(folders)
+    stated = _check_complete(folders)
     with ExitStack() as stack:
         manifests = {folder: stack.enter_context(open_finished(folder)) for folder in folders}
-        sources = _sources(manifests, total)
+        total = _check_frames(manifests, stated)
         catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], ())
         scene_file = next((folders[0] / "scene").iterdir())
         _check_layouts(folders)
@@ -57,21 +58,18 @@ def merge_shards(
                     _take_files(folder, out, record)
                     manifest.append(record)
                 if progress is not None:
-                    progress(len(manifest), len(sources), f"frame {index}")
+                    progress(len(manifest), total, f"frame {index}")
         for folder in folders:
             for layout in sorted((folder / "layouts").glob("*.json")):
                 write_file(out / "layouts" / layout.name, partial(link_file, layout))
         for name in (TIMINGS, RUNS):
-            (out / name).write_bytes(b"")
-            for folder in folders:
-                with suppress(FileNotFoundError):
-                    for line in (folder / name).read_bytes().splitlines():
-                        append_line(out / name, json.loads(line))
-        finish_folder(out, manifest, content, catalogue)
+            write_file(out / name, partial(_join_lines, [folder / name for folder in folders]))
+        counts = FrameCounts()
+        finish_folder(out, manifest, content, catalogue, counts.add)
         if (models := folders[0] / "bop/models").is_dir():
             for model in sorted(models.iterdir()):
                 write_file(out / "bop/models" / model.name, partial(shutil.copyfile, model))
-        return summarise(out, manifest, rendered=0)
+        return counts.summary(out, rendered=0)
 
 
 def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
@@ -114,20 +112,33 @@ def _named(part: dict[str, int]) -> str:
     return f"{part['shard']}/{part['of']} of {part['frames']} frames"
 
 
-def _sources(manifests: Mapping[Path, Manifest], total: int | None) -> dict[int, Path]:
-    """The shard of every frame, of which none may be missing."""
-    sources: dict[int, Path] = {}
-    for folder, manifest in manifests.items():
-        for index in manifest.indices:
-            if index in sources:
-                raise InputError(f"frame {index} is in both {sources[index]} and {folder}")
-            sources[index] = folder
-    count = max(sources, default=0) + 1 if total is None else total
-    if missing := [index for index in range(count) if index not in sources]:
-        raise InputError(
-            f"{len(missing)} of {count} frames are in no shard, the first is {missing[0]}: finish the shards first"
-        )
-    return sources
+def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int:
+    """How many frames all shards have together, of which none may be missing, nor be in two."""
+    found = [((index, folder) for index in manifest.indices) for folder, manifest in manifests.items()]
+    last, place = -1, Path()
+    missing, first = 0, 0
+    for index, folder in heapq.merge(*found):
+        if index == last:
+            raise InputError(f"frame {index} is in both {place} and {folder}")
+        if index > last + 1 and not missing:
+            first = last + 1
+        missing += index - last - 1
+        last, place = index, folder
+    count = last + 1 if stated is None else stated
+    if count > last + 1 and not missing:
+        first = last + 1
+    missing += max(0, count - last - 1)
+    if missing:
+        raise InputError(f"{missing} of {count} frames are in no shard, the first is {first}: finish the shards first")
+    return sum(map(len, manifests.values()))
+
+
+def _join_lines(files: Sequence[Path], whole: Path) -> None:
+    """Write the lines of several files that may be missing, and may end in a torn line."""
+    with whole.open("wb") as out:
+        for file in files:
+            with suppress(FileNotFoundError), file.open("rb") as lines:
+                out.writelines(line for line in lines if line.endswith(b"\n"))
 
 
 def _check_layouts(folders: Sequence[Path]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import colorsys
 import math
-from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,22 +73,41 @@ def layer_sheet(frame: Frame) -> Image:
     return sheet
 
 
-def contact_sheet(root: Path, records: Collection[Record], path: Path, *, count: int = 16) -> None:
-    """Write a JPEG of up to ``count`` frames, evenly spread over the ``records`` below ``root``, labels drawn.
+def spread(total: int, count: int) -> set[int]:
+    """Up to ``count`` positions, evenly spread over ``total``."""
+    return {round(float(place)) for place in np.linspace(0, total - 1, min(count, total))}
 
-    Raises:
-        OSError: If an image cannot be read.
-    """
-    chosen = np.unique(np.linspace(0, len(records) - 1, min(count, len(records))).round().astype(int))
-    tiles = [_tile(root, record) for i, record in enumerate(records) if i in chosen]
-    height, width = max(tile.shape[0] for tile in tiles) + _GAP, _TILE_WIDTH + _GAP
-    columns = min(_COLUMNS, len(tiles))
-    sheet = np.full((-(-len(tiles) // columns) * height, columns * width - _GAP, 3), 32, dtype=np.uint8)
-    for i, tile in enumerate(tiles):
-        top, left = i // columns * height, i % columns * width
-        sheet[top : top + tile.shape[0], left : left + _TILE_WIDTH] = tile
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
-    write_file(path, lambda temporary: temporary.write_bytes(bytes(data)))
+
+class ContactSheet:
+    """A picture of up to ``count`` frames, labels drawn, evenly spread over the ``total`` of a dataset in ``root``."""
+
+    def __init__(self, root: Path, total: int, *, count: int = 16) -> None:
+        self._root = root
+        self._chosen = spread(total, count)
+        self._heard = 0
+        self._tiles: list[Image] = []
+
+    def add(self, record: Record) -> None:
+        """See the next frame.
+
+        Raises:
+            OSError: If its image cannot be read.
+        """
+        if self._heard in self._chosen:
+            self._tiles.append(_tile(self._root, record))
+        self._heard += 1
+
+    def write(self, path: Path) -> None:
+        """Write the picture as JPEG."""
+        tiles = self._tiles
+        height, width = max(tile.shape[0] for tile in tiles) + _GAP, _TILE_WIDTH + _GAP
+        columns = min(_COLUMNS, len(tiles))
+        sheet = np.full((-(-len(tiles) // columns) * height, columns * width - _GAP, 3), 32, dtype=np.uint8)
+        for i, tile in enumerate(tiles):
+            top, left = i // columns * height, i % columns * width
+            sheet[top : top + tile.shape[0], left : left + _TILE_WIDTH] = tile
+        _, data = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
+        write_file(path, lambda temporary: temporary.write_bytes(bytes(data)))
 
 
 def _id_colours(ids: npt.NDArray[np.uint16]) -> Image:

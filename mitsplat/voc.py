@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
-from mitsplat.files import SPLITS, Record, write_text
+from mitsplat.files import SPLITS, GrowingFile, Record
 from mitsplat.label import InstanceLabel, Labels
 
 TRUNCATED, OCCLUDED = 0.15, 0.05
@@ -53,15 +53,28 @@ def flags(label: InstanceLabel) -> tuple[bool, bool]:
     return 1 - boxed / label.silhouette_area > TRUNCATED, 1 - label.area / boxed > OCCLUDED
 
 
-def write_description(root: Path, records: Iterable[Record], class_names: Iterable[str]) -> None:
-    """Write which images belong to which split, and what classes there are."""
-    names: dict[str, list[str]] = {split: [] for split in SPLITS}
-    for record in records:
-        names[record["split"]].append(f"{record['index']:06d}\n")
-    for split, lines in names.items():
-        write_text(root / f"voc/ImageSets/Main/{split}.txt", "".join(lines))
-    lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in ("background", *class_names))]
-    write_text(root / "voc/labelmap.txt", "".join(lines))
+class SetsWriter:
+    """Writes which images belong to which split, and what classes there are."""
+
+    def __init__(self, root: Path, class_names: Iterable[str]) -> None:
+        self._files = {split: GrowingFile(root / f"voc/ImageSets/Main/{split}.txt") for split in SPLITS}
+        self._classes = GrowingFile(root / "voc/labelmap.txt")
+        lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in ("background", *class_names))]
+        self._classes.write("".join(lines))
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        self._files[record["split"]].write(f"{record['index']:06d}\n")
+
+    def keep(self) -> None:
+        """Give the files their names."""
+        for file in (*self._files.values(), self._classes):
+            file.keep()
+
+    def discard(self) -> None:
+        """Remove what was written, unless it was kept."""
+        for file in (*self._files.values(), self._classes):
+            file.discard()
 
 
 def _add(parent: ElementTree.Element, name: str, value: object) -> None:

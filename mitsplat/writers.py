@@ -23,20 +23,20 @@ file's ``output.formats``:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat import bop, coco, maps, voc
-from mitsplat.colmap import write_colmap
+from mitsplat.colmap import ModelWriter
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, link_file, write_file, write_text
+from mitsplat.json_stream import ListsFile
 from mitsplat.spec import FORMATS, Output, SceneSpec
 from mitsplat.yolo import TASKS, data_yaml, yolo_lines
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from mitsplat.frame import Frame
     from mitsplat.scene import Scene
 
-__all__ = ["FOLDERS", "FORMATS", "Catalogue", "encode_image", "write_collection", "write_frame"]
+__all__ = ["FOLDERS", "FORMATS", "Catalogue", "CollectionWriter", "encode_image", "write_collection", "write_frame"]
 
 
 FOLDERS = {
@@ -200,29 +200,115 @@ def encode_image(image: npt.NDArray[np.uint8], output: Output) -> bytes:
     return bytes(data)
 
 
+class Describer(Protocol):
+    """Writes files that describe a whole dataset, frame by frame; they get their names when they are kept."""
+
+    def add(self, record: Record) -> None:
+        """Describe a frame; frames come by ascending index."""
+
+    def keep(self) -> None:
+        """End the files, and give them their names."""
+
+    def discard(self) -> None:
+        """Remove what was not kept."""
+
+
+class _OfSplit(Protocol):
+    file: ListsFile
+
+    def add(self, record: Record) -> None: ...
+
+
+class _Annotations:
+    """A file of annotations for each split."""
+
+    def __init__(self, root: Path, name: str, make: Callable[[Path], _OfSplit]) -> None:
+        self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in SPLITS}
+
+    def add(self, record: Record) -> None:
+        self._writers[record["split"]].add(record)
+
+    def keep(self) -> None:
+        for writer in self._writers.values():
+            writer.file.keep()
+
+    def discard(self) -> None:
+        for writer in self._writers.values():
+            writer.file.discard()
+
+
+class _Descriptions:
+    """Ultralytics' descriptions of all tasks."""
+
+    def __init__(self, root: Path, tasks: Iterable[str], catalogue: Catalogue) -> None:
+        self._root, self._tasks, self._catalogue = root, list(tasks), catalogue
+        self._splits: set[str] = set()
+
+    def add(self, record: Record) -> None:
+        self._splits.add(record["split"])
+
+    def keep(self) -> None:
+        for task in self._tasks:
+            points = self._catalogue.keypoint_names if task == "yolo-pose" else None
+            text = data_yaml(self._catalogue.class_names, self._splits, points)
+            write_text(self._root / f"{TASKS[task].folder}data.yaml", text)
+
+    def discard(self) -> None:
+        """There is nothing that was not kept."""
+
+
+class CollectionWriter:
+    """Writes what describes a whole dataset, from the records of its frames by ascending index.
+
+    Nothing is kept in memory but the frame at hand, and no file gets its name before all frames were added, but for
+    BOP's scenes, each of which is whole with its last frame.
+    """
+
+    def __init__(self, root: Path, catalogue: Catalogue, formats: Iterable[str]) -> None:
+        self._root, self._catalogue, self._formats = root, catalogue, set(formats)
+        self._describers: list[Describer] = []
+
+    def __enter__(self) -> CollectionWriter:
+        root, classes, points = self._root, self._catalogue.class_names, self._catalogue.keypoint_names
+        make: dict[str, Callable[[], Describer]] = {
+            "coco": lambda: _Annotations(
+                root, "instances", lambda path: coco.InstancesWriter(path, classes, points, amodal=False)
+            ),
+            "amodal": lambda: _Annotations(
+                root, "amodal", lambda path: coco.InstancesWriter(path, classes, points, amodal=True)
+            ),
+            "panoptic": lambda: _Annotations(root, "panoptic", lambda path: coco.PanopticWriter(path, classes)),
+            "poses": lambda: _Annotations(
+                root, "poses", lambda path: coco.PosesWriter(path, classes, self._catalogue.assets)
+            ),
+            "voc": lambda: voc.SetsWriter(root, classes),
+            "bop": lambda: bop.ScenesWriter(root),
+            "colmap": lambda: ModelWriter(root),
+        }
+        self._describers.append(_Descriptions(root, self._formats & set(TASKS), self._catalogue))
+        self._describers += (make[name]() for name in make if name in self._formats)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for describer in self._describers:
+            describer.discard()
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        for describer in self._describers:
+            describer.add(record)
+
+    def keep(self) -> None:
+        """Give the files their names."""
+        for describer in self._describers:
+            describer.keep()
+        if "bop" in self._formats:
+            bop.write_models(self._root, self._catalogue.meshes)
+
+
 def write_collection(root: Path, records: Iterable[Record], catalogue: Catalogue, formats: Iterable[str]) -> None:
-    """Write what describes a whole dataset, from the ``records`` of its frames, which are iterated several times."""
-    formats = set(formats)
-    classes, points = catalogue.class_names, catalogue.keypoint_names
-    splits = {record["split"] for record in records}
-    for task in formats & set(TASKS):
-        text = data_yaml(classes, splits, points if task == "yolo-pose" else None)
-        write_text(root / f"{TASKS[task].folder}data.yaml", text)
-    describe: dict[str, tuple[str, Callable[[Iterable[Record]], dict[str, Any]]]] = {
-        "coco": ("instances", lambda chosen: coco.instances_json(chosen, classes, points, amodal=False)),
-        "amodal": ("amodal", lambda chosen: coco.instances_json(chosen, classes, points, amodal=True)),
-        "panoptic": ("panoptic", lambda chosen: coco.panoptic_json(chosen, classes)),
-        "poses": ("poses", lambda chosen: coco.poses_json(chosen, classes, catalogue.assets)),
-    }
-    for format, (name, describe_split) in describe.items():
-        if format in formats:
-            for split in SPLITS:
-                content = describe_split(record for record in records if record["split"] == split)
-                write_text(root / f"annotations/{name}_{split}.json", json.dumps(content))
-    if "voc" in formats:
-        voc.write_description(root, records, classes)
-    if "bop" in formats:
-        bop.write_scenes(root, records)
-        bop.write_models(root, catalogue.meshes)
-    if "colmap" in formats:
-        write_colmap(root, records)
+    """Write what describes a whole dataset, from the ``records`` of its frames by ascending index."""
+    with CollectionWriter(root, catalogue, formats) as collection:
+        for record in records:
+            collection.add(record)
+        collection.keep()

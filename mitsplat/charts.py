@@ -33,19 +33,39 @@ def bars(caption: str, values: Mapping[str, float], *, unit: str = "") -> str:
     return _figure(caption, drawing, [(name, f"{_number(value)}{unit}") for name, value in values.items()])
 
 
+class Histogram:
+    """Counts of values in equal bins; values beyond ``bounds`` count in the outermost ones."""
+
+    def __init__(self, bounds: tuple[float, float], bins: int = 20) -> None:
+        self._bounds = bounds
+        self._counts = np.zeros(bins, dtype=np.int64)
+
+    def add(self, values: npt.ArrayLike) -> None:
+        """Count values."""
+        data = np.asarray(values, dtype=np.float64).ravel()
+        self._counts += np.histogram(np.clip(data, *self._bounds), bins=len(self._counts), range=self._bounds)[0]
+
+    def draw(self, caption: str, axis: str = "") -> str:
+        """The histogram as a chart."""
+        if not self._counts.any():
+            return _figure(caption, "<p>nothing</p>", [])
+        low, high = self._bounds
+        names = [f"{_number(a)} to {_number(b)}" for a, b in pairwise(np.linspace(low, high, len(self._counts) + 1))]
+        ends = {share: _number(low + share * (high - low)) for share in (0.0, 0.5, 1.0)}
+        return _columns(caption, self._counts, names, ends, axis)
+
+
 def histogram(
     caption: str, values: npt.ArrayLike, *, bins: int = 20, bounds: tuple[float, float] | None = None, axis: str = ""
 ) -> str:
-    """Counts of values in equal bins; values beyond ``bounds`` count in the outermost ones."""
+    """A histogram of values, from the smallest to the largest or within ``bounds``."""
     data = np.asarray(values, dtype=np.float64).ravel()
-    if not data.size:
-        return _figure(caption, "<p>nothing</p>", [])
-    low, high = bounds or (float(data.min()), float(data.max()))
-    high = high if high > low else low + 1
-    counts, edges = np.histogram(np.clip(data, low, high), bins=bins, range=(low, high))
-    names = [f"{_number(a)} to {_number(b)}" for a, b in pairwise(edges)]
-    ends = {share: _number(low + share * (high - low)) for share in (0.0, 0.5, 1.0)}
-    return _columns(caption, counts, names, ends, axis)
+    if bounds is None:
+        bounds = (float(data.min()), float(data.max())) if data.size else (0.0, 1.0)
+    low, high = bounds
+    counted = Histogram((low, high if high > low else low + 1), bins)
+    counted.add(data)
+    return counted.draw(caption, axis)
 
 
 def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names: Sequence[str], axis: str = "") -> str:
@@ -58,16 +78,39 @@ def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names
     return _columns(caption, np.asarray(counts), names, ends, axis)
 
 
+class HeatMap:
+    """Counts of points (x, y) in a grid over (0, 0) to ``size``, y downwards."""
+
+    def __init__(self, size: tuple[float, float], cells: tuple[int, int]) -> None:
+        self._size = size
+        self._counts = np.zeros((cells[1], cells[0]))
+
+    def add(self, x: npt.ArrayLike, y: npt.ArrayLike) -> None:
+        """Count points."""
+        counts, _, _ = np.histogram2d(
+            np.clip(np.asarray(y, dtype=np.float64), 0, self._size[1]),
+            np.clip(np.asarray(x, dtype=np.float64), 0, self._size[0]),
+            bins=self._counts.shape,
+            range=((0, self._size[1]), (0, self._size[0])),
+        )
+        self._counts += counts
+
+    def draw(self, caption: str, axes: str) -> str:
+        """The map as a chart."""
+        return _heat_map(caption, self._counts, self._size, axes)
+
+
 def heat_map(
     caption: str, x: npt.ArrayLike, y: npt.ArrayLike, *, size: tuple[float, float], cells: tuple[int, int], axes: str
 ) -> str:
-    """Counts of points (x, y) in a grid over (0, 0) to ``size``, y downwards."""
-    counts, _, _ = np.histogram2d(
-        np.clip(np.asarray(y, dtype=np.float64), 0, size[1]),
-        np.clip(np.asarray(x, dtype=np.float64), 0, size[0]),
-        bins=(cells[1], cells[0]),
-        range=((0, size[1]), (0, size[0])),
-    )
+    """A map of points."""
+    counted = HeatMap(size, cells)
+    counted.add(x, y)
+    return counted.draw(caption, axes)
+
+
+def _heat_map(caption: str, counts: npt.NDArray[np.float64], size: tuple[float, float], axes: str) -> str:
+    cells = counts.shape[::-1]
     most = counts.max() or 1.0
     width = _WIDTH - _LEFT - 10
     height = width * size[1] / size[0]

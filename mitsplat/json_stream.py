@@ -94,25 +94,14 @@ class EntriesFile:
         self._file.discard()
 
 
-def read_list(path: Path, name: str) -> Iterator[Any]:
-    """Elements of a list of an object, one after the other.
+def read_lists(path: Path) -> Iterator[tuple[str, Any]]:
+    """Elements of an object's lists, and its other values, each with its key, one after the other.
 
     Raises:
-        ValueError: If it is not JSON, not an object, has no such list, or has it twice.
+        ValueError: If it is not JSON or not an object.
         OSError: If it cannot be read.
     """
-    found = False
-    for key, element in read_object(path, lists=True):
-        if key == name and element is _BEGIN:
-            if found:
-                raise ValueError(f"it has {name!r} twice")
-            found = True
-        elif key == name:
-            if not found:
-                raise ValueError(f"{name!r} must be a list")
-            yield element
-    if not found:
-        raise ValueError(f"it has no list {name!r}")
+    yield from _read_object(path, lists=True)
 
 
 def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
@@ -122,18 +111,10 @@ def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
         ValueError: If it is not JSON or not an object.
         OSError: If it cannot be read.
     """
-    yield from read_object(path, lists=False)
+    yield from _read_object(path, lists=False)
 
 
-class _Begin:
-    """Stands where a list begins, which may be empty."""
-
-
-_BEGIN = _Begin()
-
-
-def read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
-    """Entries of an object; with ``lists``, the elements of those that are lists, each under the list's name."""
+def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
     with path.open(encoding="utf-8") as file:
         window = _Window(file)
         window.expect("{")
@@ -146,7 +127,6 @@ def read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
                     raise ValueError(f"a key must be a string (got {str(key)[:40]})")
                 window.expect(":")
                 if lists and window.peek() == "[":
-                    yield key, _BEGIN
                     for element in _elements(window):
                         yield key, element
                 else:
@@ -201,6 +181,8 @@ class _Window:
             except json.JSONDecodeError as error:
                 if len(self._text) - self._at > MOST_ELEMENT or not self._read(len(self._text) - self._at):
                     raise ValueError(f"{error.msg} (at {self._text[self._at : self._at + 20]!r})") from error
+            except RecursionError as error:
+                raise ValueError("it is nested too deeply") from error
             else:
                 # A number goes on as far as what was read; whatever else ends in a character of its own.
                 if end < len(self._text) or not isinstance(value, int | float) or not self._read():

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import html
 import json
-import statistics
+from array import array
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,14 @@ import cv2
 import numpy as np
 
 from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
-from mitsplat.charts import bars, columns, heat_map, histogram
+from mitsplat.charts import HeatMap, Histogram, bars, columns, histogram
 from mitsplat.coco import image_file
 from mitsplat.files import Record, write_text
 from mitsplat.label import Labels
 from mitsplat.masks import Silhouette
 from mitsplat.page import inline_image, make_page
 from mitsplat.sheet import class_colour
-from mitsplat.stored import read_content, read_records
+from mitsplat.stored import Records, read_content
 
 SAMPLES = 12
 """Images that are shown, evenly spread over the dataset."""
@@ -33,28 +34,29 @@ _OVERLAYS = {"mask": "Masks", "box": "Boxes", "name": "Names", "alone": "Silhoue
 _SHOWN_FIRST = ("mask", "name")
 
 
-@dataclass
-class _Statistics:
-    """What is counted while the manifest is read once."""
+_SHARES = ("visible_fraction", "truncation", "agreement", "boundary_f1")
 
-    images: Counter[str] = field(default_factory=Counter)
-    classes: Counter[str] = field(default_factory=Counter)
-    per_image: list[int] = field(default_factory=list)
-    shares: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    boxes: list[tuple[float, float, float, float]] = field(default_factory=list)
-    size: tuple[int, int] = (1, 1)
+
+class _Statistics:
+    """What is counted while the manifest is read once, for images of a size [px]."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.images, self.classes, self.per_image = Counter[str](), Counter[str](), Counter[int]()
+        self.shares = {key: Histogram((0, 1)) for key in _SHARES}
+        cells = 24, max(2, round(24 * size[1] / size[0]))
+        self.places, self.sizes = HeatMap(size, cells), HeatMap(size, cells)
 
     def add(self, record: Record) -> None:
         labels = record["labels"]
-        width, height = self.size = tuple(labels["size"])
         self.images[record["split"]] += 1
-        self.per_image.append(len(labels["instances"]))
-        for label in labels["instances"]:
-            self.classes[label["class"]] += 1
-            x0, y0, x1, y1 = label["box"]
-            self.boxes.append(((x0 + x1) / 2 / width, (y0 + y1) / 2 / height, (x1 - x0) / width, (y1 - y0) / height))
-            for key in ("visible_fraction", "truncation", "agreement", "boundary_f1", "polygon_iou"):
-                self.shares[key].append(label[key])
+        self.per_image[len(labels["instances"])] += 1
+        self.classes.update(label["class"] for label in labels["instances"])
+        boxes = np.array([label["box"] for label in labels["instances"]], dtype=np.float64).reshape(-1, 4)
+        self.places.add((boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2)
+        self.sizes.add(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
+        for key, counted in self.shares.items():
+            counted.add([label[key] for label in labels["instances"]])
 
 
 def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit]:
@@ -69,28 +71,22 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
     """
     root = Path(root)
     out = root / "report.html" if out is None else Path(out)
-    audit = audit_dataset(root)
     content = read_content(root)
-    records, _ = read_records(root, content)
-    counted = _Statistics()
-    for record in records:
-        counted.add(record)
+    records = Records(root, content)
+    output = content["scene"]["output"]
+    counted = _Statistics((output["width"], output["height"]))
+    audit = audit_dataset(root, counted.add)
     name = str(content["scene"]["name"])
     parts = [
         f"<h1>{html.escape(name)}</h1>",
         _summary(content, counted, audit, root),
         _audit(audit),
-        _samples(root, _spread(records, SAMPLES)),
-        _charts(counted, _brightness(root, _spread(records, BRIGHTNESS_IMAGES)), _seconds(root)),
+        _samples(root, records.some(SAMPLES)),
+        _charts(counted, _brightness(root, records.some(BRIGHTNESS_IMAGES)), _seconds(root)),
         _details(content),
     ]
     write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
     return out, audit
-
-
-def _spread(records: list[Record], count: int) -> list[Record]:
-    chosen = np.unique(np.linspace(0, len(records) - 1, min(count, len(records))).round().astype(int))
-    return [records[i] for i in chosen]
 
 
 def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: Path) -> str:
@@ -127,7 +123,7 @@ def _audit(audit: Audit) -> str:
     )
 
 
-def _samples(root: Path, records: list[Record]) -> str:
+def _samples(root: Path, records: Iterable[Record]) -> str:
     boxes = "".join(
         f'<label><input type="checkbox" data-overlay="{key}"{" checked" if key in _SHOWN_FIRST else ""}> {text}</label>'
         for key, text in _OVERLAYS.items()
@@ -189,7 +185,7 @@ def _path(shape: Silhouette) -> str:
     )
 
 
-def _brightness(root: Path, records: list[Record]) -> tuple[np.ndarray, list[float]]:
+def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, list[float]]:
     """Counts of pixels by luma in 32 bins, and each image's mean luma."""
     counts, means = np.zeros(32, dtype=np.int64), []
     for record in records:
@@ -202,49 +198,31 @@ def _brightness(root: Path, records: list[Record]) -> tuple[np.ndarray, list[flo
 
 def _seconds(root: Path) -> dict[str, float]:
     """Median seconds of every stage over the frames."""
-    stages = defaultdict[str, list[float]](list)
+    stages: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
     for line in _lines(root / "timings.jsonl"):
         for stage, seconds in line.items():
             if stage != "index":
                 stages[stage].append(seconds)
-    return {stage: round(statistics.median(values), 4) for stage, values in stages.items()}
+    return {stage: round(float(np.median(values)), 4) for stage, values in stages.items()}
 
 
 def _charts(counted: _Statistics, brightness: tuple[np.ndarray, list[float]], seconds: dict[str, float]) -> str:
-    boxes = np.array(counted.boxes, dtype=np.float64).reshape(-1, 4)
-    most = max([1, *counted.per_image])
-    ratio = counted.size[1] / counted.size[0]
-    cells = 24, max(2, round(24 * ratio))
     share = counted.shares
-    size = float(counted.size[0]), float(counted.size[1])
+    most = max([1, *counted.per_image])
     charts = [
         bars("Instances by class", dict(sorted(counted.classes.items()))),
         columns(
             "Instances per image",
-            np.bincount(counted.per_image, minlength=most + 1),
+            [counted.per_image[number] for number in range(most + 1)],
             [str(number) for number in range(most + 1)],
             "instances",
         ),
-        heat_map(
-            "Where boxes lie",
-            boxes[:, 0] * size[0],
-            boxes[:, 1] * size[1],
-            size=size,
-            cells=cells,
-            axes="middle of the box [px]",
-        ),
-        heat_map(
-            "How large boxes are",
-            boxes[:, 2] * size[0],
-            boxes[:, 3] * size[1],
-            size=size,
-            cells=cells,
-            axes="width to the right, height down [px]",
-        ),
-        histogram("Visible fraction of instances", share["visible_fraction"], bounds=(0, 1), axis="visible fraction"),
-        histogram("Truncation of instances", share["truncation"], bounds=(0, 1), axis="share beyond the border"),
-        histogram("Agreement of splats and proxies", share["agreement"], bounds=(0, 1), axis="IoU"),
-        histogram("Agreement of their boundaries", share["boundary_f1"], bounds=(0, 1), axis="boundary F1"),
+        counted.places.draw("Where boxes lie", "middle of the box [px]"),
+        counted.sizes.draw("How large boxes are", "width to the right, height down [px]"),
+        share["visible_fraction"].draw("Visible fraction of instances", "visible fraction"),
+        share["truncation"].draw("Truncation of instances", "share beyond the border"),
+        share["agreement"].draw("Agreement of splats and proxies", "IoU"),
+        share["boundary_f1"].draw("Agreement of their boundaries", "boundary F1"),
         columns(
             "Brightness of pixels",
             brightness[0],
@@ -273,8 +251,9 @@ def _details(content: dict[str, Any]) -> str:
     )
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_bytes().splitlines()] if path.is_file() else []
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        yield from map(json.loads, file)
 
 
 def _counts(counts: dict[str, int]) -> str:

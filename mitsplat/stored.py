@@ -6,19 +6,22 @@ Nothing that a file states is trusted before it is checked, so that what works o
 from __future__ import annotations
 
 import json
+import re
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mitsplat.camera import Lens
-from mitsplat.coco import camera_of
+from mitsplat.camera import Camera, Lens
 from mitsplat.errors import InputError
 from mitsplat.files import Record
 from mitsplat.manifest import parse_line
-from mitsplat.masks import encode_mask
-from mitsplat.spec import Labelling, Output
+from mitsplat.spec import CameraSpec, Labelling, Output
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]
@@ -28,6 +31,8 @@ Point = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Pose = tuple[Row, Row, Row, Row]
 
+_INDEX = re.compile(rb'\{"index":([0-9]{1,10}),')
+
 
 class _Stored(BaseModel):
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
@@ -36,6 +41,7 @@ class _Stored(BaseModel):
 class _Scene(_Stored):
     name: str
     seed: Count
+    camera: CameraSpec
     labels: Labelling
     output: Output
 
@@ -130,25 +136,63 @@ def read_content(root: Path) -> dict[str, Any]:
         )
     if not (root / "manifest.jsonl").is_file():
         raise InputError(f"{root} must be a dataset of mitsplat (it has no manifest.jsonl)")
-    content["scene"] |= checked.scene.model_dump(mode="json", include={"labels", "output"})
+    content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "labels", "output"})
     return content
 
 
-def read_records(root: Path, content: dict[str, Any]) -> tuple[list[Record], list[tuple[str, str]]]:
-    """The frames' records that can be read, and what is wrong with the manifest's other lines."""
-    records, violations = [], []
-    for number, line in enumerate((root / "manifest.jsonl").read_bytes().splitlines(), start=1):
-        try:
-            _Record.model_validate_json(line)
-            record = parse_line(line)
-            _check_record(record, content)
-        except ValidationError as error:
-            violations.append(("manifest.jsonl", f"line {number} is not the record of a frame ({_first(error)})"))
-        except ValueError as error:
-            violations.append(("manifest.jsonl", f"line {number} is not the record of a frame ({error})"))
-        else:
-            records.append(record)
-    return records, violations
+class Records:
+    """The frames' records that can be read, by ascending index; where the lines are takes 16 bytes of memory a frame.
+
+    Attributes:
+        violations: What is wrong with the other lines, once they were read.
+    """
+
+    def __init__(self, root: Path, content: dict[str, Any]) -> None:
+        self._path, self._content = root / "manifest.jsonl", content
+        self.violations: list[tuple[str, str]] = []
+        indices, places, place = array("q"), array("q"), 0
+        with self._path.open("rb") as file:
+            for line in file:
+                found = _INDEX.match(line)
+                indices.append(int(found[1]) if found else -1)
+                places.append(place)
+                place += len(line)
+        self._places = np.array(places, dtype=np.int64)
+        self._order = np.argsort(np.array(indices, dtype=np.int64), kind="stable")
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __iter__(self) -> Iterator[Record]:
+        self.violations = []
+        yield from self._read(self._order)
+
+    def some(self, count: int) -> Iterator[Record]:
+        """Up to ``count`` of them, evenly spread; fewer, if lines among those cannot be read."""
+        places = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
+        yield from self._read(self._order[places])
+
+    def _read(self, numbers: npt.NDArray[np.intp]) -> Iterator[Record]:
+        with self._path.open("rb") as file:
+            end = 0
+            for number in map(int, numbers):
+                if self._places[number] != end:
+                    file.seek(self._places[number])
+                line = file.readline()
+                end = self._places[number] + len(line)
+                try:
+                    _Record.model_validate_json(line)
+                    record = parse_line(line)
+                    _check_record(record, self._content)
+                except ValidationError as error:
+                    self._blame(number, _first(error))
+                except ValueError as error:
+                    self._blame(number, str(error))
+                else:
+                    yield record
+
+    def _blame(self, number: int, text: str) -> None:
+        self.violations.append(("manifest.jsonl", f"line {number + 1} is not the record of a frame ({text})"))
 
 
 def _check_record(record: Record, content: dict[str, Any]) -> None:
@@ -159,8 +203,12 @@ def _check_record(record: Record, content: dict[str, Any]) -> None:
     """
     if not any(file.startswith("images/") for file in record["files"]):
         raise ValueError("files must list the frame's image")
-    camera = camera_of(record)
-    if record["labels"]["size"] != [camera.width, camera.height]:
+    camera = record["camera"]
+    lens = {key: camera[key] for key in ("lens", "aperture_radius", "focus_distance")}
+    ((fx, _, cx), (_, fy, cy), _) = camera["intrinsics"]
+    pose, distortion = np.array(camera["world_from_camera"]), tuple(camera["distortion"])
+    Camera(camera["width"], camera["height"], fx, fy, cx, cy, pose, distortion, **lens)  # refuses what is none
+    if record["labels"]["size"] != [camera["width"], camera["height"]]:
         raise ValueError(f"labels.size must be the camera's (got {record['labels']['size']})")
     if record.get("environment", ()) is None:
         raise ValueError("environment must be a segment or absent (got null)")
@@ -184,9 +232,9 @@ def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
     x0, y0, x1, y1 = box
     if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
         raise ValueError(f"its box must lie in the image (got {box})")
-    mask = coco_mask.decode({"size": [height, width], "counts": code}).astype(bool)[y0:y1, x0:x1]
+    mask = coco_mask.decode({"size": [height, width], "counts": code})
     # Decoding leaves what no run covers as the memory was; only a whole code is what its mask encodes to.
-    if not mask.any() or encode_mask(mask, (x0, y0, x1, y1), (width, height)) != code:
+    if not mask[y0:y1, x0:x1].any() or coco_mask.encode(mask)["counts"].decode() != code:
         raise ValueError(f"must be the code of a mask in its box (got {code[:20]!r} for {box})")
 
 

@@ -115,11 +115,11 @@ BOTH = [{"asset": "assets/nut"}, {"asset": "assets/bolt"}]
 @pytest.fixture(scope="session")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small dataset of drawn frames in every format, to be left as it is."""
-    from test_dataset import render, settle
+    from drawn import large_boxes, render_boxes, scatter_boxes
 
     folder = tmp_path_factory.mktemp("clean")
-    scene = small_scene(folder, nut_and_bolt(), BOTH, layouts=3, views=2, formats=list(FORMATS))
-    return write_dataset(scene, folder / "out", render=render, settle=settle).path
+    scene = small_scene(folder, large_boxes(), BOTH, layouts=3, views=2, formats=list(FORMATS))
+    return write_dataset(scene, folder / "out", render=render_boxes, settle=scatter_boxes).path
 
 
 @pytest.fixture

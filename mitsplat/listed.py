@@ -17,9 +17,9 @@ from ruamel.yaml.error import YAMLError
 
 from mitsplat.described import Cursor, is_close
 from mitsplat.files import SPLITS
+from mitsplat.owned import YOLO_FOLDERS
 from mitsplat.readback import Violations
 from mitsplat.truth import TrueFrame
-from mitsplat.yolo import TASKS
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""
@@ -84,10 +84,11 @@ class YoloReader:
 
     def finish(self) -> Violations:
         """Whether classes, folders and keypoints are the dataset's."""
-        for task in (task for task in TASKS if task in self._content["scene"]["output"]["formats"]):
-            file = f"{TASKS[task].folder}data.yaml"
-            for text in self._check(self._root / file, with_points=task == "yolo-pose"):
-                yield file, text
+        for task, folder in YOLO_FOLDERS.items():
+            if task in self._content["scene"]["output"]["formats"]:
+                file = f"{folder}data.yaml"
+                for text in self._check(self._root / file, with_points=task == "yolo-pose"):
+                    yield file, text
 
     def _check(self, path: Path, *, with_points: bool) -> Iterator[str]:
         try:

@@ -14,7 +14,9 @@ import numpy as np
 from mitsplat.files import SPLITS, Record
 from mitsplat.readback import Violations
 
-_YOLO = {"yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
+YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
+"""Where Ultralytics' tasks have their folders: labels lie beside the images that they are of."""
+_YOLO = {name: folder for name, folder in YOLO_FOLDERS.items() if folder}
 _ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic", "poses": "poses"}
 _FOLDERS = (
     *("images", "labels", "layers", "annotations", "layouts", *_YOLO),
@@ -106,7 +108,7 @@ class Owned:
 
     def orphans(self, root: Path) -> Violations:
         """Files in the dataset's folders that nothing accounts for."""
-        known = np.sort(np.frombuffer(self._names, dtype=np.uint64)) if self._names else np.zeros(0, dtype=np.uint64)
+        known = np.sort(np.array(self._names, dtype=np.uint64))
         for top in sorted(_FOLDERS):
             for folder, folders, names in os.walk(root / top):
                 folders.sort()
@@ -117,8 +119,7 @@ class Owned:
                     if name != ".lock" and not name.endswith(".cache")
                 ]
                 hashes = np.array([_hash(file) for file in files], dtype=np.uint64)
-                places = np.searchsorted(known, hashes)
-                found = (places < len(known)) & (known[np.minimum(places, len(known) - 1)] == hashes)
+                found = np.searchsorted(known, hashes, side="right") > np.searchsorted(known, hashes)
                 for file, is_known in zip(files, found, strict=True):
                     if not is_known:
                         yield file, "belongs to no frame of the manifest"

@@ -19,28 +19,26 @@ from test_cli import run
 from mitsplat.audit import audit_dataset
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.manifest import encode_line, parse_line
 
 
 def records_of(root: Path) -> list[Record]:
-    return [parse_line(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
+    return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
 
 
-def store(root: Path, records: list[Record], *, describe: bool = True) -> None:
-    """Write the manifest with the hashes of the files as they are, and what describes all frames to match it."""
+def store(root: Path, records: list[Record]) -> None:
+    """Write the manifest with the hashes of the files as they are, and its lines' own."""
     for record in records:
         for file in record["files"]:
             record["files"][file] = hashlib.sha256((root / file).read_bytes()).hexdigest()
-    (root / "manifest.jsonl").write_bytes(b"".join(map(encode_line, records)))
-    if describe:
-        from mitsplat.writers import Catalogue, write_collection
+    store_lines(root, records)
 
-        content = json.loads((root / "dataset.json").read_text())
-        kept = {path: path.read_bytes() for path in (root / "bop/models").iterdir()}
-        catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], ())
-        write_collection(root, records, catalogue, content["scene"]["output"]["formats"])
-        for path, data in kept.items():
-            path.write_bytes(data)
+
+def store_lines(root: Path, records: list[Record]) -> None:
+    lines = []
+    for record in records:
+        text = json.dumps({key: value for key, value in record.items() if key != "check"}, separators=(",", ":"))
+        lines.append(f'{text[:-1]},"check":"{hashlib.sha256(text.encode()).hexdigest()[:16]}"}}\n')
+    (root / "manifest.jsonl").write_text("".join(lines))
 
 
 def first(records: list[Record]) -> Any:
@@ -236,7 +234,7 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     erase_depth: ("depth/train/000000.png", "have no depth"),
     erode_a_bop_mask: ("bop/train/000000/mask_visib/000000_000000.png", "differ from the manifest's mask"),
     widen_a_box: ("yolo-detect/labels/train/000000.txt", "is not its box"),
-    turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is not the smallest rectangle"),
+    turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is no rectangle"),
     flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints are not"),
     name_another_class: ("voc/Annotations/000000.xml", "class is screw"),
     count_from_zero: ("voc/Annotations/000000.xml", "its box is not that of its mask"),
@@ -245,8 +243,8 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     shorten_a_line: ("yolo-detect/labels/train/000000.txt", "is not its box"),
     shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
     forget_a_depth: ("manifest.jsonl, frame 0", "lists no file of the format depth"),
-    forget_a_bop_mask: ("bop/train/000000/mask/000000_000000.png", "is not listed in the manifest"),
-    claim_a_polygon: ("manifest.jsonl, frame 0", "the IoU of its polygon is"),
+    forget_a_bop_mask: ("manifest.jsonl, frame 0", "bop by the name bop/train/000000/mask/000000_000000.png"),
+    claim_a_polygon: ("labels/train/000000.txt", "the IoU of its polygon is"),
     model_in_metres: ("bop/models/models_info.json", "does not give the measures of bop/models/obj_000001.ply"),
 }
 
@@ -278,11 +276,11 @@ def test_a_file_that_changed_or_is_missing_is_found(dataset: Path, file: str) ->
 @pytest.mark.parametrize(
     ("file", "change", "place"),
     [
-        ("annotations/instances_train.json", lambda c: c["annotations"][0]["bbox"].__setitem__(0, 1), "bbox[0]"),
+        ("annotations/instances_train.json", lambda c: c["annotations"][0]["bbox"].__setitem__(0, 1), "bbox is [1, "),
         ("annotations/instances_train.json", lambda c: c["annotations"][0].update(category_id=9), "category_id"),
         ("annotations/amodal_train.json", lambda c: c["annotations"].pop(), "annotations"),
-        ("annotations/panoptic_train.json", lambda c: c["categories"][0].update(name="x"), "categories[0].name"),
-        ("bop/train/000000/scene_gt.json", lambda c: c["0"][0]["cam_t_m2c"].__setitem__(2, 5.0), "cam_t_m2c[2]"),
+        ("annotations/panoptic_train.json", lambda c: c["categories"][0].update(name="x"), "categories[0]: name"),
+        ("bop/train/000000/scene_gt.json", lambda c: c["0"][0]["cam_t_m2c"].__setitem__(2, 5.0), "cam_t_m2c is"),
         ("bop/train/000000/scene_gt_info.json", lambda c: c["0"][0].update(visib_fract=0.1), "visib_fract"),
     ],
 )
@@ -342,7 +340,7 @@ def test_a_record_that_nothing_can_rely_on_is_one_violation(
     for key in keys[:-1]:
         place = place[key]
     place[keys[-1]] = value
-    (dataset / "manifest.jsonl").write_bytes(b"".join(map(encode_line, records)))
+    store_lines(dataset, records)
     found = [said for file, said in audit_dataset(dataset).violations if file == "manifest.jsonl"]
     assert len(found) == 1 and found[0].startswith("line 1 is not the record of a frame (") and text in found[0]
 

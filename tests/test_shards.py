@@ -13,7 +13,6 @@ from test_cli import run
 from test_dataset import contents, render, settle, write
 from test_faults import KilledOnce
 
-from mitsplat.audit import audit_dataset
 from mitsplat.cluster import Cluster
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.folder import Shard
@@ -55,7 +54,6 @@ class TestSameBytes:
         assert merge_shards(shards[::-1], tmp_path / "out").frames == 12
         assert contents(tmp_path / "out") == whole
         assert len((tmp_path / "out/timings.jsonl").read_text().splitlines()) == 12
-        assert audit_dataset(tmp_path / "out").violations == ()
 
     def test_of_a_merge_that_was_stopped(self, scene, tmp_path, whole):
         shards = write_shards(scene, tmp_path / "shards", 3)

@@ -142,8 +142,9 @@ def _check_files(root: Path, record: Record) -> Violations:
 
 def _check_rest(root: Path) -> Violations:
     """What belongs to no format."""
-    if cv2.imread(str(root / "contact_sheet.jpg")) is None if (root / "contact_sheet.jpg").is_file() else True:
-        yield "contact_sheet.jpg", "is missing or cannot be read as an image"
+    sheet = root / "contact_sheet.jpg"
+    if not sheet.is_file() or cv2.imread(str(sheet)) is None:
+        yield sheet.name, "is missing or cannot be read as an image"
     if not any((root / "scene").glob("*")):
         yield "scene", "does not hold the scene file"
 

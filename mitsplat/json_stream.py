@@ -14,6 +14,8 @@ from typing import IO, Any
 from mitsplat.files import GrowingFile
 
 _BLOCK = 1 << 16
+_LOOK_AHEAD = 3
+"""Characters behind a number by which it is known to have ended: it may go on by ``.5`` or ``e-5``."""
 MOST_ELEMENT = 1 << 26
 """Largest element that is read [characters]; no frame needs as much."""
 
@@ -184,15 +186,17 @@ class _Window:
             except RecursionError as error:
                 raise ValueError("it is nested too deeply") from error
             else:
-                # A number goes on as far as what was read; whatever else ends in a character of its own.
-                if end < len(self._text) or not isinstance(value, int | float) or not self._read():
+                # A number may go on where what was read ends; whatever else ends in a character of its own.
+                sure = not isinstance(value, int | float) or end + _LOOK_AHEAD <= len(self._text)
+                if sure or not self._read():
                     self._at = end
                     return value
 
     def _read(self, least: int = 0) -> bool:
         """Let go of what was decoded and read on, twice as much where an element is large."""
         block = self._file.read(max(_BLOCK, least))
-        self._text, self._at = self._text[self._at :] + block, 0
+        if block:
+            self._text, self._at = self._text[self._at :] + block, 0
         return bool(block)
 
 

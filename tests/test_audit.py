@@ -300,10 +300,80 @@ def test_permuted_class_names_are_found(dataset: Path) -> None:
     assert [file for file, _ in audit_dataset(dataset).violations] == ["data.yaml"]
 
 
+STRAY = (
+    *("annotations/instances_test.json", "bop/models/obj_000009.ply", "bop/train/000000/mask/000000_000009.png"),
+    *(
+        "bop/train/000000/rgb/000099.png",
+        "bop/train/000009/scene_gt.json",
+        "colmap/images.txt",
+        "depth/train/000099.png",
+    ),
+    *("flow/train/000001.flo", "images/train/000099.png", "images/val/000000.png", "instances/train/000099.png"),
+    *("labels/train/000099.txt", "layers/train/000099.exr", "layouts/0009.json", "normals/train/000099.png"),
+    *("panoptic/train/000099.png", "semantic/train/000099.png", "voc/Annotations/000099.xml"),
+    *("voc/JPEGImages/000099.png", "yolo-detect/labels/train/000099.txt", "yolo-obb/images/train/000099.png"),
+    "yolo-pose/images/train/000099.png",
+)
+"""Files that no frame owns, in the folder of every format; the dataset has no COLMAP cameras."""
+
+
 def test_files_of_no_frame_are_found(dataset: Path) -> None:
-    shutil.copyfile(dataset / "images/train/000000.png", dataset / "images/train/000099.png")
-    (dataset / "labels/train.cache").write_text("")
-    assert audit_dataset(dataset).violations == (("images/train/000099.png", "belongs to no frame of the manifest"),)
+    for file in STRAY:
+        (dataset / file).parent.mkdir(parents=True, exist_ok=True)
+        (dataset / file).write_text("")
+    (dataset / "labels/train.cache").write_text("")  # Ultralytics leaves it there
+    (dataset / "notes.txt").write_text("mine")
+    found = audit_dataset(dataset).violations
+    assert found == tuple((file, "belongs to no frame of the manifest") for file in STRAY)
+
+
+WHOLE = (
+    *(f"annotations/{n}_{s}.json" for n in ("instances", "amodal", "panoptic", "poses") for s in ("train", "val")),
+    *("data.yaml", "yolo-detect/data.yaml", "yolo-obb/data.yaml", "yolo-pose/data.yaml", "voc/labelmap.txt"),
+    *("voc/ImageSets/Main/train.txt", "voc/ImageSets/Main/val.txt", "layouts/0000.json", "layouts/0002.json"),
+    *(f"bop/train/000000/scene_{part}.json" for part in ("camera", "gt", "gt_info")),
+    *("bop/models/models_info.json", "bop/models/obj_000001.ply", "contact_sheet.jpg"),
+)
+
+
+def test_missing_files_that_describe_frames_are_found(dataset: Path) -> None:
+    for file in WHOLE:
+        (dataset / file).unlink()
+    found = dict(audit_dataset(dataset).violations)
+    assert set(found) == set(WHOLE)
+    assert all(text.startswith("is missing") for text in found.values())
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"{", b"[1, 2]", b'{"images": 3, "annotations": [3], "frames": [{}]}', b"\xff"]
+)
+def test_damaged_annotations_are_found(dataset: Path, damage: bytes) -> None:
+    """Whatever is in them: one sentence for each file and no traceback."""
+    files = [file for file in WHOLE if file.endswith((".json", ".yaml", ".txt"))]
+    for file in files:
+        (dataset / file).write_bytes(damage)
+    found = {file for file, _ in audit_dataset(dataset).violations}
+    assert set(files) - found <= {"voc/ImageSets/Main/val.txt"}
+
+
+def test_entries_of_no_frame_are_found(dataset: Path) -> None:
+    """At the end, in the middle, and twice."""
+    for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
+        content = json.loads((dataset / name).read_text())
+        entries = content["frames" if "poses" in name else "annotations"]
+        copied = json.loads(json.dumps(entries[-1]))
+        copied["id" if "poses" in name else "image_id"] = 77
+        entries.append(copied)
+        (dataset / name).write_text(json.dumps(content))
+    gt = dataset / "bop/train/000000/scene_gt.json"
+    gt.write_text(gt.read_text().replace('"1": ', '"0": '))
+    found = audit_dataset(dataset).violations
+    text = "has an entry of frame 77, which is not in the manifest at its place"
+    for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
+        assert (name, text) in found
+    assert ("bop/train/000000/scene_gt.json", "has 2 entries of frame 0") in found
+    assert ("bop/train/000000/scene_gt.json", "has 0 entries of frame 1") in found
+    assert ("annotations/instances_val.json", "id 4 is not above those before it") not in found
 
 
 def test_a_damaged_manifest_is_found(dataset: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
-from mitsplat import folder
+from mitsplat import folder, manifest
 from mitsplat.dataset import write_dataset
 from mitsplat.engine import FrameError
 from mitsplat.errors import InputError, MissingResourceError
@@ -28,6 +28,7 @@ from mitsplat.settle import Instance, Layout, RestCertificate
 from mitsplat.sheet import class_colour, draw_labels, layer_sheet
 from mitsplat.yolo import data_yaml
 
+PARSE_LINE = manifest.parse_line
 CERTIFICATE = RestCertificate(
     rested=True,
     inside=True,
@@ -140,6 +141,17 @@ class TestContent:
                 assert hashlib.sha256((tmp_path / "out" / file).read_bytes()).hexdigest() == digest
         timings = [json.loads(line) for line in (tmp_path / "out/timings.jsonl").read_text().splitlines()]
         assert all(set(line) == {"index", "march", "settle", "write"} for line in timings)
+
+    def test_the_manifest_is_read_once_to_open_and_once_to_end(self, scene, tmp_path, monkeypatch):
+        """Whatever the number of formats: reading and hashing it is most of what the end of a run takes."""
+        read = []
+        monkeypatch.setattr(manifest, "parse_line", lambda line: read.append(1) or PARSE_LINE(line))
+        write(scene, tmp_path / "out")
+        assert len(read) == 12
+        next((tmp_path / "out/images").rglob("000005.png")).unlink()
+        read.clear()
+        write(scene, tmp_path / "out")
+        assert len(read) == 24
 
     def test_views_of_a_layout_share_their_split(self, scene, tmp_path):
         write(scene, tmp_path / "out")

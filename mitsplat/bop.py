@@ -14,6 +14,7 @@ numbers. The one difference: what is visible is known exactly, where the toolkit
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,13 +24,16 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
+from mitsplat.camera import Camera
 from mitsplat.coco import camera_of
-from mitsplat.files import Record, write_file, write_text
+from mitsplat.files import GrowingFile, Record, write_file, write_text
 from mitsplat.json_stream import EntriesFile
 from mitsplat.label import Labels
 from mitsplat.maps import encode_mask_png
 
 MILLIMETRES = 1000.0
+_TOGETHER = 768
+"""Files."""
 
 
 def scene_folder(record: Record) -> str:
@@ -46,12 +50,17 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
 
 
 class ScenesWriter:
-    """Writes the annotations of all scenes, each when its last frame was added: frames come by layout."""
+    """Writes the annotations of all scenes: frames come by layout.
+
+    Scenes are put on disk together, as many as :data:`_TOGETHER`: a million images have 300,000 files, and waiting for
+    each would take longer than all the rest.
+    """
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._folder, self._layout = "", -1
         self._files: dict[str, EntriesFile] = {}
+        self._ended: list[GrowingFile] = []
 
     def add(self, record: Record) -> None:
         """Describe a frame."""
@@ -59,24 +68,38 @@ class ScenesWriter:
         if folder != self._folder:
             if record["layout"] <= self._layout:
                 raise ValueError(f"frames must come by layout (got {record['layout']} after {self._layout})")
-            self.keep()
+            self._end_scene()
+            if len(self._ended) >= _TOGETHER:
+                self._name_ended()
             self._folder, self._layout = folder, record["layout"]
             self._files = {
                 part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
             }
-        index = str(record["index"])
-        self._files["camera"].append(index, camera_entry(record))
-        self._files["gt"].append(index, pose_entries(record))
+        index, camera = str(record["index"]), camera_of(record)
+        self._files["camera"].append(index, camera_entry(record, camera))
+        self._files["gt"].append(index, pose_entries(record, camera))
         self._files["gt_info"].append(index, info_entries(record))
 
+    def _end_scene(self) -> None:
+        self._ended += (file.end() for file in self._files.values())
+        self._files = {}
+
+    def _name_ended(self) -> None:
+        os.sync()
+        for file in self._ended:
+            file.name()
+        self._ended = []
+
     def keep(self) -> None:
-        """Give the files of the last scene their names."""
-        for file in self._files.values():
-            file.keep()
+        """Give the files of the last scenes their names."""
+        self._end_scene()
+        self._name_ended()
 
     def discard(self) -> None:
         """Remove what was not kept."""
-        for file in self._files.values():
+        for open_file in self._files.values():
+            open_file.discard()
+        for file in self._ended:
             file.discard()
 
 
@@ -108,9 +131,8 @@ def diameter(mesh: trimesh.Trimesh) -> float:
     return float(pdist(corners).max())
 
 
-def camera_entry(record: Record) -> dict[str, Any]:
+def camera_entry(record: Record, camera: Camera) -> dict[str, Any]:
     """The frame in ``scene_camera.json``."""
-    camera = camera_of(record)
     intrinsics = camera.intrinsics
     intrinsics[:2, 2] -= 0.5
     pose = camera.camera_from_world
@@ -122,9 +144,9 @@ def camera_entry(record: Record) -> dict[str, Any]:
     }
 
 
-def pose_entries(record: Record) -> list[dict[str, Any]]:
+def pose_entries(record: Record, camera: Camera) -> list[dict[str, Any]]:
     """The frame in ``scene_gt.json``."""
-    camera_from_world = camera_of(record).camera_from_world
+    camera_from_world = camera.camera_from_world
     entries = []
     for label in record["labels"]["instances"]:
         pose = camera_from_world @ np.array(label["world_from_object"])

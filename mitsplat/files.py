@@ -67,6 +67,7 @@ class GrowingFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._path, self._temporary = path, path.with_name(f".{path.name}.{os.getpid()}.part")
         self._file = self._temporary.open("w+b", buffering=1 << 16)
+        self._named = False
 
     def write(self, text: str) -> None:
         """Add UTF-8 text."""
@@ -82,13 +83,22 @@ class GrowingFile:
         """Give the file its name; it is on disk then."""
         self._file.flush()
         os.fsync(self._file.fileno())
+        self.close()
+        self.name()
+
+    def close(self) -> None:
+        """Write no more."""
         self._file.close()
+
+    def name(self) -> None:
+        """Give a closed file its name, once the caller has seen to it that it is on disk."""
         self._temporary.replace(self._path)
+        self._named = True
 
     def discard(self) -> None:
-        """Remove what was written, unless it was kept."""
-        if not self._file.closed:
-            self._file.close()
+        """Remove what was written, unless it has its name."""
+        self._file.close()
+        if not self._named:
             self._temporary.unlink(missing_ok=True)
 
 

@@ -75,7 +75,7 @@ class ListsFile:
 
 
 class EntriesFile:
-    """A growing object, such as BOP's ``{"0": ..., "1": ...}``; ``path`` gets its name when it is kept."""
+    """A growing object, such as BOP's ``{"0": ..., "1": ...}``; see :class:`mitsplat.files.GrowingFile` for its end."""
 
     def __init__(self, path: Path) -> None:
         self._file = GrowingFile(path)
@@ -86,13 +86,14 @@ class EntriesFile:
         self._file.write(f"{self._separator}{json.dumps(key)}: {json.dumps(value)}")
         self._separator = ", "
 
-    def keep(self) -> None:
-        """End the object, and give the file its name."""
+    def end(self) -> GrowingFile:
+        """End the object; its file, closed, still has to be named."""
         self._file.write("{}" if self._separator == "{" else "}")
-        self._file.keep()
+        self._file.close()
+        return self._file
 
     def discard(self) -> None:
-        """Remove what was written, unless it was kept."""
+        """Remove what was written."""
         self._file.discard()
 
 

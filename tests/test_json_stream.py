@@ -57,7 +57,7 @@ def test_entries_are_what_json_writes(tmp_path: Path, entries: dict[str, Any], i
     file = EntriesFile(tmp_path / "a.json")
     for key, value in entries.items():
         file.append(key, value)
-    file.keep()
+    file.end().name()
     assert (tmp_path / "a.json").read_text() == json.dumps(entries)
     (tmp_path / "b.json").write_text(json.dumps(entries, indent=indent))
     assert list(read_entries(tmp_path / "b.json")) == list(entries.items())

@@ -16,7 +16,8 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -196,7 +197,7 @@ def run_pool(
     Raises:
         InputError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
-    plan = _Plan({layout: deque(frames) for layout, frames in layouts.items() if frames})
+    plan = _Plan(layouts)
     most = min(most, plan.left)
     staff = _Staff(most)
     losses: Counter[int] = Counter()
@@ -248,39 +249,83 @@ def run_pool(
             yield answer.result
 
 
-@dataclass
 class _Plan:
-    """Which frames are still to be given to a worker, by layout."""
+    """Which frames are still to be given to a worker, by layout.
 
-    waiting: dict[int, deque[int]]
-    _layouts: dict[int, int] = field(default_factory=dict)
+    A worker keeps to its layout while that has frames, then takes the first that nobody has, and when there is none
+    helps with that which has most left. Each costs O(log layouts): heaps hold what was so when it was entered, which is
+    looked at again when it comes to the top.
 
-    @property
-    def left(self) -> int:
-        return sum(map(len, self.waiting.values()))
+    Args:
+        layouts: Frames of each layout, in order.
+    """
+
+    def __init__(self, layouts: Mapping[int, Sequence[int]]) -> None:
+        self.waiting = {layout: deque(frames) for layout, frames in layouts.items() if frames}
+        self.left = sum(map(len, self.waiting.values()))
+        self._layouts: dict[int, int] = {}
+        self._workers: Counter[int] = Counter()
+        self._order = {layout: order for order, layout in enumerate(self.waiting)}
+        self._entered = len(self._order)
+        self._free = [(order, layout) for layout, order in self._order.items()]
+        self._longest = [(-len(self.waiting[layout]), order, layout) for order, layout in self._free]
+        heapify(self._longest)
 
     def take(self, worker: int) -> tuple[int, int] | None:
         """Layout and frame: of the worker's layout, of one nobody has taken, or of that with most left to do."""
         if not self.waiting:
             return None
         layout = self._layouts.get(worker)
-        if layout not in self.waiting:
-            free = [layout for layout in self.waiting if layout not in self._layouts.values()]
-            layout = free[0] if free else max(self.waiting, key=lambda layout: len(self.waiting[layout]))
+        if layout is None or layout not in self.waiting:
+            if layout is not None:
+                self._workers[layout] -= 1
+            layout = self._first_free() if self._free else None
+            if layout is None:
+                layout = self._longest_left()
             self._layouts[worker] = layout
+            self._workers[layout] += 1
         frames = self.waiting[layout]
         frame = frames.popleft()
+        self.left -= 1
         if not frames:
-            del self.waiting[layout]
+            del self.waiting[layout], self._order[layout]
         return layout, frame
 
     def put_back(self, worker: int, frame: int) -> None:
         """The worker is gone, and its frame is to be made again."""
-        self.waiting.setdefault(self._layouts[worker], deque()).appendleft(frame)
+        layout = self._layouts[worker]
+        if layout not in self.waiting:  # now the last
+            self.waiting[layout] = deque()
+            self._order[layout] = self._entered
+            self._entered += 1
+        self.waiting[layout].appendleft(frame)
+        self.left += 1
+        heappush(self._longest, (-len(self.waiting[layout]), self._order[layout], layout))
         self.leave(worker)
 
     def leave(self, worker: int) -> None:
-        del self._layouts[worker]
+        """The worker is gone."""
+        layout = self._layouts.pop(worker)
+        self._workers[layout] -= 1
+        if layout in self.waiting and not self._workers[layout]:
+            heappush(self._free, (self._order[layout], layout))
+
+    def _first_free(self) -> int | None:
+        while self._free:
+            order, layout = heappop(self._free)
+            if self._order.get(layout) == order and not self._workers[layout]:
+                return layout
+        return None
+
+    def _longest_left(self) -> int:
+        while True:
+            length, order, layout = self._longest[0]
+            if self._order.get(layout) != order:
+                heappop(self._longest)
+            elif -length != (left := len(self.waiting[layout])):
+                heapreplace(self._longest, (-left, order, layout))
+            else:
+                return layout
 
 
 class _Staff:

@@ -24,6 +24,7 @@ from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from mitsplat.shared_arrays import SharedArrays
 
 Made = TypeVar("Made", covariant=True)
 Result = TypeVar("Result")
@@ -124,7 +125,10 @@ class Pool(Protocol[Result]):
         """Have an idle worker make a frame."""
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
-        """Wait for answers; those that came, at least one."""
+        """Wait for answers; those that came, perhaps none."""
+
+    def openings(self) -> int:
+        """How many workers there is room for that there was not before; each is told of once."""
 
     def close(self) -> None:
         """Stop all workers."""
@@ -185,7 +189,7 @@ def run_pool(
     """Results of the pool's workers for every frame, in the order in which they are finished.
 
     A worker gets its next frame when it has finished one, so results do not pile up while the caller is busy. A lost
-    one is replaced only if it was the last: memory is what it most likely died of.
+    one is replaced only if it was the last, because memory is what it most likely died of, or where machines join.
 
     Args:
         pool: Hires and hears the workers.
@@ -247,6 +251,9 @@ def run_pool(
                         grow = False
             employ(worker)
             yield answer.result
+        for _ in range(pool.openings()):
+            if plan.left:
+                employ(pool.hire())
 
 
 class _Plan:
@@ -365,7 +372,7 @@ class _Processes(Generic[Result]):
     """Workers that are processes of this machine."""
 
     def __init__(self, make: MakeFrame[Result]) -> None:
-        self._make = make
+        self._make = SharedArrays(make)
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: dict[int, tuple[BaseProcess, Connection]] = {}
         self._hired = 0
@@ -409,11 +416,15 @@ class _Processes(Generic[Result]):
                 self.dismiss(worker)
                 yield worker, Lost(how)
 
+    def openings(self) -> int:
+        return 0
+
     def close(self) -> None:
         for process, _ in self._workers.values():
             process.terminate()
         for worker in list(self._workers):
             self.dismiss(worker)
+        self._make.close()
 
 
 def _work(pipe: Connection, make: MakeFrame[Result]) -> None:

@@ -36,7 +36,7 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
         found[f"shapes[{i}]"] = described.value(mesh)
     for i, light in enumerate(scene.spec.lights):
         if image := getattr(light, "image", None):
-            found[f"lights[{i}].image"] = hashlib.sha256((scene.path.parent / image).read_bytes()).hexdigest()
+            found[f"lights[{i}].image"] = hashlib.sha256(scene.images[image].read_bytes()).hexdigest()
     return found
 
 

@@ -189,6 +189,9 @@ class Scripted:
         self.clock, frame = self.due.pop(worker)
         yield worker, Finished(frame)
 
+    def openings(self):
+        return 0
+
     def close(self):
         pass
 

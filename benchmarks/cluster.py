@@ -64,7 +64,7 @@ class Machines:
     def start(self) -> None:
         """Start one more."""
         name = f"machine{len(self.started) + 1}"
-        ray = shutil.which("ray", path=str(Path(sys.executable).parent))
+        ray = Path(sys.executable).parent / "ray"
         script = MACHINE.format(home=f"/tmp/home_{name}", name=name, hidden=self.folder, ray=ray, address=self.address)
         command = ["unshare", "--mount", "--pid", "--fork", "--mount-proc", "--kill-child", "sh", "-c", script]
         with (self.folder / f"{name}.log").open("wb") as log:
@@ -107,21 +107,27 @@ def main() -> None:
     os.environ.setdefault("WARP_CACHE_PATH", str(Path.home() / ".cache/warp"))
     os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
     port = free_port()
-    ray = [shutil.which("ray", path=str(Path(sys.executable).parent)) or "ray"]
+    ray, head = str(Path(sys.executable).parent / "ray"), None
     machines = Machines(f"127.0.0.1:{port}", folder)
     try:
         path = write_scene(folder, options.views, options.frames)
-        head = f"start --head --port {port} --num-cpus 0 --temp-dir {folder}/ray --include-dashboard false"
-        subprocess.run([*ray, *head.split(), "--disable-usage-stats"], check=True, stdout=subprocess.DEVNULL)
+        options_of_head = f"--head --block --disable-usage-stats --include-dashboard false --temp-dir {folder}/ray"
+        options_of_head += f" --port {port} --num-cpus 0"
+        with (folder / "head.log").open("wb") as log:
+            head = subprocess.Popen([ray, "start", *options_of_head.split()], stdout=log, stderr=log)
         compare(path, options.frames, machines)
     finally:
         machines.close()
+        if head is not None:
+            head.terminate()  # with --block it ends what it started
+            head.wait()
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def compare(path: Path, frames: int, machines: Machines) -> None:
     """The dataset of one process and that of the cluster."""
     import ray
+    from ray._private.state import actors  # what is public of it takes a dashboard
 
     from mitsplat.cluster import Cluster
     from mitsplat.dataset import write_dataset
@@ -130,7 +136,12 @@ def compare(path: Path, frames: int, machines: Machines) -> None:
     folder = path.parent
     write_dataset(load_scene(path), folder / "alone", frames=frames)
     print(f"{frames} frames are made by one process", flush=True)
-    ray.init(address=machines.address, log_to_driver=False, logging_level="ERROR")
+    while True:
+        try:
+            ray.init(address=machines.address, log_to_driver=False, logging_level="ERROR")
+            break
+        except ConnectionError:
+            time.sleep(1)
     for _ in range(2):
         machines.start()
     while sum(node["Alive"] for node in ray.nodes()) < 3:
@@ -160,7 +171,7 @@ def compare(path: Path, frames: int, machines: Machines) -> None:
     )
     expected, found = hashes(folder / "alone"), hashes(folder / "cluster")
     differing = {file for file in expected.keys() | found.keys() if expected.get(file) != found.get(file)}
-    workers = Counter(actor["NodeID"][:6] for actor in ray.util.state.list_actors())
+    workers = Counter(actor["Address"]["NodeID"][:6] for actor in actors().values())
     print(f"workers by node: {dict(workers)}; frames in hand that were lost with their machine: {events['lost']}")
     print(f"{summary.rendered} frames, {len(found)} files, {len(differing)} differ {sorted(differing)[:5]}")
     ray.shutdown()

@@ -22,6 +22,7 @@ from ruamel.yaml import YAML
 
 from benchmarks.faults import ROOT, workers_of
 from mitsplat.assets import Asset
+from mitsplat.budget import worker_memory
 from mitsplat.dataset import write_dataset
 from mitsplat.scene import load_scene
 from mitsplat.splats import Splats
@@ -108,9 +109,9 @@ def make_frames(path: Path) -> None:
     """Make a few frames in this process; its peak and its budget."""
     scene = load_scene(path, allow_outside=True)
     with tempfile.TemporaryDirectory() as folder:
-        write_dataset(scene, Path(folder) / "out", frames=4)
-    budget = 0
-    print(f"{of_process('self', 'status', 'VmHWM') / MIB:10.0f}  {budget / MIB:12.0f}")
+        write_dataset(scene, Path(folder) / "out", frames=3)
+    need = worker_memory(scene)
+    print(f"{of_process('self', 'status', 'VmHWM') / MIB:10.0f}  {(need.own + need.shared) / MIB:12.0f}")
 
 
 def main() -> None:

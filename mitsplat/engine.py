@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
+from mitsplat.budget import TYPICAL, WorkerMemory
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.shared_arrays import SharedArrays
 
@@ -135,7 +136,12 @@ class Pool(Protocol[Result]):
 
 
 def run_frames(
-    make: MakeFrame[Result], layouts: Mapping[int, Sequence[int]], *, workers: int | None = 1, note: Note
+    make: MakeFrame[Result],
+    layouts: Mapping[int, Sequence[int]],
+    *,
+    workers: int | None = 1,
+    note: Note,
+    memory: WorkerMemory = TYPICAL,
 ) -> Generator[Result]:
     """Results of ``make`` for every frame, in the order in which they are finished.
 
@@ -145,6 +151,7 @@ def run_frames(
         layouts: The frames to make, by layout.
         workers: Processes to use; 1 makes the frames in this process, None as many as turn out to pay.
         note: Hears what is being done.
+        memory: What a worker takes, by which their number is limited if it is left to the engine.
 
     Raises:
         InputError: If a frame finds its input at fault.
@@ -155,7 +162,7 @@ def run_frames(
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1 (got {workers})")
     total = sum(map(len, layouts.values()))
-    most = affordable_workers() if workers is None else workers
+    most = affordable_workers(memory) if workers is None else workers
     if min(most, total) <= 1 or (workers is None and total <= _FEW):
         for frames in layouts.values():
             for index in frames:
@@ -175,12 +182,12 @@ def run_apart(make: MakeFrame[Result]) -> Generator[Result]:
         yield from run_pool(pool, {0: [0]}, 1, lambda text: None)
 
 
-def affordable_workers() -> int:
+def affordable_workers(memory: WorkerMemory) -> int:
     """Most worker processes that this machine has cores and unused memory for, at least 1."""
-    from mitsplat.doctor import NEEDED_MEMORY, unused_memory
+    from mitsplat.doctor import unused_memory
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, int(unused_memory() / NEEDED_MEMORY)))
+    return max(1, min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own)))
 
 
 def run_pool(

@@ -166,8 +166,8 @@ class Linger:
 class Scripted:
     """A pool whose workers take given times, one after the other on a clock of its own, for the growth of a staff."""
 
-    def __init__(self, seconds):
-        self.seconds, self.clock, self.most = seconds, 0.0, 0
+    def __init__(self, seconds, joining=()):
+        self.seconds, self.joining, self.clock, self.most = seconds, list(joining), 0.0, 0
         self.due: dict[int, tuple[float, int]] = {}
         self.alive: set[int] = set()
         self.hired = 0
@@ -190,7 +190,7 @@ class Scripted:
         yield worker, Finished(frame)
 
     def openings(self):
-        return 0
+        return self.joining.pop(0) if self.joining else 0
 
     def close(self):
         pass
@@ -210,6 +210,13 @@ def test_as_many_workers_as_pay(monkeypatch, seconds, settled_at, most):
     made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
     assert sorted(made) == list(range(400))
     assert (len(pool.alive), pool.most) == (settled_at, most)
+
+
+def test_workers_are_hired_where_machines_join():
+    """None of them more than once, and none without a frame for it."""
+    pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
+    assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
+    assert pool.hired == 1 + 2 + 12  # by then 5 of 20 frames were made and 3 are in hand
 
 
 class SlowPlan:

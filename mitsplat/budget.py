@@ -34,6 +34,9 @@ PER_PAIR = 40
 PER_RAY = 400
 """For every ray through the image, all layers of a pixel and what lights them [bytes]."""
 
+PER_OBJECT = 12 * 2**20
+"""For every object of a layout: its simulation, and what rays meet of it [bytes]."""
+
 PER_SEEN = 2.25
 """For every pixel and instance: which of them are seen alone, in tiles up to an image beyond each border [bytes]."""
 
@@ -65,7 +68,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     """The most that workers take for frames of a scene.
 
     The sum of terms in the Gaussians of assets, those of all instances, the tiles that they cover as seen from some of
-    the scene's cameras (in the middle of the region, where they are dropped), rays, and instances times pixels.
+    the scene's cameras (in the middle of the region, where they are dropped), rays, objects, and objects times pixels.
     """
     from mitsplat.plugins.tiles import PAIRS_MAX
     from mitsplat.scene import plan_frame
@@ -92,7 +95,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
         + PER_PLACED * count
         + PER_PAIR * min(pairs, PAIRS_MAX)
         + PER_RAY * pixels * samples**2
-        + PER_SEEN * pixels * sum(most),
+        + (PER_OBJECT + PER_SEEN * pixels) * sum(most),
         shared=stored,
     )
 

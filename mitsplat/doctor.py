@@ -146,6 +146,6 @@ def _memory() -> Finding:
     available = unused_memory()
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     remedy = (
-        f"have {NEEDED_MEMORY:g} GiB for each worker of the default scene: close programs, or render with fewer workers"
+        f"have {NEEDED_MEMORY:g} GiB for a worker of the default scene: close programs, or render with fewer workers"
     )
     return Finding("memory", total >= NEEDED_MEMORY, f"{available:.1f} of {total:.1f} GiB unused", remedy)

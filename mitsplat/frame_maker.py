@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import fcntl
 import json
+import shutil
 import tempfile
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -138,7 +140,7 @@ class RemoteFrames:
     def __init__(self, maker: FrameMaker) -> None:
         self.maker = maker
         self._images = {name: (path.suffix, path.read_bytes()) for name, path in maker.scene.images.items()}
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._unpacked = False
 
     def known(self, layout: int) -> str | None:
         """A layout that the dataset's folder has already; asked where the folder is."""
@@ -159,14 +161,17 @@ class RemoteFrames:
         return Parcel(record, seconds, contents, layout)
 
     def _unpack_images(self) -> None:
-        """Write the images of lights into a folder of this process, which goes with it; Mitsuba reads files."""
-        if self._images and self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="mitsplat-")
-            images = {}
-            for number, (name, (suffix, content)) in enumerate(self._images.items()):
-                images[name] = Path(self._folder.name) / f"{number}{suffix}"
-                images[name].write_bytes(content)
-            self.maker.scene = replace(self.maker.scene, images=images)
+        """Write the images of lights, which Mitsuba reads from files, into a folder that goes with this object."""
+        if self._unpacked or not self._images:
+            return
+        folder = Path(tempfile.mkdtemp(prefix="mitsplat-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        images = {}
+        for number, (name, (suffix, content)) in enumerate(self._images.items()):
+            images[name] = folder / f"{number}{suffix}"
+            images[name].write_bytes(content)
+        self.maker.scene = replace(self.maker.scene, images=images)
+        self._unpacked = True
 
 
 def _write_bytes(content: bytes, path: Path) -> None:

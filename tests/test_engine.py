@@ -216,7 +216,7 @@ def test_workers_are_hired_where_machines_join():
     """None of them more than once, and none without a frame for it."""
     pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
     assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
-    assert pool.hired == 1 + 2 + 12  # by then 5 of 20 frames were made and 3 are in hand
+    assert pool.hired == 1 + 2 + 11  # by then 9 of 20 frames were given out
 
 
 class SlowPlan:

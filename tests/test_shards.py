@@ -200,7 +200,7 @@ def ray():
     """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)
-    ray.init(num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
+    ray.init("local", num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
     yield ray
     ray.shutdown()
     del os.environ["PYTHONPATH"]

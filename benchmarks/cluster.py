@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -105,7 +106,8 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="mitsplat-cluster-", dir="/tmp"))
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
     os.environ.setdefault("WARP_CACHE_PATH", str(Path.home() / ".cache/warp"))
-    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
+    # A token of this cluster's own: the machines have no home to find one in.
+    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     port = free_port()
     ray, head = str(Path(sys.executable).parent / "ray"), None
     machines = Machines(f"127.0.0.1:{port}", folder)
@@ -136,12 +138,7 @@ def compare(path: Path, frames: int, machines: Machines) -> None:
     folder = path.parent
     write_dataset(load_scene(path), folder / "alone", frames=frames)
     print(f"{frames} frames are made by one process", flush=True)
-    while True:
-        try:
-            ray.init(address=machines.address, log_to_driver=False, logging_level="ERROR")
-            break
-        except ConnectionError:
-            time.sleep(1)
+    ray.init(address=machines.address, log_to_driver=False, logging_level="ERROR")
     for _ in range(2):
         machines.start()
     while sum(node["Alive"] for node in ray.nodes()) < 3:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mitsplat.scene import Scene
     from mitsplat.splats import Splats
 
-BASE = 900 * 2**20
+BASE = 2**30
 """Python, libraries, compiled kernels and the simulation of a layout [bytes]."""
 
 PER_PLACED = 160

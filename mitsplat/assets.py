@@ -65,7 +65,7 @@ class AssetSpec(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
-    name: str = Field(min_length=1, description="Name of the asset, unique in a scene.")
+    name: str = Field(min_length=1, description="Name of the asset.")
     class_name: str | None = Field(None, alias="class", min_length=1, description="Class to learn; else the name.")
     kind: Literal["object", "environment"] = "object"
     splats: str = Field(description="Splat file.")
@@ -105,7 +105,7 @@ class Asset:
     """One object or one environment in metres, z up.
 
     Attributes:
-        name: Name of the asset, unique in a scene.
+        name: Name of the asset; several of a scene may have one.
         class_name: Class that detectors learn.
         splats: Appearance, in the asset's frame.
         mesh: Proxy surface in the same frame, or None (an environment may lack one).

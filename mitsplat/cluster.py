@@ -2,23 +2,32 @@
 
 The scene goes into Ray's object store once, a worker takes it from there once, and a layout that one worker settled is
 handed to every other that needs it. Files come back to the caller, who alone writes: no file system has to be shared.
-Workers must have the same mitsplat installed, and images of environment lights at the same paths.
+Workers must have the same mitsplat installed, and open no other file of the caller's. A machine that is lost costs its
+workers' frames in hand, which others make again; one that joins gets workers too.
 """
 
 from __future__ import annotations
 
 import logging
+import sys
+import time
 from collections import OrderedDict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
-from mitsplat.engine import Answer, Failure, Finished, Lost, Note, run_pool
+from mitsplat.engine import Answer, Failure, Finished, Lost, LostWorkersError, Note, run_pool
 from mitsplat.errors import InputError, MissingResourceError
 
 Result = TypeVar("Result")
 Made = TypeVar("Made", covariant=True)
+
+_LOOK = 3.0
+"""How often to look for machines that joined, at most [s]."""
+
+_PATIENCE = 60.0
+"""How long to wait for a machine when none is left [s]."""
 
 _KEPT_LAYOUTS = 64
 """Layouts held in the object store; any other is settled, or found in a cache, again."""
@@ -94,16 +103,18 @@ def run_on_ray(
         raise InputError(f"workers must be at least 1 (got {workers})")
     if not any(layouts.values()):
         return
-    with closing(_Actors(job, cluster)) as pool:
-        most = pool.room if workers is None else min(workers, pool.room)
-        with closing(run_pool(pool, layouts, most, note)) as results:
-            yield from results
+    with closing(_Actors(job, cluster, workers)) as pool, closing(run_pool(pool, layouts, pool.room, note)) as results:
+        yield from results
 
 
 class _Actors(Generic[Result]):
-    """Workers that are Ray actors."""
+    """Workers that are Ray actors.
 
-    def __init__(self, job: ClusterJob[Result], cluster: Cluster) -> None:
+    Attributes:
+        room: How many there can be at the start.
+    """
+
+    def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
         try:
             import ray
         except ImportError:
@@ -119,13 +130,14 @@ class _Actors(Generic[Result]):
                 raise MissingResourceError(
                     f"no Ray cluster at {cluster.address!r}: {str(error).splitlines()[0]}"
                 ) from error
-        self.room = self._find_room(cluster.resources)
+        self._wanted, self._most = cluster.resources, sys.maxsize if most is None else most
+        self._actors: dict[int, Any] = {}
+        room = self._room()
+        self._nodes, self.room = set(room), min(self._most, sum(room.values()))
+        self._looked = self._last_room = time.monotonic()
         if not self.room:
             self.close()
-            raise MissingResourceError(
-                f"no node of the Ray cluster has {', '.join(f'{n}={a:g}' for n, a in cluster.resources.items())} "
-                "for a worker"
-            )
+            raise MissingResourceError(self._no_room())
         amounts = dict(cluster.resources)
         options: dict[str, Any] = {"num_cpus": amounts.pop("CPU", 0), "num_gpus": amounts.pop("GPU", 0)}
         if "memory" in amounts:
@@ -134,14 +146,34 @@ class _Actors(Generic[Result]):
         self._gpu = bool(options["num_gpus"])
         self._job = job
         self._stored = ray.put(job)
-        self._actors: dict[int, Any] = {}
         self._answers: dict[Any, tuple[int, int, int]] = {}
         self._layouts: OrderedDict[int, tuple[Any, int | None]] = OrderedDict()
         self._hired = 0
 
-    def _find_room(self, wanted: Mapping[str, float]) -> int:
-        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
-        return sum(int(min(node.get(name, 0.0) / amount for name, amount in wanted.items())) for node in nodes)
+    def _room(self) -> dict[str, int]:
+        """Workers that fit on each node."""
+        nodes = [(node["NodeID"], node["Resources"]) for node in self._ray.nodes() if node["Alive"]]
+        return {
+            node: int(min(resources.get(name, 0.0) / amount for name, amount in self._wanted.items()))
+            for node, resources in nodes
+        }
+
+    def _no_room(self) -> str:
+        wanted = ", ".join(f"{name}={amount:g}" for name, amount in self._wanted.items())
+        return f"no node of the Ray cluster has {wanted} for a worker"
+
+    def openings(self) -> int:
+        now = time.monotonic()
+        if now < self._looked + _LOOK:
+            return 0
+        room, known, self._looked = self._room(), self._nodes, now
+        self._nodes = set(room)
+        if any(room.values()):
+            self._last_room = now
+        elif now > self._last_room + _PATIENCE:
+            raise LostWorkersError(f"{self._no_room()} any more; finished frames are kept")
+        joined = sum(count for node, count in room.items() if node not in known)
+        return max(0, min(joined, self._most - len(self._actors)))
 
     def hire(self) -> int:
         worker, self._hired = self._hired, self._hired + 1
@@ -164,7 +196,7 @@ class _Actors(Generic[Result]):
         self._answers[actor.make.remote(frame, self._layouts[layout][0])] = worker, frame, layout
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
-        ready, _ = self._ray.wait(list(self._answers), num_returns=1)
+        ready, _ = self._ray.wait(list(self._answers), num_returns=1, timeout=_LOOK)
         for reference in ready:
             worker, frame, layout = self._answers.pop(reference)
             try:
@@ -178,7 +210,7 @@ class _Actors(Generic[Result]):
                 yield worker, Lost(f"was lost ({str(error).strip().splitlines()[0]})")
 
     def close(self) -> None:
-        for worker in list(getattr(self, "_actors", ())):
+        for worker in list(self._actors):
             self.dismiss(worker)
         if self._started:
             self._ray.shutdown()

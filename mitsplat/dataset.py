@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mitsplat.budget import TYPICAL, worker_memory
 from mitsplat.engine import Note, run_frames
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, storage_errors
@@ -156,7 +157,8 @@ def _results(
 ) -> Generator[tuple[Record, dict[str, float]]]:
     """Records of frames whose files are in the folder, and the seconds of their stages."""
     if cluster is None:
-        with closing(run_frames(make, layouts, workers=workers, note=note)) as made:
+        memory = TYPICAL if workers is not None else worker_memory(make.scene)
+        with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory)) as made:
             yield from made
         return
     from mitsplat.cluster import run_on_ray

@@ -16,13 +16,16 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
+from mitsplat.budget import TYPICAL, WorkerMemory
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from mitsplat.shared_arrays import SharedArrays
 
 Made = TypeVar("Made", covariant=True)
 Result = TypeVar("Result")
@@ -123,14 +126,22 @@ class Pool(Protocol[Result]):
         """Have an idle worker make a frame."""
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
-        """Wait for answers; those that came, at least one."""
+        """Wait for answers; those that came, perhaps none."""
+
+    def openings(self) -> int:
+        """How many workers there is room for that there was not before; each is told of once."""
 
     def close(self) -> None:
         """Stop all workers."""
 
 
 def run_frames(
-    make: MakeFrame[Result], layouts: Mapping[int, Sequence[int]], *, workers: int | None = 1, note: Note
+    make: MakeFrame[Result],
+    layouts: Mapping[int, Sequence[int]],
+    *,
+    workers: int | None = 1,
+    note: Note,
+    memory: WorkerMemory = TYPICAL,
 ) -> Generator[Result]:
     """Results of ``make`` for every frame, in the order in which they are finished.
 
@@ -140,6 +151,7 @@ def run_frames(
         layouts: The frames to make, by layout.
         workers: Processes to use; 1 makes the frames in this process, None as many as turn out to pay.
         note: Hears what is being done.
+        memory: What a worker takes, by which their number is limited if it is left to the engine.
 
     Raises:
         InputError: If a frame finds its input at fault.
@@ -150,7 +162,7 @@ def run_frames(
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1 (got {workers})")
     total = sum(map(len, layouts.values()))
-    most = affordable_workers() if workers is None else workers
+    most = affordable_workers(memory) if workers is None else workers
     if min(most, total) <= 1 or (workers is None and total <= _FEW):
         for frames in layouts.values():
             for index in frames:
@@ -170,12 +182,12 @@ def run_apart(make: MakeFrame[Result]) -> Generator[Result]:
         yield from run_pool(pool, {0: [0]}, 1, lambda text: None)
 
 
-def affordable_workers() -> int:
+def affordable_workers(memory: WorkerMemory) -> int:
     """Most worker processes that this machine has cores and unused memory for, at least 1."""
-    from mitsplat.doctor import NEEDED_MEMORY, unused_memory
+    from mitsplat.doctor import unused_memory
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, int(unused_memory() / NEEDED_MEMORY)))
+    return max(1, min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own)))
 
 
 def run_pool(
@@ -184,7 +196,7 @@ def run_pool(
     """Results of the pool's workers for every frame, in the order in which they are finished.
 
     A worker gets its next frame when it has finished one, so results do not pile up while the caller is busy. A lost
-    one is replaced only if it was the last: memory is what it most likely died of.
+    one is replaced only if it was the last, because memory is what it most likely died of, or where machines join.
 
     Args:
         pool: Hires and hears the workers.
@@ -196,7 +208,7 @@ def run_pool(
     Raises:
         InputError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
-    plan = _Plan({layout: deque(frames) for layout, frames in layouts.items() if frames})
+    plan = _Plan(layouts)
     most = min(most, plan.left)
     staff = _Staff(most)
     losses: Counter[int] = Counter()
@@ -246,41 +258,88 @@ def run_pool(
                         grow = False
             employ(worker)
             yield answer.result
+        for _ in range(pool.openings()):
+            if plan.left:
+                employ(pool.hire())
 
 
-@dataclass
 class _Plan:
-    """Which frames are still to be given to a worker, by layout."""
+    """Which frames are still to be given to a worker, by layout.
 
-    waiting: dict[int, deque[int]]
-    _layouts: dict[int, int] = field(default_factory=dict)
+    A worker keeps to its layout while that has frames, then takes the first that nobody has, and when there is none
+    helps with that which has most left. Each costs O(log layouts): heaps hold what was so when it was entered, which is
+    looked at again when it comes to the top.
 
-    @property
-    def left(self) -> int:
-        return sum(map(len, self.waiting.values()))
+    Args:
+        layouts: Frames of each layout, in order.
+    """
+
+    def __init__(self, layouts: Mapping[int, Sequence[int]]) -> None:
+        self.waiting = {layout: deque(frames) for layout, frames in layouts.items() if frames}
+        self.left = sum(map(len, self.waiting.values()))
+        self._layouts: dict[int, int] = {}
+        self._workers: Counter[int] = Counter()
+        self._order = {layout: order for order, layout in enumerate(self.waiting)}
+        self._entered = len(self._order)
+        self._free = [(order, layout) for layout, order in self._order.items()]
+        self._longest = [(-len(self.waiting[layout]), order, layout) for order, layout in self._free]
+        heapify(self._longest)
 
     def take(self, worker: int) -> tuple[int, int] | None:
         """Layout and frame: of the worker's layout, of one nobody has taken, or of that with most left to do."""
         if not self.waiting:
             return None
         layout = self._layouts.get(worker)
-        if layout not in self.waiting:
-            free = [layout for layout in self.waiting if layout not in self._layouts.values()]
-            layout = free[0] if free else max(self.waiting, key=lambda layout: len(self.waiting[layout]))
+        if layout is None or layout not in self.waiting:
+            if layout is not None:
+                self._workers[layout] -= 1
+            layout = self._first_free() if self._free else None
+            if layout is None:
+                layout = self._longest_left()
             self._layouts[worker] = layout
+            self._workers[layout] += 1
         frames = self.waiting[layout]
         frame = frames.popleft()
+        self.left -= 1
         if not frames:
-            del self.waiting[layout]
+            del self.waiting[layout], self._order[layout]
         return layout, frame
 
     def put_back(self, worker: int, frame: int) -> None:
         """The worker is gone, and its frame is to be made again."""
-        self.waiting.setdefault(self._layouts[worker], deque()).appendleft(frame)
+        layout = self._layouts[worker]
+        if layout not in self.waiting:  # now the last
+            self.waiting[layout] = deque()
+            self._order[layout] = self._entered
+            self._entered += 1
+        self.waiting[layout].appendleft(frame)
+        self.left += 1
+        heappush(self._longest, (-len(self.waiting[layout]), self._order[layout], layout))
         self.leave(worker)
 
     def leave(self, worker: int) -> None:
-        del self._layouts[worker]
+        """The worker is gone."""
+        layout = self._layouts.pop(worker)
+        self._workers[layout] -= 1
+        if layout in self.waiting and not self._workers[layout]:
+            heappush(self._free, (self._order[layout], layout))
+
+    def _first_free(self) -> int | None:
+        while self._free:
+            order, layout = heappop(self._free)
+            if self._order.get(layout) == order and not self._workers[layout]:
+                return layout
+        return None
+
+    def _longest_left(self) -> int:
+        while True:
+            length, order, layout = self._longest[0]
+            if self._order.get(layout) != order:
+                heappop(self._longest)
+            elif -length != (left := len(self.waiting[layout])):
+                heapreplace(self._longest, (-left, order, layout))
+            else:
+                return layout
 
 
 class _Staff:
@@ -320,7 +379,7 @@ class _Processes(Generic[Result]):
     """Workers that are processes of this machine."""
 
     def __init__(self, make: MakeFrame[Result]) -> None:
-        self._make = make
+        self._make = SharedArrays(make)
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: dict[int, tuple[BaseProcess, Connection]] = {}
         self._hired = 0
@@ -364,11 +423,15 @@ class _Processes(Generic[Result]):
                 self.dismiss(worker)
                 yield worker, Lost(how)
 
+    def openings(self) -> int:
+        return 0
+
     def close(self) -> None:
         for process, _ in self._workers.values():
             process.terminate()
         for worker in list(self._workers):
             self.dismiss(worker)
+        self._make.close()
 
 
 def _work(pipe: Connection, make: MakeFrame[Result]) -> None:

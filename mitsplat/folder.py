@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -16,16 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-import numpy as np
-
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, storage_errors, write_file, write_text
+from mitsplat.inputs import describe_inputs
 from mitsplat.manifest import Manifest, cut_torn_line
 from mitsplat.sheet import ContactSheet
 from mitsplat.writers import Catalogue, CollectionWriter
 
 if TYPE_CHECKING:
-    from mitsplat.assets import Asset
     from mitsplat.scene import Scene
 
 CONTENT = "dataset.json"
@@ -287,12 +284,6 @@ def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
     """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
     from mitsplat import __version__
 
-    inputs = {asset.name: _asset_hash(asset) for asset in (scene.environment, *scene.assets) if asset is not None}
-    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
-        inputs[f"shape {shape.name}"] = _hash(mesh.vertices, mesh.faces)
-    for light in scene.spec.lights:
-        if image := getattr(light, "image", None):
-            inputs[image] = hashlib.sha256((scene.path.parent / image).read_bytes()).hexdigest()
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
         "mitsplat": __version__,
@@ -300,26 +291,9 @@ def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
         "classes": list(scene.class_names),
         "keypoints": [list(names) for names in catalogue.keypoint_names],
         "assets": list(catalogue.assets),
-        "inputs": inputs,
+        "inputs": describe_inputs(scene),
         "libraries": {name: importlib.metadata.version(name) for name in libraries},
     }
-
-
-def _asset_hash(asset: Asset) -> str:
-    splats, meshes = asset.splats, [mesh for mesh in (asset.mesh, *asset.pieces) if mesh is not None]
-    arrays: list[Any] = [splats.means, splats.quats, splats.scales, splats.opacities, splats.sh]
-    arrays += [array for mesh in meshes for array in (mesh.vertices, mesh.faces)]
-    arrays += [asset.keypoint_array]
-    physics = [asset.density, asset.mass or 0.0, asset.friction, asset.roughness, asset.specular, asset.white or 0.0]
-    return _hash(*arrays, np.array(physics), np.frombuffer(asset.capture_light.encode(), dtype=np.uint8))
-
-
-def _hash(*arrays: Any) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(str(np.shape(array)).encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:

@@ -32,7 +32,7 @@ from mitsplat.render import (
 )
 from mitsplat.scene import FramePlan, Scene, layout_of, plan_frame
 from mitsplat.settle import Layout, settle_layout
-from mitsplat.spec import LightSpec
+from mitsplat.spec import EnvironmentLight, LightSpec
 from mitsplat.splats import Splats
 
 NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
@@ -197,8 +197,13 @@ class _Studio:
                 asset = self.scene.assets[instance.asset]
                 objects[f"instance_{instance.id}"] = _asset_shape(asset, instance.world_from_object, instance.id)
             self._placed = layout, objects
-        emitters = {f"light_{i}": emitter_dict(light, self.scene.path.parent) for i, light in enumerate(lights)}
+        emitters = {f"light_{i}": self._emitter(light) for i, light in enumerate(lights)}
         return {"type": "scene", **self.static, **self._placed[1], **emitters}
+
+    def _emitter(self, light: LightSpec) -> dict[str, Any]:
+        if isinstance(light, EnvironmentLight) and light.image is not None:
+            light = light.model_copy(update={"image": str(self.scene.images[light.image])})
+        return emitter_dict(light)
 
     def _static_shapes(self) -> dict[str, Any]:
         shapes: dict[str, Any] = {}

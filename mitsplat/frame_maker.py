@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import fcntl
 import json
+import shutil
 import tempfile
 import time
+import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -128,11 +130,17 @@ class Parcel:
         return self.record
 
 
-@dataclass
 class RemoteFrames:
-    """Settles layouts and makes frames where the dataset's folder is not: they are returned instead."""
+    """Settles layouts and makes frames where no file of the caller is: what is made is returned instead.
 
-    maker: FrameMaker
+    Args:
+        maker: Makes the frames.
+    """
+
+    def __init__(self, maker: FrameMaker) -> None:
+        self.maker = maker
+        self._images = {name: (path.suffix, path.read_bytes()) for name, path in maker.scene.images.items()}
+        self._unpacked = False
 
     def known(self, layout: int) -> str | None:
         """A layout that the dataset's folder has already; asked where the folder is."""
@@ -145,11 +153,25 @@ class RemoteFrames:
 
     def make(self, index: int, layout: str) -> Parcel:
         """Make frame ``index`` of a layout."""
+        self._unpack_images()
         with tempfile.TemporaryDirectory(prefix="mitsplat-") as folder:
             self.maker.out = Path(folder)
             record, seconds = self.maker.write(index, self.maker.keep(layout))
             contents = {digest: (Path(folder) / file).read_bytes() for file, digest in record["files"].items()}
         return Parcel(record, seconds, contents, layout)
+
+    def _unpack_images(self) -> None:
+        """Write the images of lights, which Mitsuba reads from files, into a folder that goes with this object."""
+        if self._unpacked or not self._images:
+            return
+        folder = Path(tempfile.mkdtemp(prefix="mitsplat-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        images = {}
+        for number, (name, (suffix, content)) in enumerate(self._images.items()):
+            images[name] = folder / f"{number}{suffix}"
+            images[name].write_bytes(content)
+        self.maker.scene = replace(self.maker.scene, images=images)
+        self._unpacked = True
 
 
 def _write_bytes(content: bytes, path: Path) -> None:

@@ -157,8 +157,10 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
 def check_scene(scene: Scene) -> Iterator[Finding]:
     """Findings on a scene, and what is wrong with each of its assets, whose names they begin with."""
     spec = scene.spec
-    assets = {asset.name: asset for asset in (scene.environment, *scene.assets) if asset is not None}
-    for name, asset in assets.items():
+    loaded = [asset for asset in (scene.environment, *scene.assets) if asset is not None]
+    assets = {id(asset.splats): asset for asset in loaded}.values()  # several may have one name
+    for asset in assets:
+        name = asset.name
         wrong = [finding for finding in check_asset(asset) if not finding.ok]
         for finding in wrong:
             yield replace(finding, name=f"{name}: {finding.name}")
@@ -177,7 +179,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     text = "objects have something to lie on" if support else "nothing collides with objects"
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
     yield _sight(scene, extent)
-    lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in assets.values())
+    lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in assets)
     yield Finding(
         "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
     )

@@ -10,7 +10,7 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,6 +111,7 @@ class Scene:
         assets: Asset of each entry of ``spec.objects``, with its scale and class name applied.
         shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
         class_names: Sorted; the position in it is the class index.
+        images: Files of the images that lights name, by those names.
     """
 
     spec: SceneSpec
@@ -119,6 +120,7 @@ class Scene:
     assets: tuple[Asset, ...]
     shape_meshes: tuple[trimesh.Trimesh, ...]
     class_names: tuple[str, ...]
+    images: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -168,12 +170,14 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     if not allow_outside:
         _confine(spec, path)
     folder = path.parent
+    images: dict[str, Path] = {}
     for position, light in enumerate(spec.lights):
         if isinstance(light, EnvironmentLight) and light.image is not None:
+            images[light.image] = folder / light.image
             with _blaming(path, "lights", position, "image"):
-                if not (folder / light.image).is_file():
-                    raise InputError(f"{folder / light.image}: no such file")
-                check_image(folder / light.image)
+                if not images[light.image].is_file():
+                    raise InputError(f"{images[light.image]}: no such file")
+                check_image(images[light.image])
     environment = None
     if spec.environment is not None:
         with _blaming(path, "environment"):
@@ -197,6 +201,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         assets=assets,
         shape_meshes=tuple(shape_meshes),
         class_names=tuple(sorted({asset.class_name for asset in assets})),
+        images=images,
     )
 
 

@@ -43,10 +43,13 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     files.mkdir(parents=True, exist_ok=True)
     shapes: dict[str, Any] = {}
     if scene.environment is not None:
-        shapes["environment"] = _describe_asset(scene.environment, files, np.eye(4), 0)
-    for instance in layout.instances:
-        asset = scene.assets[instance.asset]
-        shapes[f"instance_{instance.id}"] = _describe_asset(asset, files, instance.world_from_object, instance.id)
+        stem = _write_asset(scene.environment, files / "environment")
+        shapes["environment"] = _describe_asset(scene.environment, stem, np.eye(4), 0)
+    # Named by place: names of assets need be neither distinct nor those of files.
+    stems = {i: _write_asset(scene.assets[i], files / f"object_{i}") for i in {one.asset for one in layout.instances}}
+    for one in layout.instances:
+        description = _describe_asset(scene.assets[one.asset], stems[one.asset], one.world_from_object, one.id)
+        shapes[f"instance_{one.id}"] = description
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if shape.visible:
             shapes[f"shape_{number}"] = _describe_shape(shape, mesh, files / f"shape_{number}.ply")
@@ -130,24 +133,26 @@ def _last_sentence(error: RuntimeError) -> str:
     return lines[-1] if lines else "Mitsuba refuses it without a reason"
 
 
-def _describe_asset(asset: Asset, files: Path, world_from_asset: np.ndarray, instance: int) -> dict[str, Any]:
-    splats, mesh = files / f"{asset.name}.ply", files / f"{asset.name}_proxy.ply"
-    if not splats.exists():
-        asset.splats.save(splats)
-    description: dict[str, Any] = {
+def _write_asset(asset: Asset, stem: Path) -> Path:
+    """Write splats and mesh as ``stem.ply`` and ``stem_proxy.ply``; ``stem``."""
+    asset.splats.save(stem.with_suffix(".ply"))
+    if asset.mesh is not None:
+        asset.mesh.export(stem.with_name(f"{stem.name}_proxy.ply"))
+    return stem
+
+
+def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, instance: int) -> dict[str, Any]:
+    relative = f"{stem.parent.name}/{stem.name}"
+    return {
         "type": "splats",
-        "filename": f"{files.name}/{splats.name}",
+        "filename": f"{relative}.ply",
         "instance": instance,
         "capture_light": asset.capture_light,
         "roughness": float(asset.roughness),
         "specular": float(asset.specular) if instance else 0.0,
         "to_world": mi.ScalarTransform4f(world_from_asset),
+        **({"proxy": f"{relative}_proxy.ply"} if asset.mesh is not None else {}),
     }
-    if asset.mesh is not None:
-        if not mesh.exists():
-            asset.mesh.export(mesh)
-        description["proxy"] = f"{files.name}/{mesh.name}"
-    return description
 
 
 def _describe_shape(shape: Shape, mesh: trimesh.Trimesh, path: Path) -> dict[str, Any]:

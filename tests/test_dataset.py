@@ -348,7 +348,7 @@ class TestRefusals:
         shutil.copytree(tmp_path / "assets/bolt", tmp_path / "assets/nut")
         manual = tmp_path / "assets/nut/asset.yaml"
         manual.write_text(manual.read_text().replace("bolt", "nut"))
-        self.refuse(load_scene(scene.path), tmp_path / "out", r"inputs\.nut was")
+        self.refuse(load_scene(scene.path), tmp_path / "out", r"inputs\.objects\[0\]\.mesh was")
 
     def test_overwriting_starts_anew(self, scene, tmp_path):
         out = tmp_path / "out"

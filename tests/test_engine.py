@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mitsplat import engine
 from mitsplat.engine import Finished, FrameError, LostWorkersError, run_frames, run_pool
@@ -164,8 +166,8 @@ class Linger:
 class Scripted:
     """A pool whose workers take given times, one after the other on a clock of its own, for the growth of a staff."""
 
-    def __init__(self, seconds):
-        self.seconds, self.clock, self.most = seconds, 0.0, 0
+    def __init__(self, seconds, joining=()):
+        self.seconds, self.joining, self.clock, self.most = seconds, list(joining), 0.0, 0
         self.due: dict[int, tuple[float, int]] = {}
         self.alive: set[int] = set()
         self.hired = 0
@@ -187,6 +189,9 @@ class Scripted:
         self.clock, frame = self.due.pop(worker)
         yield worker, Finished(frame)
 
+    def openings(self):
+        return self.joining.pop(0) if self.joining else 0
+
     def close(self):
         pass
 
@@ -205,6 +210,91 @@ def test_as_many_workers_as_pay(monkeypatch, seconds, settled_at, most):
     made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
     assert sorted(made) == list(range(400))
     assert (len(pool.alive), pool.most) == (settled_at, most)
+
+
+def test_workers_are_hired_where_machines_join():
+    """None of them more than once, and none without a frame for it."""
+    pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
+    assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
+    assert pool.hired == 1 + 2 + 11  # by then 9 of 20 frames were given out
+
+
+class SlowPlan:
+    """The rule of the plan, readable: a worker's own layout, the first that nobody has, that with most left."""
+
+    def __init__(self, layouts):
+        self.waiting = {layout: list(frames) for layout, frames in layouts.items() if frames}
+        self.layouts = {}
+
+    def take(self, worker):
+        if not self.waiting:
+            return None
+        layout = self.layouts.get(worker)
+        if layout not in self.waiting:
+            free = [layout for layout in self.waiting if layout not in self.layouts.values()]
+            layout = free[0] if free else max(self.waiting, key=lambda layout: len(self.waiting[layout]))
+            self.layouts[worker] = layout
+        frame = self.waiting[layout].pop(0)
+        if not self.waiting[layout]:
+            del self.waiting[layout]
+        return layout, frame
+
+    def put_back(self, worker, frame):
+        self.waiting.setdefault(self.layouts[worker], []).insert(0, frame)
+        self.leave(worker)
+
+    def leave(self, worker):
+        del self.layouts[worker]
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    sizes=st.lists(st.integers(0, 6), max_size=9),
+    events=st.lists(st.tuples(st.integers(0, 4), st.sampled_from(["take"] * 6 + ["lost", "dismissed"])), max_size=80),
+)
+def test_the_plan_keeps_to_its_rule(sizes, events):
+    """Workers that take, are lost with their frame, and are dismissed, in any order."""
+    layouts = {7 * number: [100 * number + view for view in range(size)] for number, size in enumerate(sizes)}
+    fast, slow = engine._Plan(layouts), SlowPlan(layouts)
+    at_work = {}
+    for worker, event in events:
+        if event == "take":
+            task = slow.take(worker)
+            assert fast.take(worker) == task
+            at_work[worker] = task
+        elif at_work.get(worker) is not None:
+            for plan in (fast, slow):
+                plan.put_back(worker, at_work[worker][1]) if event == "lost" else plan.leave(worker)
+            del at_work[worker]
+        assert fast.left == sum(map(len, slow.waiting.values()))
+    rest = [(fast.take(9), slow.take(9)) for _ in range(fast.left + 1)]
+    assert all(one == other for one, other in rest) and rest[-1] == (None, None)
+
+
+class Counted(int):
+    """A layout's number that counts how often it is looked at."""
+
+    looks = 0
+
+    def __hash__(self):
+        Counted.looks += 1
+        return int.__hash__(self)
+
+    def __eq__(self, other):
+        Counted.looks += 1
+        return int.__eq__(self, other)
+
+
+def test_a_frame_of_many_layouts_costs_no_more_than_one_of_few():
+    """Looks at layouts for each frame; a layout goes to one worker, the last ones to several."""
+    looks = {}
+    for count in (100, 3200):
+        plan = engine._Plan({Counted(layout): range(3) for layout in range(count)})
+        Counted.looks = 0
+        for turn in range(plan.left):
+            plan.take(turn % 50)
+        looks[count] = Counted.looks / (3 * count)
+    assert looks[3200] < 1.2 * looks[100] < 15
 
 
 def test_few_frames_start_no_process():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import box_asset
+from ruamel.yaml import YAML
 from test_cli import run
 
 from mitsplat.assets import Asset
@@ -93,6 +94,20 @@ def test_a_fault_of_a_scene_is_found(scene_data, write_scene, name, change):
     found = wrong(check_scene(load_scene(write_scene(scene_data))))
     assert set(found) - set(good) == {name}
     assert found[name].remedy
+
+
+def test_assets_of_one_name_do_not_hide_each_other(tmp_path):
+    bad = replace(GOOD, splats=changed(GOOD.splats, 900, opacities=1e-3))
+    bad.save(tmp_path / "bad")
+    GOOD.save(tmp_path / "good")
+    data = {
+        "name": "both",
+        "objects": [{"asset": "bad"}, {"asset": "good"}],
+        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+    }
+    YAML(typ="safe", pure=True).dump(data, tmp_path / "scene.yaml")
+    assert "box: opacity" in wrong(check_scene(load_scene(tmp_path / "scene.yaml")))
 
 
 def test_an_object_that_cannot_fit_is_refused(scene_data, write_scene, capsys):

@@ -2,24 +2,36 @@
 
 import json
 import os
+import pickle
 import shutil
+import sys
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 from conftest import BOTH, nut_and_bolt, small_scene
 from test_cli import run
 from test_dataset import contents, render, settle, write
 from test_faults import KilledOnce
 
+from mitsplat import cluster
+from mitsplat.audit import audit_dataset
 from mitsplat.cluster import Cluster
+from mitsplat.engine import LostWorkersError
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.folder import Shard
+from mitsplat.frame import _Studio
+from mitsplat.frame_maker import FrameMaker, RemoteFrames
 from mitsplat.manifest import Manifest, encode_line
 from mitsplat.merge import merge_shards
-from mitsplat.scene import load_scene
+from mitsplat.quality import resolve_quality
+from mitsplat.scene import load_scene, plan_frame
 from mitsplat.spec import FORMATS
+from mitsplat.writers import Catalogue
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +199,7 @@ def ray():
     """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)
-    ray.init(num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
+    ray.init("local", num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
     yield ray
     ray.shutdown()
     del os.environ["PYTHONPATH"]
@@ -215,6 +227,75 @@ class TestRay:
         assert summary.rendered == 2
         with pytest.raises(MissingResourceError, match=r"no node of the Ray cluster has CPU=1, camera=2 for a worker"):
             write(scene, tmp_path / "other", cluster=Cluster(resources={"CPU": 1, "camera": 2}))
+
+
+class FakeRay:
+    """As much of Ray as tells of machines."""
+
+    def __init__(self, **nodes):
+        self.alive = nodes
+
+    def nodes(self):
+        return [{"NodeID": name, "Alive": cpus > 0, "Resources": {"CPU": cpus}} for name, cpus in self.alive.items()]
+
+    def is_initialized(self):
+        return True
+
+    def put(self, value):
+        return value
+
+    def remote(self, kind):
+        return SimpleNamespace(options=lambda **options: SimpleNamespace(remote=lambda *arguments: object()))
+
+
+def test_machines_that_join_are_told_of_once(monkeypatch):
+    ray, now = FakeRay(head=2.0, first=5.0), [0.0]
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(cluster.time, "monotonic", lambda: now[0])
+
+    def openings(**nodes):
+        ray.alive |= nodes
+        now[0] += 10.0
+        return pool.openings()
+
+    pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), None)
+    assert (pool.room, openings()) == (3, 0)
+    assert (openings(second=4.0), openings()) == (2, 0)
+    assert openings(second=0.0, first=0.0) == 0  # lost: theirs is what is made again
+    assert openings(again=4.0) == 2
+    few = pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), 2)
+    workers = [few.hire(), few.hire()]
+    assert (few.room, openings(third=8.0)) == (2, 0)
+    del few._actors[workers[0]]
+    assert openings(fourth=8.0) == 1
+    assert openings(**dict.fromkeys(ray.alive, 0.0)) == 0
+    now[0] += cluster._PATIENCE
+    with pytest.raises(LostWorkersError, match=r"^no node .* CPU=2 for a worker any more; finished frames are kept"):
+        openings()
+
+
+def test_images_of_lights_travel_with_the_job(scene_data, write_scene, tmp_path):
+    """Where frames are made no path of the caller's is opened: its folder is gone."""
+    cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 90, dtype=np.uint8))
+    scene_data["lights"] = [{"kind": "environment", "image": "sky.png"}]
+    home = load_scene(write_scene(scene_data))
+    image = home.images["sky.png"].read_bytes()
+    job = RemoteFrames(FrameMaker(home, Catalogue.of(home), tmp_path / "out", render, settle))
+    sent = pickle.dumps(job)
+    for path in (*home.path.parent.glob("*.yaml"), tmp_path / "sky.png"):
+        path.unlink()
+    there = pickle.loads(sent)
+    parcel = there.make(0, there.settle(0))
+    assert parcel.record["lights"][0]["image"] == "sky.png"
+    (copy,) = there.maker.scene.images.values()
+    assert copy.read_bytes() == image and tmp_path not in copy.parents
+    studio = _Studio(there.maker.scene, resolve_quality("fast"))
+    assert studio._emitter(plan_frame(there.maker.scene, 0).lights[0])["filename"] == str(copy)
+    scene = there.maker.scene
+    there.make(1, there.settle(0))
+    assert there.maker.scene is scene  # by which the renderer knows its uploads
+    del there, studio
+    assert not copy.exists()
 
 
 def only_later(first, scene, index, *, progress):

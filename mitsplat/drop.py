@@ -21,9 +21,9 @@ from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, Outcome, WarpWorld, World, all_pieces, run_to_rest
 from mitsplat.place import Item, draw_poses, fixed_pose
-from mitsplat.scene import ENCLOSURE, Scene, bin_walls
+from mitsplat.scene import Scene
 from mitsplat.settle import NOTHING_TO_REST, FloatArray, Instance, Layout, Progress, RestCertificate
-from mitsplat.spec import PILE_HEIGHT, Region
+from mitsplat.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
@@ -84,7 +84,7 @@ class Drop:
         walls = self._add_colliders(progress)
         self._contact_finder = ContactFinder(all_pieces((part.body for part in self._objects), self._colliders))
         self._check_given_poses()
-        self._bounds = _enclosure(scene.spec.region, [item.bounds for item in self._obstacles], walls)
+        self._bounds = enclosed_bounds(scene.spec.region, [item.bounds for item in self._obstacles], walls)
         if scene.spec.settle.arrangement == "pile":
             self._bounds[1][2] += PILE_HEIGHT
 
@@ -362,25 +362,3 @@ def _pieces(
 ) -> tuple[trimesh.Trimesh, ...]:
     progress(f"convex pieces of {name}")
     return convex_pieces(mesh, threshold=threshold)
-
-
-def _enclosure(region: Region, bounds: Sequence[FloatArray], walls: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Corners of what centres of mass must stay in: the outer faces of the walls beside the region, else all colliders.
-
-    Args:
-        region: Where objects start.
-        bounds: Bounding box of each collider, shape (2, 3) [m].
-        walls: Positions of the colliders that are an enclosure.
-    """
-    low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
-    high[2] = max(high[2], region.max[2])
-    for axis in (0, 1):
-        across = 1 - axis
-        for wall in (bounds[position] for position in walls):
-            if wall[0][across] > region.min[across] or wall[1][across] < region.max[across]:
-                continue
-            if wall[0][axis] >= region.max[axis]:
-                high[axis] = min(high[axis], wall[1][axis])
-            if wall[1][axis] <= region.min[axis]:
-                low[axis] = max(low[axis], wall[0][axis])
-    return low, high

@@ -15,7 +15,7 @@ MuJoCo's ``geom_friction`` holds these three of each geom: coefficient, radius o
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, no_type_check
 
 import newton
 import numpy as np
@@ -35,7 +35,7 @@ def pair_friction(first: FloatArray, second: FloatArray) -> FloatArray:
     """Friction of contacts, shape (N, 5), twice sliding, spin and twice rolling, of their geoms' (N, 3)."""
     slide = np.sqrt(first[:, 0] * second[:, 0])
     spin, roll = np.maximum(first[:, 1:], second[:, 1:]).T
-    return np.maximum(np.stack([slide, slide, slide * spin, roll, roll], axis=1), LEAST_FRICTION)
+    return np.asarray(np.maximum(np.stack([slide, slide, slide * spin, roll, roll], axis=1), LEAST_FRICTION))
 
 
 class PairFrictionSolver(SolverMuJoCo):
@@ -45,10 +45,10 @@ class PairFrictionSolver(SolverMuJoCo):
         with warnings.catch_warnings():
             # A geom without friction is one factor of a pair's, which has LEAST_FRICTION.
             warnings.filterwarnings("ignore", message=r"geom \d+: friction.* < MJ_MINMU")
-            super().__init__(model, **options)  # type: ignore[no-untyped-call]
+            super().__init__(model, **options)
 
     def _convert_contacts_to_mjwarp(self, model: newton.Model, state_in: newton.State, contacts: Any) -> None:
-        super()._convert_contacts_to_mjwarp(model, state_in, contacts)  # type: ignore[no-untyped-call]
+        super()._convert_contacts_to_mjwarp(model, state_in, contacts)
         found = self.mjw_data.contact
         wp.launch(
             _mix_friction,
@@ -59,6 +59,7 @@ class PairFrictionSolver(SolverMuJoCo):
 
 
 @wp.kernel(enable_backward=False, module="unique")
+@no_type_check
 def _mix_friction(
     count: wp.array[wp.int32],
     geoms: wp.array[wp.vec2i],

@@ -62,9 +62,6 @@ EmittedColour = Annotated[
 ]
 
 
-PILE_HEIGHT = 1.0
-"""How far above the drop region the objects of a pile may start [m]."""
-
 Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
 
 

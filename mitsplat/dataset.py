@@ -58,6 +58,7 @@ class DatasetSummary:
         dropped: What was not labelled, by the reasons of :class:`mitsplat.label.Labels`.
         marked: Labelled instances below a threshold, by the marks of :class:`mitsplat.label.InstanceLabel`.
         contact_sheet: Picture of some frames with their labels drawn.
+        unlabelled: Whether there are objects, but no image has a label.
     """
 
     path: Path
@@ -68,6 +69,7 @@ class DatasetSummary:
     dropped: dict[str, int]
     marked: dict[str, int]
     contact_sheet: Path
+    unlabelled: bool = False
 
 
 def write_dataset(
@@ -105,12 +107,13 @@ def write_dataset(
         settle: What to use instead of :func:`mitsplat.settle.settle_layout`.
 
     Raises:
-        InputError: If ``frames`` or a format is not available, the folder cannot be written, is in use, holds
-            something else, or holds a dataset of another scene; nothing is rendered then. Later, if what is in it is
-            changed by someone else.
+        InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
+            :mod:`mitsplat.prospects`), the folder cannot be written, is in use, holds something else, or holds a
+            dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else.
         MissingResourceError: If the disk is full.
         PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
     """
+    from mitsplat.prospects import refuse, run_faults
     from mitsplat.scene import layout_of
 
     out = Path(out)
@@ -124,6 +127,8 @@ def write_dataset(
         raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
     catalogue = Catalogue.of(scene)
     wanted = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
+    if render is None and settle is None:
+        refuse(scene, run_faults(scene, wanted, out=out, workers=workers, elsewhere=cluster is not None))
     content = content_of(scene, catalogue)
     part = None if shard is None else shard.to_json(count)
     with open_folder(out, content, scene.path, part, resume=resume, overwrite=overwrite) as manifest:
@@ -181,8 +186,10 @@ def _default_settle() -> Settle:
 def summarise(out: Path, manifest: Manifest, rendered: int) -> DatasetSummary:
     """What is in a finished dataset, ``rendered`` frames of it new."""
     images, instances, dropped, marked = (Counter[str]() for _ in range(4))
+    placed = False
     for record in manifest:
         images[record["split"]] += 1
+        placed |= bool(record["labels"]["instances"] or any(record["labels"]["dropped"].values()))
         instances.update(label["class"] for label in record["labels"]["instances"])
         dropped.update(record["labels"]["dropped"])
         marked.update(mark for label in record["labels"]["instances"] for mark in label["marks"])
@@ -195,4 +202,5 @@ def summarise(out: Path, manifest: Manifest, rendered: int) -> DatasetSummary:
         dropped=dict(dropped),
         marked=dict(sorted(marked.items())),
         contact_sheet=out / SHEET,
+        unlabelled=placed and not instances,
     )

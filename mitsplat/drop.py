@@ -288,8 +288,19 @@ class Drop:
         size = np.subtract(region.max, region.min)
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
-            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m, "
+            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m{self._in_way()}, "
             f"settle.arrangement {arrangement})"
+        )
+
+    def _in_way(self) -> str:
+        """Of what takes most of the region: how much, and its name; empty if nothing takes a tenth."""
+        points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
+        taken = [float((item.signed_distances(points) < 0).mean()) for item in self._obstacles]
+        worst = int(np.argmax(taken))
+        return (
+            f", {taken[worst]:.0%} of which are inside of {self._obstacles[worst].name!r}"
+            if taken[worst] >= 0.1
+            else ""
         )
 
     def _disarray(

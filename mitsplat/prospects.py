@@ -34,13 +34,13 @@ VIEWS = 48
 """Views that are looked at, spread over the run."""
 NARROWEST = 0.01
 """Share of the smallest object that an image must show at least."""
-PIXEL_BYTES, PROCESS_GIB = 300, 0.5
-"""Least memory of a pixel at the peak of a frame, and of a process besides; the workcell takes 1.0 GiB at 640x360 and
-2.6 at 2000x2000."""
+PIXEL_BYTES, PROCESS_GIB = 400, 0.5
+"""Least memory of a pixel at the peak of a frame, and of a process besides; the workcell takes 1.0 GiB at 640x360,
+2.6 at 2000x2000 and 8.4 at 4000x4000."""
 FRAME_BYTES = 8192
 """Least room on the disk of a frame: an image and a label, a block each."""
 _CELLS = 24  # of a region along each axis, in which is looked for room
-_MOST_WORK = 20_000_000  # pairs of a point and a triangle
+_PAIRS = 1_000_000  # of a point and a triangle that are looked at together
 
 
 def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
@@ -244,13 +244,14 @@ def doubts(scene: Scene) -> Iterator[Finding]:
 def points_inside(mesh: trimesh.Trimesh, points: FloatArray) -> npt.NDArray[np.bool_]:
     """Which of some points (N, 3) are inside a mesh: around which it winds, as often as not (Jacobson et al. 2013).
 
-    The solid angles of its triangles are those of Van Oosterom and Strackee (1983).
+    The solid angles of its triangles are those of Van Oosterom and Strackee (1983). :class:`mitsplat.clearance.Surface`
+    finds the same faster, once physics has been started, for which no check should wait.
     """
     low, high = mesh.bounds
     inside = ((points > low) & (points < high)).all(axis=1)
     triangles = np.asarray(mesh.triangles, dtype=np.float64)
     nearby = np.flatnonzero(inside)
-    for chunk in np.array_split(nearby, math.ceil(len(nearby) * len(triangles) / 1_000_000) or 1):
+    for chunk in np.array_split(nearby, math.ceil(len(nearby) * len(triangles) / _PAIRS) or 1):
         corners = triangles[None] - points[chunk][:, None, None]
         a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]
         la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))

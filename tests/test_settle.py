@@ -274,6 +274,17 @@ def test_a_region_too_small_is_an_error(scene_data, write_scene):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
+def test_a_region_mostly_inside_of_a_table_is_blamed_on_it(scene_data, write_scene, monkeypatch):
+    from mitsplat import place
+    from mitsplat.drop import drop_of
+
+    monkeypatch.setattr(place, "_DRAWS", 1)
+    rng = np.random.default_rng(0)
+    scene_data["region"] = {"min": [-0.2, -0.2, -0.09], "max": [0.2, 0.2, 0.01]}
+    with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside of 'table', settle"):
+        drop_of(load_scene(write_scene(scene_data)), lambda text: None).draw_poses((0,), rng)
+
+
 def test_a_scene_without_colliders_is_an_error(scene_data, write_scene):
     scene_data["shapes"][0]["collider"] = False
     with pytest.raises(InputError, match="something to rest on"):

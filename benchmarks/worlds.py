@@ -12,6 +12,7 @@ from newton.solvers import SolverMuJoCo
 from numpy.typing import NDArray
 
 from mitsplat import physics
+from mitsplat.friction import PairFrictionSolver
 from mitsplat.physics import Body, Collider, World, run_to_rest
 
 FloatArray = NDArray[np.float64]
@@ -63,7 +64,7 @@ class Batch:
         SolverMuJoCo.register_custom_attributes(builder)
         builder.replicate(one, len(starts))
         model = builder.finalize(device=device)
-        self._solver = SolverMuJoCo(
+        self._solver = PairFrictionSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics._SOLVER_OPTIONS
         )
         self._solver.mjw_model.opt.warn_overflow = 0

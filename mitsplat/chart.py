@@ -144,10 +144,19 @@ def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
     Raises:
         InputError: If the tolerance is negative.
     """
-    if not tolerance >= 0:
-        raise InputError(f"tolerance must be at least 0 (got {tolerance})")
+    check_tolerance(tolerance)
     within = [row for row in rows if row.name in PRESETS and row.rmse <= tolerance]
     return min(within, key=lambda row: row.seconds)
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Refuse what no error can be within.
+
+    Raises:
+        InputError: If it is negative or not a number.
+    """
+    if not tolerance >= 0:
+        raise InputError(f"tolerance must be at least 0 (got {tolerance})")
 
 
 def choose_preset(
@@ -163,6 +172,7 @@ def choose_preset(
     Raises:
         InputError: If the tolerance is negative, or the scene file is not as it should be.
     """
+    check_tolerance(tolerance)
     steps = STEPS[: len(PRESETS)]
     rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, note=note)
     return cheapest(rows, tolerance)

@@ -90,8 +90,11 @@ class PlacedSurface:
         near = points[((points > self.bounds[0] - reach) & (points < self.bounds[1] + reach)).all(axis=1)]
         if not len(near):
             return reach
-        local = (near - self._pose[:3, 3]) @ self._pose[:3, :3]
-        return min(reach, float(self._surface.signed_distances(local).min()))
+        return min(reach, float(self.signed_distances(near).min()))
+
+    def signed_distances(self, points: FloatArray) -> NDArray[np.float32]:
+        """Distance of each world-space point (N, 3) [m] to the surface; negative inside."""
+        return self._surface.signed_distances((points - self._pose[:3, 3]) @ self._pose[:3, :3])
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ class DatasetSummary:
         dropped: What was not labelled, by the reasons of :class:`mitsplat.label.Labels`.
         marked: Labelled instances below a threshold, by the marks of :class:`mitsplat.label.InstanceLabel`.
         contact_sheet: Picture of some frames with their labels drawn.
+        unlabelled: Whether there are objects, but no image has a label.
     """
 
     path: Path
@@ -69,6 +70,7 @@ class DatasetSummary:
     dropped: dict[str, int]
     marked: dict[str, int]
     contact_sheet: Path
+    unlabelled: bool = False
 
 
 def write_dataset(
@@ -106,12 +108,13 @@ def write_dataset(
         settle: What to use instead of :func:`mitsplat.settle.settle_layout`.
 
     Raises:
-        InputError: If ``frames`` or a format is not available, the folder cannot be written, is in use, holds
-            something else, or holds a dataset of another scene; nothing is rendered then. Later, if what is in it is
-            changed by someone else.
+        InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
+            :mod:`mitsplat.prospects`), the folder cannot be written, is in use, holds something else, or holds a
+            dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else.
         MissingResourceError: If the disk is full.
         PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
     """
+    from mitsplat.prospects import refuse, run_faults
     from mitsplat.scene import layout_of
 
     out = Path(out)
@@ -125,6 +128,8 @@ def write_dataset(
         raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
     catalogue = Catalogue.of(scene)
     wanted = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
+    if render is None and settle is None:
+        refuse(scene, run_faults(scene, wanted, out=out, workers=workers, elsewhere=cluster is not None))
     content = content_of(scene, catalogue)
     part = None if shard is None else shard.to_json(count)
     with open_folder(out, content, scene.path, part, resume=resume, overwrite=overwrite) as manifest:
@@ -189,6 +194,7 @@ class FrameCounts:
     instances: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     marked: Counter[str] = field(default_factory=Counter)
+    placed: bool = False
 
     def add(self, record: Record) -> None:
         """Count a frame."""
@@ -196,6 +202,7 @@ class FrameCounts:
         self.images[record["split"]] += 1
         self.instances.update(label["class"] for label in labels["instances"])
         self.dropped.update(labels["dropped"])
+        self.placed |= bool(labels["instances"] or any(labels["dropped"].values()))
         self.marked.update(mark for label in labels["instances"] for mark in label["marks"])
 
     def summary(self, out: Path, rendered: int) -> DatasetSummary:
@@ -209,4 +216,5 @@ class FrameCounts:
             dropped=dict(self.dropped),
             marked=dict(sorted(self.marked.items())),
             contact_sheet=out / SHEET,
+            unlabelled=self.placed and not self.instances,
         )

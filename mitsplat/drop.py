@@ -21,9 +21,9 @@ from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.physics import OVERFLOW, Body, Collider, MujocoWorld, Outcome, WarpWorld, World, all_pieces, run_to_rest
 from mitsplat.place import Item, draw_poses, fixed_pose
-from mitsplat.scene import ENCLOSURE, Scene, bin_walls
+from mitsplat.scene import Scene
 from mitsplat.settle import NOTHING_TO_REST, FloatArray, Instance, Layout, Progress, RestCertificate
-from mitsplat.spec import PILE_HEIGHT, Region
+from mitsplat.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
@@ -84,7 +84,7 @@ class Drop:
         walls = self._add_colliders(progress)
         self._contact_finder = ContactFinder(all_pieces((part.body for part in self._objects), self._colliders))
         self._check_given_poses()
-        self._bounds = _enclosure(scene.spec.region, [item.bounds for item in self._obstacles], walls)
+        self._bounds = enclosed_bounds(scene.spec.region, [item.bounds for item in self._obstacles], walls)
         if scene.spec.settle.arrangement == "pile":
             self._bounds[1][2] += PILE_HEIGHT
 
@@ -288,8 +288,19 @@ class Drop:
         size = np.subtract(region.max, region.min)
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
-            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m, "
+            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m{self._in_way()}, "
             f"settle.arrangement {arrangement})"
+        )
+
+    def _in_way(self) -> str:
+        """Of what takes most of the region: how much, and its name; empty if nothing takes a tenth."""
+        points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
+        taken = [float((item.signed_distances(points) < 0).mean()) for item in self._obstacles]
+        worst = int(np.argmax(taken))
+        return (
+            f", {taken[worst]:.0%} of which are inside of {self._obstacles[worst].name!r}"
+            if taken[worst] >= 0.1
+            else ""
         )
 
     def _disarray(
@@ -362,25 +373,3 @@ def _pieces(
 ) -> tuple[trimesh.Trimesh, ...]:
     progress(f"convex pieces of {name}")
     return convex_pieces(mesh, threshold=threshold)
-
-
-def _enclosure(region: Region, bounds: Sequence[FloatArray], walls: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Corners of what centres of mass must stay in: the outer faces of the walls beside the region, else all colliders.
-
-    Args:
-        region: Where objects start.
-        bounds: Bounding box of each collider, shape (2, 3) [m].
-        walls: Positions of the colliders that are an enclosure.
-    """
-    low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
-    high[2] = max(high[2], region.max[2])
-    for axis in (0, 1):
-        across = 1 - axis
-        for wall in (bounds[position] for position in walls):
-            if wall[0][across] > region.min[across] or wall[1][across] < region.max[across]:
-                continue
-            if wall[0][axis] >= region.max[axis]:
-                high[axis] = min(high[axis], wall[1][axis])
-            if wall[1][axis] <= region.min[axis]:
-                low[axis] = max(low[axis], wall[0][axis])
-    return low, high

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsplat.contacts import ContactFinder, newton_hull
+from mitsplat.friction import PairFrictionSolver, pair_friction
 from mitsplat.mesh import MassProperties, join_meshes
 
 FloatArray = NDArray[np.float64]
@@ -38,10 +39,10 @@ _MEAN_TIME = 0.05  # over which speeds are told [s]
 # Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
 # 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
 _CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
-# Spin and roll friction [m], at most these shares of the size: round parts stop, thin ones do not stand on their rim.
-_TORSIONAL, _ROLLING = (5e-3, 0.1), (5e-4, 0.01)
+# Radius of contact and length of roll friction [m], at most these shares of the size: round parts stop, thin ones do
+# not stand on their rim. See :mod:`mitsplat.friction`.
+_CONTACT_RADIUS, _ROLLING = (0.01, 0.2), (5e-4, 0.01)
 _WITH_ROLL, _WITHOUT_ROLL = 6, 4  # dimensions of a contact: one across, two of sliding, spin, and two of rolling
-_LEAST_FRICTION = 2e-5  # below it MuJoCo divides by almost nothing
 # Impedance of contacts at their surface and 1 mm deep: at MuJoCo's default of 0.9, a nut that carries a plate of a
 # hundred times its mass sinks by 1 mm. MuJoCo's own contacts, which flicker, come to rest less often when stiffer.
 _IMPEDANCE_WARP, _IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
@@ -56,6 +57,16 @@ _SOLVER_OPTIONS: dict[str, Any] = {
     "include_sites": False,
     "kinematic_switchable_roots": False,
 }
+# The stages of mj_step (mj_forward, then the integrator) for models without sensors, before and after collision.
+_BEFORE_CONTACTS = (
+    *(mujoco.mj_checkPos, mujoco.mj_checkVel),
+    *(mujoco.mj_fwdKinematics, mujoco.mj_makeM, mujoco.mj_factorM),
+)
+_AFTER_CONTACTS = (
+    *(mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_transmission, mujoco.mj_projectConstraint),
+    *(mujoco.mj_fwdVelocity, mujoco.mj_fwdActuation, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint),
+    *(mujoco.mj_checkAcc, mujoco.mj_implicit),
+)
 # Some kernels are compiled for the number of bodies: bodies without shape fill it up to a multiple of this.
 _BATCH = 4
 
@@ -229,7 +240,7 @@ class WarpWorld(World):
         self._timestep = timestep
         model = _build_model(bodies, colliders, _IMPEDANCE_WARP)
         contacts = max(8, int(capacity * max_contacts(len(bodies), model.shape_count)))
-        self._solver = SolverMuJoCo(
+        self._solver = PairFrictionSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
         )
         # Overflow is read from flags: the kernels would print it at every step.
@@ -286,7 +297,7 @@ class MujocoWorld(World):
 
     def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
         super().__init__(bodies, timestep=timestep)
-        solver = SolverMuJoCo(
+        solver = PairFrictionSolver(
             _build_model(bodies, colliders, _IMPEDANCE_MUJOCO), use_mujoco_cpu=True, **_SOLVER_OPTIONS
         )
         self._model, self._data = solver.mj_model, solver.mj_data
@@ -314,10 +325,24 @@ class MujocoWorld(World):
         self._data.qvel[: of_origin.size] = of_origin.ravel()
 
     def _advance(self) -> None:
-        mujoco.mj_step(self._model, self._data, nstep=_STEPS)
+        for _ in range(_STEPS):
+            self._step()
         full = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
         if any(self._data.warning[kind].number for kind in full):
             raise ContactOverflow
+
+    def _step(self) -> None:
+        """``mj_step`` for this integrator, but with the friction of :mod:`mitsplat.friction`.
+
+        Between what it calls there is no callback where contacts are known and their constraints are not made yet.
+        """
+        model, data = self._model, self._data
+        for stage in (*_BEFORE_CONTACTS, mujoco.mj_collision):
+            stage(model, data)
+        contacts, friction = data.contact, model.geom_friction
+        contacts.friction[:] = pair_friction(friction[contacts.geom[:, 0]], friction[contacts.geom[:, 1]])
+        for stage in _AFTER_CONTACTS:
+            stage(model, data)
 
     def _let_roll(self, rolls: bool) -> None:
         self._model.geom_condim[:] = _WITHOUT_ROLL if rolls else _WITH_ROLL
@@ -470,7 +495,7 @@ def _build_scene(
     builder.validate_inertia_detailed = True  # in Python: the other way compiles a kernel for 4 s
     SolverMuJoCo.register_custom_attributes(builder)
     for collider in colliders:
-        # MuJoCo takes the larger friction of a pair: size 0 leaves spin and roll friction to the bodies.
+        # Size 0 leaves the lengths of spin and roll friction to the bodies.
         config = _shape_config(collider.friction, size=0.0)
         if collider.box is not None:
             size, pose = collider.box
@@ -509,9 +534,9 @@ def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeC
         density=0.0,
         ke=1 / (_CONTACT_TIME * _DAMPING_RATIO) ** 2,
         kd=2 / _CONTACT_TIME,
-        mu=max(friction, _LEAST_FRICTION),
-        mu_torsional=max(_LEAST_FRICTION, min(_TORSIONAL[0], _TORSIONAL[1] * size)),
-        mu_rolling=max(_LEAST_FRICTION, min(_ROLLING[0], _ROLLING[1] * size)),
+        mu=friction,
+        mu_torsional=min(_CONTACT_RADIUS[0], _CONTACT_RADIUS[1] * size),
+        mu_rolling=min(_ROLLING[0], _ROLLING[1] * size),
         margin=0.0,
         gap=0.0,
     )

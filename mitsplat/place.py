@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.clearance import PlacedSurface, Surface, clearance
 from mitsplat.settle import FloatArray
-from mitsplat.spec import PILE_HEIGHT, Arrangement, ObjectPose, Region
+from mitsplat.spec import Arrangement, ObjectPose, Region
+from mitsplat.walls import PILE_HEIGHT
 
 _PLACES = 200  # positions tried for an object before all are drawn anew
 _PLACES_IN_LAYER = 20  # of a pile

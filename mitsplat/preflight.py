@@ -12,11 +12,14 @@ import trimesh
 
 from mitsplat.align import measure_offset
 from mitsplat.assets import Asset, opaque_core
+from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.isolate import NEEDLE, find_floaters
 from mitsplat.mesh import mass_properties
+from mitsplat.prospects import doubts, run_faults
 from mitsplat.scene import Scene, load_scene, plan_frame
 from mitsplat.settle import warp_settings
+from mitsplat.writers import Catalogue
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -157,6 +160,12 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
 def check_scene(scene: Scene) -> Iterator[Finding]:
     """Findings on a scene, and what is wrong with each of its assets, whose names they begin with."""
     spec = scene.spec
+    try:
+        Catalogue.of(scene)
+    except InputError as error:
+        yield Finding("formats", False, str(error), "change output.formats, or what they need")
+    faults = list(run_faults(scene))
+    yield from faults or doubts(scene)
     loaded = [asset for asset in (scene.environment, *scene.assets) if asset is not None]
     assets = {id(asset.splats): asset for asset in loaded}.values()  # several may have one name
     for asset in assets:

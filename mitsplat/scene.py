@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +25,6 @@ from mitsplat.errors import InputError
 from mitsplat.files import is_inside
 from mitsplat.image_check import check_image
 from mitsplat.spec import (
-    PILE_HEIGHT,
     AreaLight,
     Bin,
     Box,
@@ -51,6 +50,7 @@ from mitsplat.spec import (
     Shape,
     SpotLight,
 )
+from mitsplat.walls import bin_walls, enclosure_walls
 from mitsplat.yaml_input import key_place, load_yaml
 
 __all__ = [
@@ -95,9 +95,6 @@ _DRAWN = (
     *("white_balance", "hue", "saturation", "jpeg"),
 )
 """What is drawn anew for every frame."""
-
-ENCLOSURE = "enclosure "
-"""How the names of the shapes begin that an enclosure is written out as."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +188,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         supports = [mesh for shape, mesh in zip(spec.shapes, shape_meshes, strict=True) if shape.collider]
         if spec.environment_collides and environment is not None and environment.mesh is not None:
             supports.append(environment.mesh)
-        walls = _enclosure_walls(spec.enclosure, spec, assets, supports)
+        walls = enclosure_walls(spec.enclosure, spec, assets, supports)
         shape_meshes += [_shape_mesh(wall, folder) for wall in walls]
         spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
     return Scene(
@@ -257,38 +254,6 @@ def scene_json_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
 
 
-def _enclosure_walls(
-    enclosure: Enclosure, spec: SceneSpec, assets: Sequence[Asset], supports: Sequence[trimesh.Trimesh]
-) -> list[Shape]:
-    """The enclosure as five invisible boxes: walls from its floor up to the region's top or a pile's, and a lid.
-
-    Without a margin of its own the largest object finds room between region and walls, but no wall stands where there
-    is nothing to lie on before it.
-    """
-    inner_low, inner_high = np.array(spec.region.min), np.array(spec.region.max)
-    if enclosure.margin is not None:
-        low, high = inner_low - enclosure.margin, inner_high + enclosure.margin
-    else:
-        margin = max((float(asset.mesh.extents.max()) for asset in assets if asset.mesh is not None), default=0.0)
-        bounds = np.array([mesh.bounds for mesh in supports] or [(inner_low, inner_high)])
-        low = np.minimum(inner_low, np.maximum(inner_low - margin, bounds[:, 0].min(axis=0)))
-        high = np.maximum(inner_high, np.minimum(inner_high + margin, bounds[:, 1].max(axis=0)))
-    low[2], high[2] = enclosure.floor, inner_high[2]
-    if spec.settle.arrangement == "pile":
-        high[2] += PILE_HEIGHT
-    middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
-    walls = []
-    for name, axis, side in (("-x", 0, -1), ("+x", 0, 1), ("-y", 1, -1), ("+y", 1, 1), ("lid", 2, 1)):
-        position = middle.copy()
-        position[axis] += side * (size[axis] + thickness) / 2
-        extents = size + 2 * thickness
-        extents[axis] = thickness
-        extents[2] = thickness if name == "lid" else size[2]
-        box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
-        walls.append(Shape(name=f"{ENCLOSURE}{name}", box=box))
-    return walls
-
-
 @contextmanager
 def _blaming(path: Path, *keys: str | int) -> Iterator[None]:
     """Begin the sentence of an InputError with the key of the scene file that led to it."""
@@ -348,23 +313,6 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
     transform[:3, 3] = shape.box.position
     box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
     return box
-
-
-def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
-    """The five boxes that a bin consists of, in world space."""
-    width, depth, height = shape.size
-    edge = shape.thickness
-    # Walls along x are as long as the floor; those along y stand between them, so that no faces coincide.
-    walls = [((width + 2 * edge, depth + 2 * edge, edge), (0.0, 0.0, -edge / 2))]
-    walls += [((width + 2 * edge, edge, height), (0.0, side * (depth + edge) / 2, height / 2)) for side in (-1, 1)]
-    walls += [((edge, depth, height), (side * (width + edge) / 2, 0.0, height / 2)) for side in (-1, 1)]
-    turn = Rotation.from_euler("z", shape.rotate_z, degrees=True).as_matrix()
-    boxes = []
-    for size, middle in walls:
-        transform = np.eye(4)
-        transform[:3, :3], transform[:3, 3] = turn, turn @ middle + shape.position
-        boxes.append(trimesh.creation.box(extents=size, transform=transform))
-    return tuple(boxes)
 
 
 def _split(layout: int, validation: float) -> Literal["train", "val"]:

@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 
     from mitsplat.scene import Scene
 
+MODULES = ("clearance", "contacts", "drop", "friction", "mesh", "physics", "place", "walls")
+"""Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
+_SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
+LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
+
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None]
 
@@ -214,9 +219,9 @@ def _scene_hash(scene: Scene) -> str:
                 add(array.shape)
                 digest.update(np.ascontiguousarray(array).tobytes())
 
-    for name in ("coacd", "mujoco", "mujoco-warp", "newton", "numpy", "scipy", "trimesh", "warp-lang"):
+    for name in LIBRARIES:
         add(name, version(name))
-    for module in ("clearance", "contacts", "drop", "mesh", "physics", "place"):
+    for module in MODULES:
         digest.update((Path(__file__).parent / f"{module}.py").read_bytes())
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)

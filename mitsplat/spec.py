@@ -62,9 +62,6 @@ EmittedColour = Annotated[
 ]
 
 
-PILE_HEIGHT = 1.0
-"""How far above the drop region the objects of a pile may start [m]."""
-
 Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
 
 
@@ -99,7 +96,9 @@ class Shape(StrictModel):
         description="Whether light is traced against it though it is not rendered: a table that only splats show.",
     )
     colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
-    friction: NonNegativeFloat = Field(0.6, description="Coulomb friction coefficient.")
+    friction: NonNegativeFloat = Field(
+        0.6, description="Coulomb friction coefficient; what touches has the geometric mean of both sides'."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Shape:
@@ -380,7 +379,9 @@ class Randomise(StrictModel):
         None, description="Quality of a JPEG compression before the image is written; none if absent."
     )
     friction: PositiveRange = Field(
-        (1.0, 1.0), description="Factor on the friction of each entry of objects, drawn once for a layout."
+        (1.0, 1.0),
+        description="Factor on the friction of each entry of objects, drawn once for a layout; its square root "
+        "is the factor on contacts with the table.",
     )
     light_intensity: PositiveRange = Field((1.0, 1.0), description="Factor on each light, drawn once for a layout.")
 

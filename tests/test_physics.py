@@ -15,10 +15,10 @@ pytestmark = pytest.mark.usefixtures("physics")
 EVERYWHERE = np.full(3, -1e3), np.full(3, 1e3)
 
 
-def body_of(mesh, friction=0.5, density=3000.0):
+def body_of(*pieces, friction=0.5, density=3000.0):
     from mitsplat.physics import Body
 
-    return Body((mesh,), mass_properties(mesh, (mesh,), density=density), friction)
+    return Body(pieces, mass_properties(trimesh.util.concatenate(list(pieces)), pieces, density=density), friction)
 
 
 def table(pose=None, friction=0.5):
@@ -113,18 +113,97 @@ def test_small_parts_come_to_rest_on_the_table(stepper):
     np.testing.assert_allclose(world.poses[:, :3, 3], first[:, :3, 3], atol=1e-4)
 
 
+FRICTIONS = [(0.2, 0.6), (0.6, 0.2), (0.05, 0.8), (0.8, 0.05), (0.35, 0.5), (0.9, 0.0), (0.0, 0.9), (0.4, 0.4)]
+"""Of a block and of what it lies on."""
+
+
+def inclines(angle, frictions):
+    """Tables side by side that fall towards +x by an angle [rad], and the frame of each one's surface."""
+    frames = [
+        pose_at((0, 1.1 * i, 0)) @ pose_at((0, 0, 0), Rotation.from_euler("y", angle)) for i in range(len(frictions))
+    ]
+    return [table(frame, friction) for frame, friction in zip(frames, frictions, strict=True)], frames
+
+
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_friction_on_an_incline(stepper):
-    """On 20 degrees a block slides from rest by g (sin a - mu cos a) t (t + h) / 2, h the semi-implicit step."""
-    angle = np.radians(20.0)
+    """On 25 degrees a block slides by g (sin a - mu cos a) t (t + h) / 2, mu the geometric mean, h the step."""
+    angle = np.radians(25.0)
+    tables, frames = inclines(angle, [friction for _, friction in FRICTIONS])
+    starts = np.stack([frame @ pose_at((-0.45, 0, 0.005)) for frame in frames])
     block = trimesh.creation.box((0.04, 0.04, 0.01))
-    tilt = pose_at((0, 0, 0), Rotation.from_euler("y", angle))
-    start = tilt @ pose_at((-0.4, 0, 0.005))
-    world = world_of(stepper, [body_of(block, friction=0.2)], [table(tilt, friction=0.0)], [start])
-    run_until(world, 0.8)
-    distance = (world.poses[0, :3, 3] - start[:3, 3]) @ tilt[:3, 0]
-    acceleration = GRAVITY * (np.sin(angle) - 0.2 * np.cos(angle))
-    assert distance == pytest.approx(acceleration * world.time * (world.time + 0.002) / 2, rel=0.003)
+    world = world_of(stepper, [body_of(block, friction=friction) for friction, _ in FRICTIONS], tables, starts)
+    run_until(world, 0.5)
+    way = (world.poses[:, :3, 3] - starts[:, :3, 3]) @ frames[0][:3, 0]
+    acceleration = 2 * way / (world.time * (world.time + 0.002))
+    mu = np.tan(angle) - acceleration / (GRAVITY * np.cos(angle))
+    np.testing.assert_allclose(mu, np.sqrt(np.prod(FRICTIONS, axis=1)), rtol=0.003, atol=1e-4)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_what_slides_on_an_incline(stepper):
+    """A block slides iff tan a > sqrt(mu mu'), whichever of the two is the smoother, on a table or on a slab."""
+    angle = np.radians(20.0)
+    pairs = [(low, (share * np.tan(angle)) ** 2 / low) for share in (0.9, 1.1) for low in (0.1, 0.3, 1.0)]
+    block, slab = trimesh.creation.box((0.02, 0.02, 0.01)), trimesh.creation.box((0.3, 0.1, 0.02))
+    rough = 9.0  # of the tables on which slabs lie, which must not slide themselves
+    tables, frames = inclines(angle, [mu for _, mu in pairs] + [rough] * len(pairs))
+    bodies = [body_of(block, friction=mu) for mu, _ in pairs * 2]
+    bodies += [body_of(slab, friction=mu) for _, mu in pairs]
+    height = [0.005] * len(pairs) + [0.0251] * len(pairs)
+    starts = [frame @ pose_at((-0.1, 0, z)) for frame, z in zip(frames, height, strict=True)]
+    starts += [frame @ pose_at((0, 0, 0.01)) for frame in frames[len(pairs) :]]
+    world = world_of(stepper, bodies, tables, starts)
+    run_until(world, 0.1)  # let them sink in
+    before = world.poses[:, :3, 3]
+    run_until(world, 0.4)
+    way = np.linalg.norm(world.poses[:, :3, 3] - before, axis=1)
+    np.testing.assert_array_equal(way > 0.005, [True] * 3 + [False] * 3 + [True] * 3 + [False] * 9)
+    assert way[way < 0.005].max() < 1e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_friction_of_spin(stepper):
+    """A top on a square foot slows by g m mu sqrt(p^2 + r^2) / I: sliding at the corners, p from the axis, and spin.
+
+    Spin friction of each corner is mu r, r = 10 mm the radius of contact; the cone of both is an ellipsoid.
+    """
+    foot = trimesh.creation.box((0.004, 0.004, 0.004)).apply_translation((0, 0, 0.002))
+    disc = trimesh.creation.box((0.05, 0.05, 0.006)).apply_translation((0, 0, 0.007))
+    tables, frames = inclines(0.0, [mu for _, mu in FRICTIONS])
+    bodies = [body_of(foot, disc, friction=mu) for mu, _ in FRICTIONS]
+    world = world_of(stepper, bodies, tables, frames)
+    run_until(world, 0.1)
+    velocities = np.zeros((len(bodies), 2, 3))
+    velocities[:, 1, 2] = 40.0
+    world.reset(world.poses, velocities)
+    run_until(world, 0.3)
+    mass, mu = bodies[0].mass, np.sqrt(np.prod(FRICTIONS, axis=1))
+    slowing = GRAVITY * mass.mass * mu * np.hypot(0.002 * np.sqrt(2), 0.01) / mass.inertia[2, 2]
+    slowed = (40.0 - world.velocities[:, 1, 2]) / world.time
+    np.testing.assert_allclose(slowed, slowing, rtol=0.01, atol=0.6)
+
+
+def test_mujoco_in_c_is_stepped_as_by_itself(monkeypatch):
+    """With the friction that MuJoCo takes, the stages called one by one leave what mj_step does, to the bit."""
+    import mujoco
+
+    from mitsplat import physics
+
+    box = trimesh.creation.box((0.02, 0.03, 0.01))
+    poses = [pose_at((0.004 * i, 0, 0.02 + 0.03 * i), Rotation.from_rotvec((i, 1, 0.3))) for i in range(5)]
+    ours, own = (world_of("mujoco", [body_of(box)] * 5, [table(friction=0.4)], poses) for _ in range(2))
+
+    def larger(first, second):
+        slide, spin, roll = np.maximum(first, second).T
+        return np.maximum(np.stack([slide, slide, spin, roll, roll], axis=1), 1e-5)
+
+    monkeypatch.setattr(physics, "pair_friction", larger)
+    run_until(ours, 0.6)
+    mujoco.mj_step(own._model, own._data, nstep=300)
+    assert own._data.ncon > 8
+    np.testing.assert_array_equal(ours._data.qpos, own._data.qpos)
+    np.testing.assert_array_equal(ours._data.qvel, own._data.qvel)
 
 
 def test_a_contact_buffer_that_is_too_small_is_noticed():
@@ -193,7 +272,7 @@ def test_an_incline_is_crept_down_by_less_than_a_tenth_of_a_millimetre(stepper):
     """tan 20 = 0.36 < mu = 0.5: a block at rest stays; 3 s."""
     block = trimesh.creation.box((0.04, 0.04, 0.01))
     tilt = pose_at((0, 0, 0), Rotation.from_euler("y", 20, degrees=True))
-    world = world_of(stepper, [body_of(block)], [table(tilt, friction=0.0)], [tilt @ pose_at((0, 0, 0.005))])
+    world = world_of(stepper, [body_of(block)], [table(tilt)], [tilt @ pose_at((0, 0, 0.005))])
     run_until(world, 0.2)  # let it sink in
     before = world.poses
     run_until(world, 3.2)

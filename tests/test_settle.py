@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import gc
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -139,6 +141,45 @@ def test_a_layout_is_settled_once(scene_data, write_scene, tmp_path, monkeypatch
     assert settled == [0, 1, 0, 0, 0]
 
 
+def test_code_that_decides_layouts_is_hashed():
+    """Whatever mitsplat's modules of MODULES take from others of its modules is a type, or hashed as a value."""
+    from mitsplat import settle
+
+    folder = Path(settle.__file__).parent
+    given = {
+        *("assets.Asset", "cache.cache_folder", "cache.keep_file", "errors.InputError", "scene.Scene"),
+        *(f"settle.{name}" for name in ("FloatArray", "Instance", "Layout", "Progress", "RestCertificate")),
+        "settle.NOTHING_TO_REST",
+        *(f"spec.{name}" for name in ("Arrangement", "Bin", "Box", "Enclosure", "ObjectPose", "Region", "SceneSpec")),
+        "spec.Shape",
+    }
+    for module in settle.MODULES:
+        for node in ast.walk(ast.parse((folder / f"{module}.py").read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mitsplat."):
+                source = node.module.removeprefix("mitsplat.")
+                taken = {f"{source}.{name.name}" for name in node.names}
+                assert source in settle.MODULES or taken <= given, f"{module} takes {taken - given}"
+
+
+@pytest.mark.parametrize("change", [("walls", "PILE_HEIGHT = 1.0", "PILE_HEIGHT = 0.9"), ("friction", "sqrt", "cbrt")])
+def test_another_rule_settles_anew(change, scene_data, write_scene, tmp_path, monkeypatch):
+    """The height of piles, the walls of bins and the rule of friction are part of what a layout is kept by."""
+    from mitsplat import settle
+
+    module, text, other = change
+    scene = load_scene(write_scene(scene_data))
+    package = tmp_path / "mitsplat"
+    shutil.copytree(Path(settle.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(settle, "__file__", str(package / "settle.py"))
+    kept = settle._scene_hash.__wrapped__(scene)
+    (package / "render.py").write_text("")
+    assert settle._scene_hash.__wrapped__(scene) == kept
+    code = (package / f"{module}.py").read_text()
+    assert text in code
+    (package / f"{module}.py").write_text(code.replace(text, other))
+    assert settle._scene_hash.__wrapped__(scene) != kept
+
+
 @pytest.mark.slow
 def test_processes_settle_what_one_process_settles(scene_data, write_scene):
     scene_data["settle"] = {"stepper": "mujoco"}
@@ -231,6 +272,17 @@ def test_a_region_too_small_is_an_error(scene_data, write_scene):
     scene_data["region"] = {"min": [-0.05, -0.05, 0.01], "max": [0.05, 0.05, 0.08]}
     with pytest.raises(InputError, match=r"scene.yaml: region must be large enough .*the 61 of a layout"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+
+
+def test_a_region_mostly_inside_of_a_table_is_blamed_on_it(scene_data, write_scene, monkeypatch):
+    from mitsplat import place
+    from mitsplat.drop import drop_of
+
+    monkeypatch.setattr(place, "_DRAWS", 1)
+    rng = np.random.default_rng(0)
+    scene_data["region"] = {"min": [-0.2, -0.2, -0.09], "max": [0.2, 0.2, 0.01]}
+    with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside of 'table', settle"):
+        drop_of(load_scene(write_scene(scene_data)), lambda text: None).draw_poses((0,), rng)
 
 
 def test_a_scene_without_colliders_is_an_error(scene_data, write_scene):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
 from mitsplat.cli.options import JsonLog, command_log, progress_bar
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, PartialResultError
 from mitsplat.quality import PresetName
 
 if TYPE_CHECKING:
@@ -94,7 +95,9 @@ def render(
             if quality is not None:
                 raise InputError("--quality and --tolerance both choose the preset: give one of them")
             from mitsplat.chart import choose_preset
+            from mitsplat.prospects import refuse, run_faults
 
+            refuse(loaded, run_faults(loaded))
             with progress_bars() as progress:
                 best = choose_preset(scene, tolerance, overrides=overrides, allow_outside=allow_outside, note=progress)
             typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
@@ -110,7 +113,7 @@ def render(
                 overwrite=overwrite,
                 progress=progress,
             )
-        _tell_dataset(summary)
+        _tell_dataset(summary, whole=part is None)
 
 
 def merge(
@@ -133,11 +136,17 @@ def merge(
     _tell_dataset(summary)
 
 
-def _tell_dataset(summary: DatasetSummary) -> None:
+def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
+    """Say what a dataset holds; without any label it is not what was asked for, unless it is a part of one."""
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
     typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
     typer.echo(f"contact sheet: {summary.contact_sheet}")
+    if summary.unlabelled and whole:
+        raise PartialResultError(
+            f"{summary.path}: no image has a label (not labelled: {_counts(summary.dropped)}); "
+            "`mitsplat check` and `mitsplat preview` show what the cameras see"
+        )
 
 
 def chart(
@@ -159,10 +168,11 @@ def chart(
     from rich.console import Console
     from rich.table import Table
 
-    from mitsplat.chart import cheapest, draw_chart, measure_steps, write_csv
+    from mitsplat.chart import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
+    check_tolerance(tolerance)
     with progress_bar() as progress:
         rows = measure_steps(
             scene, frames=frames, overrides=_overrides(size=size), allow_outside=allow_outside, note=progress
@@ -233,10 +243,12 @@ def preview(
     from PIL import Image
 
     from mitsplat.frame import render_frame
+    from mitsplat.prospects import count_faults, image_faults, layout_faults, refuse
     from mitsplat.scene import load_scene
     from mitsplat.sheet import layer_sheet
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
+    refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
     rendered = render_frame(loaded, frame)
     Image.fromarray(layer_sheet(rendered) if layers else rendered.image).save(out)
     typer.echo(f"picture: {out}")
@@ -262,6 +274,7 @@ def settle(
         raise InputError(f"--out must be in a folder that exists (got {out})")
     from rich.console import Console
 
+    from mitsplat.prospects import count_faults, layout_faults, refuse
     from mitsplat.rest import certificate_table, write_preview
     from mitsplat.scene import load_scene
     from mitsplat.settle import settle_layouts
@@ -272,6 +285,7 @@ def settle(
         raise InputError(
             f"--layouts must be 1 to {loaded.spec.output.layouts}, the scene's output.layouts (got {wanted})"
         )
+    refuse(loaded, chain(count_faults(loaded), layout_faults(loaded)))
     with Console(stderr=True).status("settling") as status:
         found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
         settled = sorted(found, key=lambda layout: layout.index)

@@ -19,7 +19,6 @@ from test_dataset import contents, render, settle, write
 from test_faults import KilledOnce
 
 from mitsplat import cluster
-from mitsplat.audit import audit_dataset
 from mitsplat.cluster import Cluster
 from mitsplat.engine import LostWorkersError
 from mitsplat.errors import InputError, MissingResourceError

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.variant import one_at_a_time
+from mitsplat.warp_start import init_warp
 
 if TYPE_CHECKING:
     import trimesh
@@ -129,6 +131,7 @@ class Layout:
         )
 
 
+@one_at_a_time
 def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None, cached: bool = True) -> Layout:
     """Drop the objects of one layout until they rest. The scene's seed and ``index`` decide the result.
 
@@ -238,7 +241,7 @@ def warp_settings(progress: Progress | None = None) -> Iterator[None]:
     kept = wp.config.log_level, wp.config.enable_backward
     wp.config.log_level, wp.config.enable_backward = wp.LOG_ERROR, False
     try:
-        wp.init()  # type: ignore[no-untyped-call]
+        init_warp()
         compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
         if progress is not None and not any(compiled):
             progress("compiling physics, once (about a minute)")

@@ -17,12 +17,14 @@ from trimesh.visual.material import PBRMaterial
 from mitsplat.colour import decode_srgb
 from mitsplat.composite import black_body_colour
 from mitsplat.errors import InputError
+from mitsplat.kinds import refuse_others
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
 from mitsplat.variant import ensure_variant
 
 FloatArray = npt.NDArray[np.float64]
 
+_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
 _DIELECTRIC_SPECULAR = 0.04
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
@@ -92,6 +94,7 @@ def read_parts(
     source = "mesh"
     if isinstance(mesh, str | Path):
         source = str(mesh)
+        refuse_others(Path(mesh), "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
         if not Path(mesh).is_file():
             raise InputError(f"{source}: no such mesh file")
         try:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.errors import InputError
 from mitsplat.variant import one_at_a_time
 from mitsplat.warp_start import init_warp
 
@@ -145,8 +146,14 @@ def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None,
         cached: Whether a layout that was settled before is taken from the cache, and this one kept there.
 
     Raises:
-        InputError: If the region is too small for the objects, or no draw of poses comes to rest within the limits.
+        InputError: If the index is no layout's, the region is too small for the objects, or no draw of poses comes to
+            rest within the limits.
     """
+    from mitsplat.scene import whole
+
+    index = whole(index, "layout")
+    if index < 0:
+        raise InputError(f"layout must be at least 0 (got {index})")
     path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
     if cached:
         with suppress(OSError, ValueError, KeyError, TypeError):  # damaged or missing: settled anew

@@ -71,9 +71,9 @@ def __dir__() -> list[str]:
 
 
 def _register_plugins(_old: str | None = None, new: str | None = None) -> None:
-    from mitsplat.plugins import register
+    from mitsplat.variant import register_plugins
 
-    register(new)
+    register_plugins(new)
 
 
 _mi.detail.add_variant_callback(_register_plugins)

@@ -32,6 +32,7 @@ from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
 from mitsplat.trace import RAYS_PER_LAUNCH, render_mesh, trace_radiance
+from mitsplat.variant import one_at_a_time
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -102,6 +103,7 @@ class BakeSettings:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
 
 
+@one_at_a_time
 def bake_asset(
     mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
     *,

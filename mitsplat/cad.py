@@ -17,11 +17,14 @@ from trimesh.visual.material import PBRMaterial
 from mitsplat.colour import decode_srgb
 from mitsplat.composite import black_body_colour
 from mitsplat.errors import InputError
+from mitsplat.kinds import refuse_others
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
+from mitsplat.variant import ensure_variant
 
 FloatArray = npt.NDArray[np.float64]
 
+_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
 _DIELECTRIC_SPECULAR = 0.04
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
@@ -91,6 +94,7 @@ def read_parts(
     source = "mesh"
     if isinstance(mesh, str | Path):
         source = str(mesh)
+        refuse_others(Path(mesh), "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
         if not Path(mesh).is_file():
             raise InputError(f"{source}: no such mesh file")
         try:
@@ -150,6 +154,7 @@ def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool =
 
     Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
     """
+    ensure_variant()
     shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE if clay else _bsdf(part)) for k, part in enumerate(parts)}
     scene: mi.Scene = mi.load_dict({"type": "scene", **shapes, **lights})
     return scene
@@ -196,6 +201,7 @@ def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
     Raises:
         InputError: If the name is unknown, or there is no light at all.
     """
+    ensure_variant()
     if light == "uniform":
         return {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
     if light == "studio":
@@ -209,6 +215,7 @@ def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
 
 def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]:
     """Mitsuba's description of one light; images of environments are relative to ``folder``."""
+    ensure_variant()
     colour = np.asarray(light.colour)
     if light.kind != "environment" and light.temperature is not None:
         colour = colour * black_body_colour(light.temperature)

@@ -24,7 +24,7 @@ from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
 from mitsplat.budget import TYPICAL, WorkerMemory
-from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError, exit_status, sentence_of
 from mitsplat.shared_arrays import SharedArrays
 
 Made = TypeVar("Made", covariant=True)
@@ -92,7 +92,9 @@ class Failure:
     def of(cls, error: Exception) -> Failure:
         """The failure that the exception being handled is."""
         sentence = next((kind for kind in _SENTENCES if isinstance(error, kind)), None)
-        return cls(sentence, type(error).__name__, str(error), traceback.format_exc())
+        if sentence is None:  # what ends the command line with the same status
+            sentence = {2: InputError, 3: MissingResourceError}.get(exit_status(error) or 0)
+        return cls(sentence, type(error).__name__, sentence_of(error), traceback.format_exc())
 
     def error(self, frame: int) -> Exception:
         """The exception to raise for it where the frames are wanted."""
@@ -441,11 +443,9 @@ def _work(pipe: Connection, make: MakeFrame[Result]) -> None:
         while True:
             index = pipe.recv()
             try:
-                result = make(index, lambda text: pipe.send(Told(text)))
+                pipe.send(Finished(make(index, lambda text: pipe.send(Told(text)))))
             except Exception as error:  # noqa: BLE001 - the parent raises it
                 pipe.send(Failure.of(error))
-            else:
-                pipe.send(Finished(result))
 
 
 def _end_with_parent() -> None:

@@ -24,7 +24,6 @@ from mitsplat.plugins.device import plain_mesh
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.render import (
     Layers,
-    ensure_variant,
     make_integrator,
     make_splats_shape,
     render_layers,
@@ -34,6 +33,7 @@ from mitsplat.scene import FramePlan, Scene, layout_of, plan_frame
 from mitsplat.settle import Layout, settle_layout
 from mitsplat.spec import EnvironmentLight, LightSpec
 from mitsplat.splats import Splats
+from mitsplat.variant import ensure_variant, one_at_a_time
 
 NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
 """Splats of a proxy that only receives and casts shadows."""
@@ -84,6 +84,7 @@ class Frame:
         return bytes(data)
 
 
+@one_at_a_time
 def render_frame(
     scene: Scene, index: int, *, quality: str | Quality | None = None, layout: Layout | None = None
 ) -> Frame:
@@ -103,7 +104,8 @@ def render_frame(
     plan = plan_frame(scene, index)
     if not isinstance(quality, Quality):
         quality = replace(resolve_quality(quality or scene.spec.quality), **scene.spec.rendering.model_dump())
-    stage = _Studio.of(scene, quality)
+    ensure_variant()
+    stage = _Studio.of(scene, quality, str(mi.variant()))
     if layout is None:
         with _timed(seconds, "settle"):
             layout = stage.settle(layout_of(scene, index))
@@ -172,7 +174,6 @@ class _Studio:
     """What the frames of one scene share: the integrator with its uploads, and the shapes of the current layout."""
 
     def __init__(self, scene: Scene, quality: Quality) -> None:
-        ensure_variant()
         self.scene = scene
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self.static = self._static_shapes()
@@ -180,8 +181,8 @@ class _Studio:
 
     @staticmethod
     @lru_cache(maxsize=2)
-    def of(scene: Scene, quality: Quality) -> _Studio:
-        """The studio of a scene, kept for the next frame."""
+    def of(scene: Scene, quality: Quality, variant: str) -> _Studio:
+        """The studio of a scene under a variant, kept for the next frame."""
         return _Studio(scene, quality)
 
     @lru_cache(maxsize=4)  # noqa: B019 - a studio lives as long as its cache

@@ -11,14 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
-from mitsplat.llvm import check_llvm
 from mitsplat.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.splats import Splats
+from mitsplat.variant import ensure_variant as ensure_variant
+from mitsplat.variant import one_at_a_time
 
 FloatArray = npt.NDArray[np.float32]
-
-VARIANT = "llvm_ad_rgb"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,18 +52,6 @@ class Layers:
     normal: FloatArray
     light: FloatArray
     highlight: FloatArray
-
-
-def ensure_variant() -> None:
-    """Choose ``llvm_ad_rgb`` unless the user has chosen a variant that the plugins can run in.
-
-    Raises:
-        MissingResourceError: If Dr.Jit has no usable LLVM.
-    """
-    if mi.variant() is None or mi.variant().startswith(("scalar", "llvm")):
-        check_llvm()
-    if mi.variant() is None or mi.variant().startswith("scalar"):
-        mi.set_variant(VARIANT)
 
 
 def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> Any:
@@ -124,6 +111,7 @@ def make_splats_shape(
     return SplatsShape(props, splats=splats, proxy=proxy)
 
 
+@one_at_a_time
 def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "balanced") -> Layers:
     """Render splats alone, with the colours as captured.
 

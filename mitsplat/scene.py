@@ -7,12 +7,13 @@ adding one never shifts another, and any worker may plan any frame in any order.
 from __future__ import annotations
 
 import math
+import operator
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,7 @@ from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.files import is_inside
 from mitsplat.image_check import check_image
+from mitsplat.kinds import refuse_others
 from mitsplat.spec import (
     AreaLight,
     Bin,
@@ -163,6 +165,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         InputError: If the file or something that it names is missing or breaks a rule.
     """
     path = Path(path)
+    refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
     spec = load_yaml(path, SceneSpec, overrides=overrides)
     if not allow_outside:
         _confine(spec, path)
@@ -214,8 +217,21 @@ def _confine(spec: SceneSpec, path: Path) -> None:
                 raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
 
 
+def whole(index: SupportsIndex, name: str) -> int:
+    """An index that an integer of any kind gives.
+
+    Raises:
+        InputError: If it is something else, such as text.
+    """
+    try:
+        return operator.index(index)
+    except TypeError:
+        raise InputError(f"{name} must be a whole number (got {index!r})") from None
+
+
 def layout_of(scene: Scene, index: int) -> int:
     """Layout that frame ``index`` shows."""
+    index = whole(index, "frame")
     if not 0 <= index < scene.num_frames:
         raise InputError(f"{scene.path}: frame must be in 0 to {scene.num_frames - 1} (got {index})")
     return index // scene.spec.output.views
@@ -223,6 +239,7 @@ def layout_of(scene: Scene, index: int) -> int:
 
 def plan_frame(scene: Scene, index: int) -> FramePlan:
     """The plan of frame ``index``, from (seed, index) alone."""
+    index = whole(index, "frame")
     spec, layout = scene.spec, layout_of(scene, index)
     view = index - layout * spec.output.views
     time = view / max(1, spec.output.views - 1)

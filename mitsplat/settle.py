@@ -17,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.errors import InputError
+from mitsplat.variant import one_at_a_time
+from mitsplat.warp_start import init_warp
 
 if TYPE_CHECKING:
     import trimesh
@@ -134,6 +137,7 @@ class Layout:
         )
 
 
+@one_at_a_time
 def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None, cached: bool = True) -> Layout:
     """Drop the objects of one layout until they rest. The scene's seed and ``index`` decide the result.
 
@@ -147,8 +151,14 @@ def settle_layout(scene: Scene, index: int, *, progress: Progress | None = None,
         cached: Whether a layout that was settled before is taken from the cache, and this one kept there.
 
     Raises:
-        InputError: If the region is too small for the objects, or no draw of poses comes to rest within the limits.
+        InputError: If the index is no layout's, the region is too small for the objects, or no draw of poses comes to
+            rest within the limits.
     """
+    from mitsplat.scene import whole
+
+    index = whole(index, "layout")
+    if index < 0:
+        raise InputError(f"layout must be at least 0 (got {index})")
     path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
     if cached:
         with suppress(OSError, ValueError, KeyError, TypeError):  # damaged or missing: settled anew
@@ -243,7 +253,7 @@ def warp_settings(progress: Progress | None = None) -> Iterator[None]:
     kept = wp.config.log_level, wp.config.enable_backward
     wp.config.log_level, wp.config.enable_backward = wp.LOG_ERROR, False
     try:
-        wp.init()  # type: ignore[no-untyped-call]
+        init_warp()
         compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
         if progress is not None and not any(compiled):
             progress("compiling physics, once (about a minute)")

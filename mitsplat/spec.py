@@ -5,6 +5,7 @@ Lengths are metres, angles degrees, z is up; conventions are those of :mod:`mits
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, model_validator
@@ -32,7 +33,10 @@ def _count_range(count: Any) -> Any:
         if count < 1:
             raise ValueError(f"must be >= 1 (got {count})")
         return (count, count)
-    return tuple(count) if isinstance(count, list) else count
+    if not isinstance(count, list | tuple) or len(count) != 2:
+        shown = "nothing" if count is None else json.dumps(count, default=str)
+        raise ValueError(f"must be a whole number, or [least, most] of them (got {shown})")
+    return tuple(count)
 
 
 def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:

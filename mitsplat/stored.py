@@ -127,7 +127,10 @@ def read_content(root: Path) -> dict[str, Any]:
     except ValidationError as error:
         reason = f"dataset.json: {_first(error)}"
         raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        reason = f"dataset.json: {error.strerror}" if root.is_dir() else "no such folder"
+        raise InputError(f"{root} must be a dataset of mitsplat ({reason})") from error
+    except ValueError as error:
         raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
     if len(content["keypoints"]) != len(content["classes"]):
         raise InputError(

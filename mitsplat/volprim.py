@@ -9,10 +9,12 @@ import numpy as np
 
 from mitsplat.camera import Camera
 from mitsplat.splats import Splats
+from mitsplat.variant import ensure_variant
 
 
 def volprim_scene(splats: Splats, camera: Camera) -> Any:
     """Mitsuba scene of the splats as ``ellipsoids``, one sample per pixel, box filter."""
+    ensure_variant()
     count, bands = len(splats), splats.sh.shape[1]
     data = np.concatenate([splats.means, splats.scales, splats.quats], axis=1).astype(np.float32)
     return mi.load_dict(

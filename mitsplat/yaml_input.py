@@ -129,7 +129,7 @@ def _parse(path: Path) -> CommentedMap:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: must be UTF-8 text ({error.reason} at byte {error.start})") from None
+        raise InputError(f"{path}: must be YAML, hence UTF-8 text ({error.reason} at byte {error.start})") from None
     try:
         reader = YAML(typ="rt", pure=True)
         reader.Scanner = _Scanner
@@ -211,6 +211,8 @@ def _finding(
     elif kind == "missing" and isinstance(location[-1], int):
         rule = f"must have {_schema_at(model, location[:-1])['minItems']} items (got {location[-1]})"
     elif kind != "missing":
+        if kind == "tuple_type" and "prefixItems" in (form := _schema_at(model, location)):
+            rule += f" of {len(form['prefixItems'])}"
         rule = f"{rule.replace('Input should', 'must')} (got {_shown(value)})"
     overlaps = [min(len(keys), len(override)) for override in overridden]
     from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))

@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import importlib
 import sys
+from typing import Any
+
+import mitsuba as mi
 
 PLUGINS = ("splats", "opencv_camera", "splat_proxy")
 
 
-def register(variant: str | None) -> None:
-    """Register the plugins under a Mitsuba variant: their classes derive from types that exist once per variant.
-
-    Scalar variants cannot run them and are left alone.
-    """
-    if variant is None or variant.startswith("scalar"):
-        return
+def register() -> None:
+    """Register the plugins under the current variant: their classes derive from types that exist once per variant."""
     for name in PLUGINS:
         module = f"{__name__}.{name}"
         if module in sys.modules:
             importlib.reload(sys.modules[module])
         else:
             importlib.import_module(module)
+
+
+def refuse(variant: str) -> None:
+    """Register, under a variant that cannot run them, plugins that say so when a scene names them."""
+
+    def refused(props: Any) -> Any:
+        raise RuntimeError(
+            f"plugin {props.plugin_name()!r} needs the variant llvm_ad_rgb or cuda_ad_rgb (got {variant})"
+        )
+
+    mi.register_shape("splats", refused)
+    mi.register_sensor("opencv_camera", refused)
+    mi.register_integrator("splat_proxy", refused)

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -23,6 +23,9 @@ from mitsplat.scene import Scene, load_scene
 from mitsplat.settle import warp_settings
 from mitsplat.spec import FORMATS
 from mitsplat.splats import Splats
+
+if TYPE_CHECKING:
+    from mitsplat.take import CaptureResult
 
 WriteScene = Callable[..., Path]
 
@@ -128,6 +131,30 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(clean: Path, tmp_path: Path) -> Path:
     """A copy of the clean dataset, to be damaged."""
     return Path(shutil.copytree(clean, tmp_path / "out"))
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
+    """Rendered photos, and their true cameras."""
+    import rendered
+
+    folder = tmp_path_factory.mktemp("rendered")
+    return folder, rendered.render_capture(folder)
+
+
+@pytest.fixture(scope="session")
+def captured(
+    photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path, CaptureResult]:
+    """Their capture, with one torn photo among them: photos, folder, result."""
+    import rendered
+
+    from mitsplat.take import CaptureSettings, capture_photos
+
+    given, out = tmp_path_factory.mktemp("given"), tmp_path_factory.mktemp("capture")
+    shutil.copytree(photos[0], given, dirs_exist_ok=True)
+    (given / "torn.png").write_bytes((given / "photo00.png").read_bytes()[:5000])
+    return given, out, capture_photos(given, out, CaptureSettings(board=rendered.BOARD))
 
 
 @dataclass(frozen=True, eq=False)

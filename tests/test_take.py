@@ -30,24 +30,6 @@ from mitsplat.sfm import Model
 from mitsplat.take import CaptureResult, CaptureSettings, capture_photos
 
 
-@pytest.fixture(scope="session")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
-    """Rendered photos, and their true cameras."""
-    folder = tmp_path_factory.mktemp("rendered")
-    return folder, rendered.render_capture(folder)
-
-
-@pytest.fixture(scope="session")
-def captured(
-    photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Path, CaptureResult]:
-    """Their capture, with one torn photo among them: photos, folder, result."""
-    given, out = tmp_path_factory.mktemp("given"), tmp_path_factory.mktemp("capture")
-    shutil.copytree(photos[0], given, dirs_exist_ok=True)
-    (given / "torn.png").write_bytes((given / "photo00.png").read_bytes()[:5000])
-    return given, out, capture_photos(given, out, CaptureSettings(board=rendered.BOARD))
-
-
 def test_a_rendered_capture_comes_back(
     photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult]
 ) -> None:

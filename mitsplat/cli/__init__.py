@@ -1,7 +1,7 @@
-"""The command ``mitsplat``: arguments to calls, and errors in one sentence instead of a traceback.
+"""The command ``mitsplat``: arguments to calls, and errors in one sentence, never a traceback.
 
 Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 3 something is missing on the machine,
-4 a result was written that is not whole or misses a threshold, 130 interrupted.
+4 a result was written that is not whole or misses a threshold, 70 a fault of mitsplat, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from typing import Annotated
 import typer
 
 from mitsplat import __version__
-from mitsplat.cli import assets, datasets
-from mitsplat.cli.options import sentence_of
-from mitsplat.errors import InputError, MissingResourceError, PartialResultError, exit_status
+from mitsplat.cli import assets, datasets, fault
+from mitsplat.errors import exit_status, sentence_of
 
 app = typer.Typer(
     help="Labelled training images of settled objects, from Gaussian splats, physics and traced light.",
@@ -55,9 +54,10 @@ def main(args: Sequence[str] | None = None) -> None:
     """
     try:
         app(args)
-    except (InputError, MissingResourceError, PartialResultError, OSError) as error:
-        typer.echo(f"mitsplat: {sentence_of(error)}", err=True)
-        sys.exit(exit_status(error))
+    except Exception as error:  # noqa: BLE001 - the last one who can tell the user
+        status = exit_status(error)
+        typer.echo(f"mitsplat: {fault.tell_fault(error) if status is None else sentence_of(error)}", err=True)
+        sys.exit(fault.STATUS if status is None else status)
 
 
 def _show_version(wanted: bool) -> None:

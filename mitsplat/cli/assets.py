@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -69,6 +70,13 @@ def bake(
     """
     from mitsplat.bake import BakeSettings, bake_asset
 
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out must be a folder (got the file {out})")
+    for option, value in (("--units", units), ("--density", density), ("--friction", friction)):
+        if not 0 < value < math.inf and not (value == 0 and option == "--friction"):
+            raise InputError(f"{option} must be finite and > 0 (got {value})")
+    if seed < 0:
+        raise InputError(f"--seed must be >= 0 (got {seed})")
     result = bake_asset(
         mesh,
         name=name or out.resolve().name,

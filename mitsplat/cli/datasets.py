@@ -52,8 +52,11 @@ def render(
         str | None, typer.Option(help="Of the cluster, or auto; Ray is started on this machine if absent.")
     ] = None,
     resources: Annotated[
-        str, typer.Option(metavar="NAME=AMOUNT,...", help="What a worker on the cluster reserves, such as CPU=4,GPU=1.")
-    ] = "CPU=2",
+        str | None,
+        typer.Option(
+            metavar="NAME=AMOUNT,...", help="What a worker on the cluster reserves, such as CPU=4; CPU=2 if absent."
+        ),
+    ] = None,
     shard: Annotated[
         str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, which `merge` joins; I counts from 1.")
     ] = None,
@@ -89,7 +92,9 @@ def render(
         from mitsplat.scene import load_scene
 
         part = None if shard is None else Shard.parse(shard)
-        cluster = Cluster(address, Cluster.parse_resources(resources)) if engine == "ray" else None
+        if engine != "ray" and (address is not None or resources is not None):
+            raise InputError("--address and --resources are of a cluster: give --engine ray as well")
+        cluster = Cluster(address, Cluster.parse_resources(resources or "CPU=2")) if engine == "ray" else None
         loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
         if tolerance is not None:
             if quality is not None:
@@ -364,12 +369,19 @@ def _overrides(
     *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
 ) -> dict[str, Any]:
     """The options that were given, by the scene file's keys."""
+    from mitsplat.spec import FORMATS
+
+    if seed is not None and seed < 0:
+        raise InputError(f"--seed must be >= 0 (got {seed})")
     overrides: dict[str, Any] = {"seed": seed, "quality": quality}
     if size is not None:
         width, _, height = size.lower().partition("x")
-        if not (width.isdecimal() and height.isdecimal()):
+        if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
             raise InputError(f"--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got {size})")
         overrides |= {"output.width": int(width), "output.height": int(height)}
     if formats is not None:
-        overrides["output.formats"] = [name.strip() for name in formats.split(",")]
+        names = [name.strip() for name in formats.split(",")]
+        if unknown := [name for name in names if name not in FORMATS]:
+            raise InputError(f"--format must be among {', '.join(FORMATS)} (got {unknown[0]})")
+        overrides["output.formats"] = names
     return {key: value for key, value in overrides.items() if value is not None}

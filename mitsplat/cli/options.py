@@ -1,4 +1,4 @@
-"""What commands share: the seed, the bar or log that shows how far they are, and how errors read."""
+"""What commands share: the seed, the bar or log that shows how far they are, and how they log for machines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from mitsplat.errors import exit_status
+from mitsplat.cli import fault
+from mitsplat.errors import exit_status, sentence_of
 
 Progress = Callable[[int, int, str], None]
 
@@ -20,13 +21,6 @@ JsonLog = Annotated[
     bool,
     typer.Option("--json", help="Log to stderr for machines: an event a line, as a JSON object, instead of a bar."),
 ]
-
-
-def sentence_of(error: BaseException) -> str:
-    """What to tell of an error."""
-    if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)
 
 
 @contextmanager
@@ -51,10 +45,14 @@ def command_log(json_log: bool, command: str) -> Iterator[Callable[[], AbstractC
         yield lambda: nullcontext(progress)
     except BaseException as error:
         status = exit_status(error)
-        sentence = "interrupted: run again to go on" if status == 130 else sentence_of(error)
-        tell("failed", status=1 if status is None else status, error=type(error).__name__, message=sentence)
-        if status is None or status == 130:
+        if isinstance(error, typer.Exit) or (status is None and not isinstance(error, Exception)):
             raise
+        if status == 130:
+            tell("failed", status=130, error=type(error).__name__, message="interrupted: run again to go on")
+            raise
+        sentence = fault.tell_fault(error) if status is None else sentence_of(error)
+        status = fault.STATUS if status is None else status
+        tell("failed", status=status, error=type(error).__name__, message=sentence)
         raise typer.Exit(status) from error
     tell("finished", status=0)
 

@@ -1,0 +1,64 @@
+"""What the command line does about an error that nobody foresaw: a sentence for the user, the traceback in a file."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from mitsplat import __version__
+from mitsplat.cache import cache_folder
+
+STATUS = 70
+"""EX_SOFTWARE of sysexits.h: a fault of mitsplat, not of its input."""
+
+VARIABLE = "MITSPLAT_TRACEBACK"
+"""Environment variable by which a developer sees the traceback at once."""
+
+_LONGEST = 200
+_FOLDERS: tuple[Callable[[], Path], ...] = (
+    lambda: cache_folder() / "logs",
+    lambda: Path(tempfile.gettempdir()),
+    Path.cwd,
+)
+
+
+def tell_fault(error: BaseException) -> str:
+    """One sentence on an error, whose traceback, with that of the worker process it came from, is kept in a file."""
+    text = "".join(traceback.format_exception(error))
+    if os.environ.get(VARIABLE):
+        sys.stderr.write(text)
+    lines = str(error).strip().splitlines()
+    what = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    if len(what) > _LONGEST:
+        what = f"{what[: _LONGEST - 3]}..."
+    log = _keep(f"{_circumstances()}\n{text}")
+    where = f"set {VARIABLE}=1 to see where" if log is None else f"the log is {log}"
+    return f"this is a fault of mitsplat, not of what it was given: {what} ({where})"
+
+
+def _circumstances() -> str:
+    return (
+        f"mitsplat {__version__}, Python {platform.python_version()}, {platform.platform()}\n"
+        f"{time.strftime('%Y-%m-%d %H:%M:%S %z')} in {os.environ.get('PWD', '')}\n{shlex.join(sys.argv)}\n"
+    )
+
+
+def _keep(text: str) -> Path | None:
+    """A new file of the text, in the first folder that can be written, or None."""
+    for folder in _FOLDERS:
+        with suppress(OSError, RuntimeError):  # RuntimeError: there is no home folder
+            place = folder()
+            place.mkdir(parents=True, exist_ok=True)
+            number, name = tempfile.mkstemp(".log", time.strftime("mitsplat-%Y%m%d-%H%M%S-"), place)
+            with os.fdopen(number, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(text)
+            return Path(name)
+    return None

@@ -56,7 +56,8 @@ def _mean_radiance(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean radiance (N, 3) of every ``samples`` consecutive rays, black where nothing is, and the share that hits (N,).
 
-    The paths of one mean share a multi-jittered pattern (Kensler 2013): several times less noise than of independent ones.
+    The paths of one mean share a multi-jittered pattern (Kensler 2013), which has several times less noise than
+    independent ones.
     """
     integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
     sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
@@ -99,6 +100,5 @@ def render_mesh(
         mean[chunk], cover[chunk] = _mean_radiance(
             scene, rays.o, rays.d, samples=samples, bounces=bounces, seed=seed + launch
         )
-    mean = (mean / np.maximum(cover, 1e-9)[:, None]).reshape(camera.height, camera.width, 3)
-    cover = cover.reshape(camera.height, camera.width)
-    return decode_srgb(encode_srgb(mean) * cover[..., None]), cover
+    blended = decode_srgb(encode_srgb(mean / np.maximum(cover, 1e-9)[:, None]) * cover[:, None])
+    return blended.reshape(camera.height, camera.width, 3), cover.reshape(camera.height, camera.width)

@@ -77,7 +77,9 @@ def compare_with_textures(
     The texture is looked up by trimesh in the file's own image, past all that is known of materials here. Under light
     of radiance 1 from everywhere a convex matt surface has its texture's brightness.
     """
-    scene = mesh if isinstance(mesh, trimesh.Scene) else trimesh.load_scene(mesh)
+    if isinstance(mesh, str | Path):
+        mesh = trimesh.load_scene(mesh)
+    scene = mesh if isinstance(mesh, trimesh.Scene) else trimesh.Scene({"mesh": mesh})
     points, normals, colours = [], [], []
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]

@@ -195,7 +195,7 @@ def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.ui
         return None
     if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
         warnings.append("its texture has transparent places, which are baked opaque")
-    return np.asarray(image.convert("RGB"))
+    return np.array(image.convert("RGB"))
 
 
 def check_textures(mesh: Path) -> None:

@@ -31,7 +31,7 @@ _CONVEX = 0.9995
 _MOST_PARTS = 64
 # More triangles than this say nothing about how an object lies, and take CoACD hours.
 _MOST_FACES = 200_000
-# A solid of more faces is a scan, whose noise is taken off before it is split: by this share of its size, and no more
+# A mesh of more faces is a scan, whose noise is taken off before it is split: by this share of its size, and no more
 # than this [m], a third of what objects may sink into a table.
 _SCAN_FACES, _DEVIATION, _MOST_DEVIATION = 3000, 5e-4, 1e-4
 # Of CoACD's search for every cut; a scan has more cuts than it has concavities, and any of them will do.
@@ -192,13 +192,14 @@ def _split(part: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:
         return [hull]
     # CoACD rebuilds what it thinks no solid from voxels, slowly and a voxel too thick: also solids of which two
     # triangles touch, as in scans.
-    scan = part.is_volume and len(part.faces) > _SCAN_FACES
-    solid = simplify_solid(part, min(_DEVIATION * part.scale, _MOST_DEVIATION)) if scan else part
+    scan = len(part.faces) > _SCAN_FACES
+    closed = scan and part.is_volume
+    solid = simplify_solid(part, min(_DEVIATION * part.scale, _MOST_DEVIATION)) if closed else part
     coacd.set_log_level("error")
     found = coacd.run_coacd(
         coacd.Mesh(solid.vertices, solid.faces),
         threshold=threshold,
-        preprocess_mode="off" if scan else "auto",
+        preprocess_mode="off" if closed else "auto",
         mcts_iterations=_SCAN_ITERATIONS if scan else _ITERATIONS,
         seed=0,
     )

@@ -21,8 +21,9 @@ def make_proxy(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
 
     Decimation eats open sheets from their edges, so they keep all faces, the flat ones only as many as they need.
     """
-    solids = [part.mesh for part in parts if part.mesh.is_volume]
-    sheets = [part.mesh for part in parts if not part.mesh.is_volume]
+    meshes = [_without_holes(part.mesh) for part in parts]
+    solids = [mesh for mesh in meshes if mesh.is_volume]
+    sheets = [mesh for mesh in meshes if not mesh.is_volume]
     if len(solids) > 1:
         solids = [trimesh.boolean.union(solids, engine="manifold")]
     if solids:
@@ -32,6 +33,15 @@ def make_proxy(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
     solids = [s if len(s.faces) <= room else s.simplify_quadric_decimation(face_count=room) for s in solids]
     proxy = trimesh.util.concatenate(solids + sheets)
     return trimesh.Trimesh(proxy.vertices, proxy.faces)
+
+
+def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A solid that lacks a triangle or two, as scans do, closed; any other mesh as it is."""
+    if mesh.is_watertight:
+        return mesh
+    closed = mesh.copy()
+    closed.fill_holes()
+    return closed if closed.is_volume else mesh
 
 
 def _flattened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:

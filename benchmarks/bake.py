@@ -48,7 +48,8 @@ def main() -> None:
                 progress=note,
             )
         seconds = cpu_seconds() - start
-        gap = 1e3 * standoff(Surface(result.surface or result.asset.mesh), result.asset.pieces)
+        truth = result.asset.mesh if result.surface is None else result.surface
+        gap = 1e3 * standoff(Surface(truth), result.asset.pieces)
         print(
             f"{name}: {len(result.asset.splats)} Gaussians, {seconds:.1f} CPU s, {result.psnr:.2f} dB (object "
             f"{result.psnr_object:.2f} dB), {len(result.asset.pieces)} pieces within {gap:.2f} mm, "

@@ -61,14 +61,14 @@ def _verdict(result: Reconstruction) -> str:
     extents = "none" if result.asset.mesh is None else " x ".join(f"{e:.4g}" for e in result.asset.mesh.extents)
     rows: dict[str, str | None] = {
         "Photos with a camera": f"{found.photos} of {found.photos + found.rejected}",
-        "Held-out PSNR": _figure(found.psnr, "{:.2f} dB"),
-        "Held-out PSNR of the object": _figure(found.psnr_object, "{:.2f} dB"),
-        "IoU of the splats with held-out masks": _figure(found.splat_iou, "{:.4f}"),
-        "IoU of the mesh with held-out masks": _figure(found.mesh_iou, "{:.4f}"),
-        "Shift between mesh and splats": _figure(found.offset, "{:.3%} of the diagonal"),
-        "Median distance between mesh and splats": _figure(found.spread, "{:.3%} of the diagonal"),
-        "Lost by isolation": _figure(found.lost, "{:.2%} of the object"),
-        "Error of the scale": _figure(found.scale_error, "{:.2%}"),
+        "Held-out PSNR": figure_of(found.psnr, "{:.2f} dB"),
+        "Held-out PSNR of the object": figure_of(found.psnr_object, "{:.2f} dB"),
+        "IoU of the splats with held-out masks": figure_of(found.splat_iou, "{:.4f}"),
+        "IoU of the mesh with held-out masks": figure_of(found.mesh_iou, "{:.4f}"),
+        "Shift between mesh and splats": figure_of(found.offset, "{:.3%} of the diagonal"),
+        "Median distance between mesh and splats": figure_of(found.spread, "{:.3%} of the diagonal"),
+        "Lost by isolation": figure_of(found.lost, "{:.2%} of the object"),
+        "Error of the scale": figure_of(found.scale_error, "{:.2%}"),
         "Extents": f"{extents} {unit}",
         "Gaussians": f"{found.gaussians}",
         "Mesh": f"{found.faces} faces, {'watertight' if found.watertight else 'open'}, "
@@ -214,6 +214,11 @@ def _image(picture: Image, width: int) -> str:
     return inline_image(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR))
 
 
+def rgb_image(values: npt.NDArray[np.floating], width: int) -> str:
+    """Colours from 0 to 1, (H, W, 3), as the address of an image element at most ``width`` px wide."""
+    return _image(_eight_bit(values), width)
+
+
 def _eight_bit(values: npt.NDArray[np.floating]) -> Image:
     return np.asarray(255 * np.clip(values, 0, 1) + 0.5).astype(np.uint8)
 
@@ -223,5 +228,6 @@ def _spread(items: Sequence[T], count: int) -> list[T]:
     return [items[int(i)] for i in chosen]
 
 
-def _figure(value: float | None, form: str) -> str | None:
+def figure_of(value: float | None, form: str) -> str | None:
+    """A figure as text, or None where it is not known."""
     return None if value is None else form.format(value)

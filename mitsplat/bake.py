@@ -7,7 +7,7 @@ has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,19 +15,20 @@ from typing import Literal
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
-import shapely
 import trimesh
 from scipy.spatial import KDTree
 
 from mitsplat.assets import Asset
-from mitsplat.cad import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake_check import BakedView, compare_views, compare_with_textures
+from mitsplat.cad import bake_lights, mitsuba_scene, read_parts, world_from_file
 from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
+from mitsplat.materials import Finish
 from mitsplat.mesh import convex_pieces
-from mitsplat.metrics import psnr_of
-from mitsplat.plugins.proxies import Occluder, Proxies
+from mitsplat.proxy_mesh import make_proxy
 from mitsplat.refine import Picture, RefineSettings, refine_splats
+from mitsplat.render import ensure_variant
 from mitsplat.scene import LightSpec
 from mitsplat.splats import Splats, sh_basis
 from mitsplat.surfels import Surfels, place_surfels
@@ -35,17 +36,30 @@ from mitsplat.trace import RAYS_PER_LAUNCH, render_mesh, trace_radiance
 from mitsplat.variant import one_at_a_time
 
 FloatArray = npt.NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
 
 _OPACITY = 0.98
 _HIDDEN = 0.01
 """Radiance of a white surface under the uniform light below which nobody sees it."""
 _DETAIL = 7.0
 """How many times denser Gaussians are where the texture changes strongly."""
+_MOST_GAUSSIANS = 2_000_000
+_SMALLEST, _LARGEST = 0.001, 5.0
+"""Size of objects [m] outside of which units are wrong rather than objects unusual."""
+_STAGES = {
+    "reading the mesh": 1,
+    "placing Gaussians": 14,
+    "tracing their radiance": 16,
+    "path-tracing pictures": 14,
+    "fitting to the pictures": 40,
+    "finding convex pieces": 25,
+    "comparing with the mesh": 8,
+}
+"""What a bake does, and its shares of the time."""
+_DARKEST, _BRIGHTEST = 0.6, 1.4
+"""Brightness relative to its textures that corners in the shade and highlights explain."""
 _RIDGE = 0.02
 """Weight of the penalty on view dependence, relative to the data: decides what no ray has seen."""
-
-_LABEL_GAP = 0.01
-"""Distance from a solid, relative to its own size, within which a sheet is a label on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +70,20 @@ class BakeResult:
         asset: The asset, in metres, z up.
         psnr: Over whole images of unseen views [dB]; NaN without verification.
         psnr_object: Over the mesh's pixels alone [dB]; NaN without verification.
+        views: The pictures of that comparison.
+        surface: The mesh that was baked, all parts of it [m], z up; None where it was not kept.
+        brightness: Mean brightness of the splats relative to the textures of the file, read from it once more; None
+            without textures of its own or under a scene's lights.
+        warnings: What a user should know, a sentence each.
     """
 
     asset: Asset
     psnr: float
     psnr_object: float
+    views: tuple[BakedView, ...] = ()
+    surface: trimesh.Trimesh | None = None
+    brightness: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,6 +122,8 @@ class BakeSettings:
         for name in ("gaussians", "directions", "samples", "bounces", "proxy_faces"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1 (got {getattr(self, name)})")
+        if self.gaussians > _MOST_GAUSSIANS:
+            raise InputError(f"gaussians must be at most {_MOST_GAUSSIANS} (got {self.gaussians})")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
 
@@ -119,6 +144,9 @@ def bake_asset(
     pieces: Sequence[trimesh.Trimesh] = (),
     cameras: Sequence[Camera] = (),
     fit_cameras: Sequence[Camera] = (),
+    finish: Finish | None = None,
+    any_size: bool = False,
+    progress: Progress | None = None,
 ) -> BakeResult:
     """Bake a textured or coloured mesh into an asset of Gaussians.
 
@@ -138,15 +166,30 @@ def bake_asset(
         cameras: Views for the comparison; by default all around the mesh.
         fit_cameras: Views of the pictures that the fit takes; by default all around the mesh, others than for the
             comparison.
+        finish: Colour and gloss to use instead of the file's own.
+        any_size: Bake an object even if it is smaller than 1 mm or larger than 5 m, which tells of wrong units.
+        progress: Told how much of how much is done, and the stage.
 
     Raises:
-        InputError: If the mesh cannot be read or is empty, or the light is unknown.
+        InputError: Before work starts, if the mesh cannot be read, is empty or of a size that tells of wrong units, or
+            if another value breaks a rule.
     """
+    ensure_variant()
     settings = settings or BakeSettings()
-    parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up)
-    scene = mitsuba_scene(parts, bake_lights(light))
-    rng = np.random.default_rng(settings.seed)
+    if not (density > 0 and np.isfinite(density)):
+        raise InputError(f"density must be a number > 0 in kg/m^3 (got {density:g})")
+    if not (friction >= 0 and np.isfinite(friction)):
+        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
+    stages = _Stages(progress)
+    stages("reading the mesh")
+    lights = bake_lights(light)
+    parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
     surface = trimesh.util.concatenate([part.mesh for part in parts])
+    if kind == "object" and not any_size:
+        _check_size(str(mesh) if isinstance(mesh, str | Path) else name, surface, metres_per_unit)
+    scene = mitsuba_scene(parts, lights)
+    stages("placing Gaussians")
+    rng = np.random.default_rng(settings.seed)
     relative = settings.density or {}
     face_density = np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts])
     clay = mitsuba_scene(parts, bake_lights("uniform"), clay=True)
@@ -159,7 +202,8 @@ def bake_asset(
         wanted = round(wanted * settings.gaussians / max(len(surfels), 0.2 * settings.gaussians))
     if not len(surfels):
         raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
-    colour = _fit_radiance(scene, surfels, settings, rng)
+    stages("tracing their radiance")
+    colour = _fit_radiance(scene, surfels, settings, rng, stages)
     splats = Splats(
         means=surfels.centres.astype(np.float32),
         quats=surfels.quats.astype(np.float32),
@@ -168,10 +212,22 @@ def bake_asset(
         sh=_sharpened(surfels, colour, settings.sharpening).astype(np.float32),
     )
     if settings.fit_steps:
+        stages("path-tracing pictures")
         fit_cameras = fit_cameras or _orbit(surface, settings.fit_views, turn=0.0)
-        pictures = [_picture(scene, camera, settings, view) for view, camera in enumerate(fit_cameras)]
-        splats = refine_splats(splats, pictures, RefineSettings(iterations=settings.fit_steps, seed=settings.seed))
-    proxy = _proxy_mesh(parts, settings.proxy_faces)
+        pictures = []
+        for view, camera in enumerate(fit_cameras):
+            stages("path-tracing pictures", view / len(fit_cameras))
+            pictures.append(_picture(scene, camera, settings, view))
+        stages("fitting to the pictures")
+        refining = RefineSettings(iterations=settings.fit_steps, seed=settings.seed)
+        splats = refine_splats(
+            splats,
+            pictures,
+            refining,
+            progress=lambda step, _: stages("fitting to the pictures", step / settings.fit_steps),
+        )
+    stages("finding convex pieces")
+    proxy = make_proxy(parts, settings.proxy_faces)
     area = np.array([part.mesh.area for part in parts])
     asset = Asset(
         name=name,
@@ -187,10 +243,61 @@ def bake_asset(
         capture_light="uniform" if isinstance(light, str) else "scene",
         white=None if isinstance(light, str) else float(np.pi),
     )
+    warnings = [warning for part in parts for warning in part.warnings]
     if not settings.verify_views:
-        return BakeResult(asset, float("nan"), float("nan"))
+        stages.end()
+        return BakeResult(asset, float("nan"), float("nan"), surface=surface, warnings=tuple(warnings))
+    stages("comparing with the mesh")
     cameras = cameras or _orbit(surface, settings.verify_views)
-    return BakeResult(asset, *_compare(scene, splats, cameras, settings))
+    views, whole, on_object = compare_views(
+        scene, splats, cameras, bounces=settings.bounces, seed=settings.seed, progress=stages.part
+    )
+    brightness = None
+    if isinstance(light, str) and (finish is None or finish.colour is None):
+        brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up))
+    if brightness is not None and not _DARKEST < brightness < _BRIGHTEST:
+        warnings.append(
+            f"the splats are {brightness:.2g} times as bright as the textures of the file: "
+            "are the factors of its materials meant?"
+        )
+    stages.end()
+    return BakeResult(asset, whole, on_object, views, surface, brightness, tuple(warnings))
+
+
+class _Stages:
+    """Tells how far a bake is, of 100."""
+
+    def __init__(self, tell: Progress | None) -> None:
+        self._tell, self._stage = tell, next(iter(_STAGES))
+
+    def __call__(self, stage: str, share: float = 0.0) -> None:
+        self._stage = stage
+        if self._tell is not None:
+            names = list(_STAGES)
+            before = sum(_STAGES[name] for name in names[: names.index(stage)])
+            self._tell(int(100 * (before + share * _STAGES[stage]) / sum(_STAGES.values())), 100, stage)
+
+    def part(self, share: float) -> None:
+        """So much of the present stage is done."""
+        self(self._stage, share)
+
+    def end(self) -> None:
+        """All is done."""
+        if self._tell is not None:
+            self._tell(100, 100, "done")
+
+
+def _check_size(source: str, surface: trimesh.Trimesh, metres_per_unit: float) -> None:
+    """Refuse objects whose size tells of wrong units."""
+    size = float(surface.extents.max())
+    if _SMALLEST <= size <= _LARGEST:
+        return
+    factor, unit = (0.001, "millimetres") if size > _LARGEST else (1000.0, "metres")
+    likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
+    raise InputError(
+        f"{source}: an object must be {_SMALLEST:g} to {_LARGEST:g} m across (got {size:.3g} m at {metres_per_unit:g} "
+        f"metres per unit: {likely if _SMALLEST <= size * factor <= _LARGEST else ''}--any-size bakes it as it is)"
+    )
 
 
 def _hemisphere(count: int) -> FloatArray:
@@ -251,7 +358,9 @@ def _hits_nearby(
     return np.asarray((distance < reach[:, None]) & alike)
 
 
-def _fit_radiance(scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator) -> FloatArray:
+def _fit_radiance(
+    scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator, stages: _Stages
+) -> FloatArray:
     """Spherical-harmonic coefficients (N, K, 3) of the display-encoded radiance that leaves every surfel."""
     local = _hemisphere(settings.directions)
     weights = 0.2 + local[:, 2]
@@ -260,6 +369,7 @@ def _fit_radiance(scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng
     coefficients = np.empty((len(surfels), terms, 3))
     step = max(1, RAYS_PER_LAUNCH // (settings.directions * settings.samples))
     for start in range(0, len(surfels), step):
+        stages.part(start / len(surfels))
         chunk = slice(start, start + step)
         frames, scales = surfels.frames[chunk], surfels.scales[chunk]
         towards = _turned(frames, local, rng)
@@ -311,47 +421,6 @@ def _sharpened(surfels: Surfels, target: FloatArray, rounds: int) -> FloatArray:
     return colour
 
 
-def _proxy_mesh(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
-    """One surface of all parts, of at most about ``most_faces`` faces; labels on solids are left out.
-
-    Decimation eats open sheets from their edges, so they keep all faces, the flat ones only as many as they need.
-    """
-    solids = [part.mesh for part in parts if part.mesh.is_volume]
-    sheets = [part.mesh for part in parts if not part.mesh.is_volume]
-    if len(solids) > 1:
-        solids = [trimesh.boolean.union(solids, engine="manifold")]
-    if solids:
-        sheets = [sheet for sheet in sheets if not _lies_on(sheet, solids[0])]
-    sheets = [_flattened(sheet) for sheet in sheets]
-    room = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
-    solids = [s if len(s.faces) <= room else s.simplify_quadric_decimation(face_count=room) for s in solids]
-    proxy = trimesh.util.concatenate(solids + sheets)
-    return trimesh.Trimesh(proxy.vertices, proxy.faces)
-
-
-def _flattened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A sheet in a plane with no more faces than its outline needs; any other sheet as it is."""
-    normal = sheet.face_normals[0]
-    height = (sheet.vertices - sheet.vertices[0]) @ normal
-    if (sheet.face_normals @ normal < 0.999).any() or np.ptp(height) > 1e-5 * sheet.scale:
-        return sheet
-    to_plane = trimesh.geometry.plane_transform(sheet.vertices[0], normal)
-    corners = trimesh.transform_points(sheet.vertices, to_plane)[sheet.faces, :2]
-    outline = shapely.coverage_union_all(shapely.polygons(corners)).simplify(1e-6 * sheet.scale)
-    flat = [trimesh.creation.triangulate_polygon(polygon, engine="earcut") for polygon in shapely.get_parts(outline)]
-    vertices, faces = trimesh.util.append_faces([v for v, _ in flat], [f for _, f in flat])
-    vertices = np.pad(vertices, ((0, 0), (0, 1)))
-    return trimesh.Trimesh(trimesh.transform_points(vertices, np.linalg.inv(to_plane)), faces)
-
-
-def _lies_on(sheet: trimesh.Trimesh, solid: trimesh.Trimesh) -> bool:
-    """Whether an open sheet hugs a solid, as a label does: everywhere within a hundredth of its size."""
-    origins, down = sheet.triangles_center, -sheet.face_normals
-    rays = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(down.T.astype(np.float32)))
-    hit, _ = Proxies([Occluder(solid, 0, dynamic=False)]).nearest(rays)
-    return bool((np.array(hit.distance) < _LABEL_GAP * sheet.scale).all())
-
-
 def _picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:
     """A path-traced picture of the mesh to fit to."""
     seed = settings.seed + 1000 + view
@@ -371,17 +440,3 @@ def _orbit(surface: trimesh.Trimesh, count: int, *, turn: float = 0.7) -> list[C
         Camera.look_at(centre + 4.5 * radius * d, centre, width=256, height=256, fov_x=29.0, near=0.1 * radius)
         for d in outward
     ]
-
-
-def _compare(scene: mi.Scene, splats: Splats, cameras: Sequence[Camera], settings: BakeSettings) -> tuple[float, float]:
-    """PSNR [dB] of the splats against the path-traced mesh: whole images, and the mesh's pixels alone."""
-    from mitsplat.render import render_splats
-
-    errors, on_object = [], []
-    for view, camera in enumerate(cameras):
-        truth, cover = render_mesh(scene, camera, samples=36, bounces=settings.bounces, seed=settings.seed + view)
-        layers = render_splats(splats, camera)
-        error = (np.clip(encode_srgb(layers.rgb), 0, 1) - np.clip(encode_srgb(truth), 0, 1)) ** 2
-        errors.append(error.mean())
-        on_object.append(error[cover > 0].mean() if cover.any() else np.nan)
-    return psnr_of(float(np.mean(errors))), psnr_of(float(np.nanmean(on_object)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,12 +12,23 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 from trimesh.visual import ColorVisuals
-from trimesh.visual.material import PBRMaterial
+from trimesh.visual.color import to_rgba
 
-from mitsplat.colour import decode_srgb
+from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.composite import black_body_colour
 from mitsplat.errors import InputError
 from mitsplat.kinds import refuse_others
+from mitsplat.materials import (
+    DIELECTRIC_SPECULAR,
+    LEAST_ROUGHNESS,
+    MOST_SPECULAR,
+    ROUGHNESS,
+    UNKNOWN_COLOUR,
+    Finish,
+    Material,
+    check_textures,
+    read_material,
+)
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
 from mitsplat.variant import ensure_variant
@@ -25,7 +36,6 @@ from mitsplat.variant import ensure_variant
 FloatArray = npt.NDArray[np.float64]
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
-_DIELECTRIC_SPECULAR = 0.04
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
 _DETAIL_CONTRAST = 0.12
@@ -45,6 +55,8 @@ class Part:
         metallic: 0 for dielectrics to 1 for metals.
         roughness: Of the glTF material model, in (0, 1]; None for a matt surface without highlight.
         shiny: Whether the material reflects a highlight at all.
+        reflectance: At normal incidence, of what of the material is no metal.
+        warnings: What of the file's material is left out, a sentence each.
     """
 
     name: str
@@ -55,6 +67,8 @@ class Part:
     metallic: float
     roughness: float
     shiny: bool
+    reflectance: float = DIELECTRIC_SPECULAR
+    warnings: tuple[str, ...] = ()
 
     @property
     def specular(self) -> float:
@@ -62,7 +76,7 @@ class Part:
         if not self.shiny:
             return 0.0
         base = float(self._face_colours(np.full((1, 3), 1.0 / 3.0)).mean())
-        return _DIELECTRIC_SPECULAR * (1.0 - self.metallic) + base * self.metallic
+        return self.reflectance * (1.0 - self.metallic) + base * self.metallic
 
     def _face_colours(self, barycentric: FloatArray) -> FloatArray:
         """Linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, by the nearest texel."""
@@ -84,43 +98,67 @@ class Part:
 
 
 def read_parts(
-    mesh: trimesh.Trimesh | trimesh.Scene | str | Path, *, metres_per_unit: float = 1.0, up: Literal["y", "z"] = "z"
+    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    *,
+    metres_per_unit: float = 1.0,
+    up: Literal["y", "z"] = "z",
+    finish: Finish | None = None,
 ) -> tuple[Part, ...]:
-    """Parts of a mesh or of a file that trimesh reads, in metres, z up.
+    """Parts of a mesh or of a file that trimesh reads, in metres, z up, with ``finish`` over their own materials.
 
     Raises:
-        InputError: If the file cannot be read, there are no faces, or a position is not finite.
+        InputError: If the file or its textures cannot be read, there are no faces, none has an area, or a position is
+            not finite.
     """
+    finish, linear = finish or Finish(), False
     source = "mesh"
     if isinstance(mesh, str | Path):
-        source = str(mesh)
-        refuse_others(Path(mesh), "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
-        if not Path(mesh).is_file():
+        source, path = str(mesh), Path(mesh)
+        refuse_others(path, "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
+        if not path.is_file():
             raise InputError(f"{source}: no such mesh file")
+        if finish.colour is None:
+            check_textures(path)
+        linear = path.suffix.lower() in (".glb", ".gltf")
         try:
             mesh = trimesh.load_scene(mesh)
         except (ValueError, TypeError, KeyError, OSError, NotImplementedError) as error:
             raise InputError(f"{source}: not a mesh that can be read ({error})") from error
-    if not metres_per_unit > 0:
+    if not (metres_per_unit > 0 and np.isfinite(metres_per_unit)):
         raise InputError(f"{source}: metres_per_unit must be > 0 (got {metres_per_unit})")
     scene = mesh if isinstance(mesh, trimesh.Scene) else trimesh.Scene({"mesh": mesh})
-    world_from_file = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
-    if up == "y":
-        world_from_file = world_from_file @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    to_world = world_from_file(metres_per_unit, up)
     parts = []
     for node in scene.graph.nodes_geometry:
         transform, geometry_name = scene.graph[node]
         geometry = scene.geometry[geometry_name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            parts.append(_read_part(str(geometry_name), geometry, world_from_file @ transform))
+            if not np.isfinite(geometry.vertices).all():
+                row = int(np.flatnonzero(~np.isfinite(geometry.vertices).all(axis=1))[0])
+                place = np.asarray(geometry.vertices[row]).tolist()
+                raise InputError(f"{source}: vertex positions must be finite (got {place} at vertex {row})")
+            part = _read_part(str(geometry_name), geometry, to_world @ transform, finish, linear=linear)
+            if len(part.mesh.faces):
+                parts.append(part)
+    if not parts and any(len(getattr(g, "faces", ())) for g in scene.geometry.values()):
+        raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
     if not parts:
         raise InputError(f"{source}: a mesh needs at least one face (got none)")
-    if not all(np.isfinite(part.mesh.vertices).all() for part in parts):
-        raise InputError(f"{source}: vertex positions must be finite")
+    if not sum(float(part.mesh.area) for part in parts) > 0:
+        raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
     return tuple(parts)
 
 
-def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray) -> Part:
+def world_from_file(metres_per_unit: float, up: Literal["y", "z"]) -> FloatArray:
+    """Matrix (4, 4) to metres, z up."""
+    matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
+    if up == "y":
+        matrix = matrix @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    return np.asarray(matrix)
+
+
+def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray, finish: Finish, *, linear: bool) -> Part:
+    """A part; its vertex colours are ``linear`` or display-encoded."""
     geometry = trimesh.Trimesh(source.vertices, source.faces, process=False)
     geometry.merge_vertices(merge_tex=True, merge_norm=True)
     # Only what has collapsed: dropping slivers would open holes.
@@ -128,25 +166,56 @@ def _read_part(name: str, source: trimesh.Trimesh, transform: FloatArray) -> Par
     geometry.update_faces(keep)
     geometry.apply_transform(transform)
     faces = source.faces[keep]
-    visual = source.visual
+    visual, per_corner = source.visual, None
     if isinstance(visual, ColorVisuals):
+        material = Material(np.ones(3), None, shiny=False)
         if visual.kind == "vertex":
-            colours = decode_srgb(visual.vertex_colors[faces][..., :3] / 255.0)
+            per_corner = visual.vertex_colors[faces]
         elif visual.kind == "face":
-            colours = np.repeat(decode_srgb(visual.face_colors[keep][:, None, :3] / 255.0), 3, axis=1)
+            per_corner = np.repeat(visual.face_colors[keep][:, None], 3, axis=1)
         else:
-            colours = np.full((*faces.shape, 3), 0.5)
-        return Part(name, geometry, colours, None, None, metallic=0.0, roughness=1.0, shiny=False)
-    material = visual.material if isinstance(visual.material, PBRMaterial) else visual.material.to_pbr()
-    metallic = 0.0 if material.metallicFactor is None else float(material.metallicFactor)
-    roughness = 0.6 if material.roughnessFactor is None else float(np.clip(material.roughnessFactor, 0.05, 1.0))
-    factor = np.ones(3) if material.baseColorFactor is None else np.asarray(material.baseColorFactor)[:3] / 255.0
-    if material.baseColorTexture is None or visual.uv is None:
-        colours = np.broadcast_to(decode_srgb(factor), (*faces.shape, 3)).copy()
-        return Part(name, geometry, colours, None, None, metallic, roughness, shiny=True)
-    texture = np.asarray(material.baseColorTexture.convert("RGB"))
-    texture = (texture * factor).round().astype(np.uint8)
-    return Part(name, geometry, None, texture, np.asarray(visual.uv)[faces], metallic, roughness, shiny=True)
+            material = replace(material, factor=np.full(3, UNKNOWN_COLOUR))
+    else:
+        material = read_material(visual.material)
+        stored = visual.vertex_attributes.get("color")
+        if stored is not None and len(stored) == len(source.vertices):
+            per_corner = to_rgba(np.asarray(stored))[faces]
+    warnings = [f"material of part {name!r}: {warning}" for warning in material.warnings]
+    material = _finished(material, finish)
+    if finish.colour is not None:
+        warnings, per_corner = [], None
+    gloss = (material.metallic, material.roughness, material.shiny, material.specular)
+    if material.texture is not None and visual.uv is not None:
+        if per_corner is not None and (per_corner[..., :3] < 255).any():
+            warnings.append(f"part {name!r} has a texture and vertex colours: these are left out")
+        texture = material.texture
+        if not (material.factor == 1.0).all():
+            texture = (255.0 * encode_srgb(decode_srgb(texture / 255.0) * material.factor)).round().astype(np.uint8)
+        return Part(name, geometry, None, texture, np.asarray(visual.uv)[faces], *gloss, tuple(warnings))
+    colours = np.ones((*faces.shape, 3))
+    if per_corner is not None:
+        colours = per_corner[..., :3] / 255.0 if linear else decode_srgb(per_corner[..., :3] / 255.0)
+    return Part(name, geometry, colours * material.factor, None, None, *gloss, tuple(warnings))
+
+
+def _finished(material: Material, finish: Finish) -> Material:
+    """``material`` with what ``finish`` gives."""
+    colour = finish.linear_colour()
+    if colour is not None:
+        material = replace(material, factor=colour, texture=None)
+    given = {
+        name: value for name in ("roughness", "metallic", "specular") if (value := getattr(finish, name)) is not None
+    }
+    if not given:
+        return material
+    if not material.shiny:
+        material = replace(material, roughness=ROUGHNESS, specular=DIELECTRIC_SPECULAR)
+    material = replace(material, **given)
+    return replace(
+        material,
+        roughness=max(material.roughness, LEAST_ROUGHNESS),
+        shiny=material.specular > 0 or material.metallic > 0,
+    )
 
 
 def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
@@ -172,7 +241,7 @@ def _bsdf(part: Part) -> dict[str, Any]:
         "base_color": colour,
         "metallic": part.metallic,
         "roughness": part.roughness,
-        "specular": 0.5,
+        "specular": part.reflectance / MOST_SPECULAR,
     }
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.render import make_sensor
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,33 +27,51 @@ def trace_radiance(
     samples: int,
     bounces: int,
     seed: int,
-    group: int = 1,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Mean radiance (R, 3) that arrives at ``origins`` (R, 3) [m] from ``directions`` (R, 3), and where a surface is.
 
-    Every ray is traced ``samples`` times by Mitsuba's path tracer. The paths of ``group`` consecutive rays share one
-    multi-jittered pattern (Kensler 2013), so that their mean has several times less noise than of independent paths.
+    Every ray is traced ``samples`` times by Mitsuba's path tracer.
     """
-    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
     radiance, hit = np.empty((len(origins), 3)), np.empty(len(origins), dtype=bool)
-    step = max(1, RAYS_PER_LAUNCH // (samples * group)) * group
+    step = max(1, RAYS_PER_LAUNCH // samples)
     for launch, start in enumerate(range(0, len(origins), step)):
         chunk = slice(start, start + step)
-        rays = mi.RayDifferential3f(
-            mi.Point3f(np.repeat(origins[chunk], samples, axis=0).T.astype(np.float32)),
-            mi.Vector3f(np.repeat(directions[chunk], samples, axis=0).T.astype(np.float32)),
+        from_points = mi.Point3f(origins[chunk].T.astype(np.float32))
+        along = mi.Vector3f(directions[chunk].T.astype(np.float32))
+        ray = dr.arange(mi.UInt32, len(origins[chunk]) * samples) // dr.opaque(mi.UInt32, samples)
+        total, hits = _mean_radiance(
+            scene,
+            dr.gather(mi.Point3f, from_points, ray),
+            dr.gather(mi.Vector3f, along, ray),
+            samples=samples,
+            bounces=bounces,
+            seed=seed + launch,
         )
-        count = len(origins[chunk]) * samples
-        sampler = mi.load_dict({"type": "multijitter", "sample_count": samples * group})
-        if sampler.sample_count() == samples * group:
-            sampler.set_samples_per_wavefront(samples * group)
-        else:  # a number that has no grid
-            sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed + launch, count)
-        spectrum, valid, _ = integrator.sample(scene, sampler, rays)
-        radiance[chunk] = np.asarray(mi.Color3f(spectrum)).T.reshape(-1, samples, 3).mean(axis=1)
-        hit[chunk] = np.asarray(valid).reshape(-1, samples)[:, 0]
+        radiance[chunk], hit[chunk] = total, hits > 0
     return radiance, hit
+
+
+def _mean_radiance(
+    scene: mi.Scene, origins: Any, directions: Any, *, samples: int, bounces: int, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """Mean radiance (N, 3) of every ``samples`` consecutive rays, black where nothing is, and the share that hits (N,).
+
+    The paths of one mean share a multi-jittered pattern (Kensler 2013), which has several times less noise than
+    independent ones.
+    """
+    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+    if sampler.sample_count() == samples:
+        sampler.set_samples_per_wavefront(samples)
+    else:  # a number that has no grid
+        sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, dr.width(directions))
+    spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
+    radiance, hit = mi.Color3f(dr.select(valid, spectrum, 0.0)), dr.select(valid, mi.Float(1), 0)
+    # Together: what is left for later would trace all paths again.
+    dr.eval(radiance, hit)
+    sums = [np.asarray(dr.block_sum(channel, samples), dtype=np.float64) / samples for channel in (*radiance, hit)]
+    return np.stack(sums[:3], axis=1), sums[3]
 
 
 def render_mesh(
@@ -60,18 +82,23 @@ def render_mesh(
     ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it
     is encoded, because the mean of encoded noise is too dark. Only the background counts encoded, as splats blend.
     """
-    side = max(1, round(samples**0.5))
-    fine = camera.resized(camera.width * side, camera.height * side)
-    x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
-    by_pixel = (camera.height, side, camera.width, side)
-    x, y = (v.reshape(by_pixel).transpose(0, 2, 1, 3) for v in (x, y))
-    slopes = fine.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
-    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = np.broadcast_to(camera.centre, directions.shape)
-    radiance, hit = trace_radiance(scene, origins, directions, samples=1, bounces=bounces, seed=seed, group=side * side)
-    pixels = camera.height, camera.width, side * side
-    cover = hit.reshape(pixels).mean(axis=2)
-    total = np.where(hit[:, None], radiance, 0.0).reshape(*pixels, 3).mean(axis=2)
-    mean = total / np.maximum(cover, 1e-9)[..., None]
-    return decode_srgb(encode_srgb(mean) * cover[..., None]), cover
+    from mitsplat.plugins.splat_proxy import view_of
+
+    view, side = view_of(make_sensor(camera)), max(1, round(samples**0.5))
+    samples, pixels = side * side, camera.width * camera.height
+    across, width = dr.opaque(mi.UInt32, side), dr.opaque(mi.UInt32, camera.width)
+    mean, cover = np.empty((pixels, 3)), np.empty(pixels)
+    step = max(1, RAYS_PER_LAUNCH // samples)
+    for launch, start in enumerate(range(0, pixels, step)):
+        count = min(step, pixels - start)
+        ray = dr.arange(mi.UInt32, count * samples)
+        pixel, within = ray // (across * across), ray % (across * across)
+        pixel += dr.opaque(mi.UInt32, start)
+        x = mi.Float(pixel % width) + (mi.Float(within % across) + 0.5) / mi.Float(across)
+        y = mi.Float(pixel // width) + (mi.Float(within // across) + 0.5) / mi.Float(across)
+        rays, chunk = view.rays_through(x, y), slice(start, start + count)
+        mean[chunk], cover[chunk] = _mean_radiance(
+            scene, rays.o, rays.d, samples=samples, bounces=bounces, seed=seed + launch
+        )
+    blended = decode_srgb(encode_srgb(mean / np.maximum(cover, 1e-9)[:, None]) * cover[:, None])
+    return blended.reshape(camera.height, camera.width, 3), cover.reshape(camera.height, camera.width)

@@ -132,14 +132,19 @@ class View:
         """World-space rays through the pixels' centres, row-major, of unit direction."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         row = pixel // self.width
-        u, v = self.slopes(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
+        ray = self.rays_through(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
+        dr.eval(ray)
+        return ray
+
+    def rays_through(self, x: Any, y: Any) -> Any:
+        """World-space rays through pixel positions (x, y) [px], of unit direction."""
+        u, v = self.slopes(x, y)
         axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3].T]
         right, down, forward, centre = axes
-        ray = dr.zeros(mi.Ray3f, dr.width(pixel))
+        ray = dr.zeros(mi.Ray3f, dr.width(x))
         ray.d = dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
         ray.o = mi.Point3f(*centre)
         ray.maxt = dr.inf
-        dr.eval(ray)
         return ray
 
     def cosine(self, rays: Any) -> Any:

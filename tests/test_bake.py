@@ -238,6 +238,13 @@ def test_studio_has_mean_radiance_one() -> None:
     assert radiance.mean() == pytest.approx(1.0, abs=0.02)
 
 
+def not_finite() -> trimesh.Trimesh:
+    mesh = trimesh.creation.box()
+    vertices = np.array(mesh.vertices)
+    vertices[0, 0] = np.nan
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -246,6 +253,19 @@ def test_studio_has_mean_radiance_one() -> None:
         ({"light": "candle"}, "uniform, studio or a scene's lights .got 'candle'."),
         ({"light": []}, "at least one light"),
         ({"metres_per_unit": 0.0}, "metres_per_unit must be > 0 .got 0.0."),
+        ({"mesh": trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]])}, "faces that have an area"),
+        ({"mesh": not_finite()}, r"vertex positions must be finite .got \[nan, .* at vertex 0."),
+        (
+            {"mesh": trimesh.creation.box((31, 9, 4))},
+            "0.001 to 5 m across .got 31 m .* --units 0.001 reads it in milli",
+        ),
+        (
+            {"mesh": trimesh.creation.box((0.04, 0.01, 0.01)), "metres_per_unit": 0.001},
+            r"got 4e-05 m at 0.001 metres per unit: --units 1 reads it in metres, and --any-size bakes it as it is",
+        ),
+        ({"density": 0.0}, "density must be a number > 0 .* .got 0."),
+        ({"density": float("nan")}, "density must be a number > 0 .* .got nan."),
+        ({"friction": -0.5}, "friction must be a number of at least 0 .got -0.5."),
     ],
 )
 def test_bad_input_is_refused_in_one_sentence(arguments: dict[str, object], sentence: str) -> None:
@@ -253,7 +273,7 @@ def test_bad_input_is_refused_in_one_sentence(arguments: dict[str, object], sent
         bake_asset(**{"mesh": trimesh.creation.box(), "name": "x", "settings": quick(), **arguments})
 
 
-@pytest.mark.parametrize(("field", "value"), [("gaussians", 0), ("sh_degree", 4), ("samples", 0)])
+@pytest.mark.parametrize(("field", "value"), [("gaussians", 0), ("gaussians", 10**9), ("sh_degree", 4), ("samples", 0)])
 def test_bad_settings_are_refused(field: str, value: int) -> None:
     with pytest.raises(InputError, match=field):
         BakeSettings(**{field: value})
@@ -263,6 +283,48 @@ def test_damaged_mesh_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.glb").write_bytes(b"glTF\x02\x00\x00\x00 and no more")
     with pytest.raises(InputError, match=r"broken\.glb: not a mesh that can be read"):
         bake_asset(tmp_path / "broken.glb", name="x", settings=quick())
+
+
+def test_large_object_bakes_where_the_user_insists_and_tells_its_stages() -> None:
+    told: list[tuple[int, int, str]] = []
+    result = bake_asset(
+        white(trimesh.creation.box((6.0, 4.0, 3.0))),
+        name="container",
+        any_size=True,
+        settings=quick(gaussians=200, fit_steps=2, fit_views=1),
+        progress=lambda *step: told.append(step),
+    )
+    assert len(result.asset.splats) > 100
+    assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
+    assert told[-1] == (100, 100, "done")
+    assert len({stage for _, _, stage in told}) == 7
+
+
+def test_picture_is_that_of_single_rays_through_the_same_pixels() -> None:
+    """The readable twin: rays of the camera's own model, one by one. Light of radiance 1 on white leaves no noise."""
+    ball = white(trimesh.creation.icosphere(3, 0.02))
+    scene = mitsuba_scene(read_parts(ball), bake_lights("uniform"))
+    camera = Camera.look_at((0.05, -0.06, 0.04), (0, 0, 0), width=24, height=18, fov_x=40, near=0.01)
+    picture, cover = render_mesh(scene, camera, samples=1, bounces=2)
+    x, y = np.meshgrid(np.arange(24) + 0.5, np.arange(18) + 0.5)
+    slopes = camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.tile(camera.centre, (len(directions), 1))
+    radiance, hit = trace_radiance(scene, origins, directions, samples=1, bounces=2, seed=0)
+    assert 0.1 < cover.mean() < 0.9
+    np.testing.assert_array_equal(cover.ravel() > 0, hit)
+    np.testing.assert_allclose(picture.reshape(-1, 3)[hit], radiance[hit], atol=1e-3)
+
+
+def test_noise_differs_from_pixel_to_pixel() -> None:
+    """Were all paths to share their random numbers, the mean over the picture would be as noisy as one pixel."""
+    cup = white(trimesh.creation.annulus(0.01, 0.02, 0.03))
+    scene = mitsuba_scene(read_parts(cup), bake_lights("studio"))
+    camera = Camera.look_at((0.0, -0.04, 0.06), (0, 0, 0), width=48, height=48, fov_x=30, near=0.01)
+    pictures = np.array([render_mesh(scene, camera, samples=1, bounces=3, seed=seed)[0] for seed in range(6)])
+    inside = pictures.std(axis=0)[pictures.min(axis=0) > 0].mean()
+    assert pictures.mean(axis=(1, 2, 3)).std() < 0.1 * inside
 
 
 def test_encoding_is_the_srgb_curve() -> None:

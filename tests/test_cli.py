@@ -27,6 +27,7 @@ from mitsplat.dataset import DatasetSummary
 from mitsplat.depth_maps import DepthMaps
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.fit import FitProgress, FitResult, FitSettings
+from mitsplat.materials import Finish
 from mitsplat.pipeline import Finished
 from mitsplat.scene import Scene
 from mitsplat.settle import Layout
@@ -280,16 +281,20 @@ def test_bake_passes_every_option_on(
     status = run(
         "bake", "gear.glb", "-o", tmp_path / "gear", "--class", "wheel", "--light", "studio", "--gaussians", 500,
         "--sh-degree", 1, "--units", 0.001, "--up", "y", "--density", 7800, "--friction", 0.2, "--seed", 4,
-        "--kind", "environment", "--name", "cog",
+        "--kind", "environment", "--name", "cog", "--colour", "steelblue", "--roughness", 0.3, "--metallic", 1,
+        "--specular", 0.05, "--any-size",
     )  # fmt: skip
     assert status == 0
     assert calls.args == (Path("gear.glb"),)
+    assert callable(calls.kwargs.pop("progress"))
     assert calls.kwargs == {
         "name": "cog", "class_name": "wheel", "kind": "environment", "light": "studio",
         "settings": BakeSettings(gaussians=500, sh_degree=1, seed=4), "metres_per_unit": 0.001, "up": "y",
         "density": 7800.0, "friction": 0.2,
+        "finish": Finish(colour="steelblue", roughness=0.3, metallic=1.0, specular=0.05), "any_size": True,
     }  # fmt: skip
     assert (tmp_path / "gear/asset.yaml").is_file()
+    assert (tmp_path / "gear/report.html").is_file()
     assert "31.3 dB" in capsys.readouterr().out
     assert run("bake", "gear.glb", "-o", tmp_path / "gear") == 0
     assert calls.kwargs["name"] == "gear"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mitsplat.cli.options import Seed, progress_bar
+from mitsplat.cli.options import Seed, progress_bar, stage_bar
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
@@ -62,13 +62,28 @@ def bake(
     up: Annotated[Literal["y", "z"], typer.Option(help="Axis of the mesh that points up.")] = "z",
     density: Annotated[float, typer.Option(help="Mass density [kg/m^3].")] = 1000.0,
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
+    colour: Annotated[
+        str | None, typer.Option(help="Name or #rrggbb, instead of all colours and textures of the file.")
+    ] = None,
+    roughness: Annotated[
+        float | None, typer.Option(help="0 (a mirror) to 1, instead of the file's; makes what is matt glossy.")
+    ] = None,
+    metallic: Annotated[float | None, typer.Option(help="0 to 1 (metal), instead of the file's.")] = None,
+    specular: Annotated[
+        float | None, typer.Option(help="Reflectance of what is no metal, 0 (matt) to 0.08, instead of the file's.")
+    ] = None,
+    any_size: Annotated[
+        bool, typer.Option("--any-size", help="Bake an object of less than 1 mm or more than 5 m as well.")
+    ] = False,
     seed: Seed = 0,
 ) -> None:
     """Turn MESH into an asset.
 
-    It has Gaussians with baked radiance, a proxy mesh and convex pieces.
+    It has Gaussians with baked radiance, a proxy mesh and convex pieces; report.html shows the mesh beside the splats.
     """
     from mitsplat.bake import BakeSettings, bake_asset
+    from mitsplat.bake_report import write_bake_report
+    from mitsplat.materials import Finish
 
     if out.exists() and not out.is_dir():
         raise InputError(f"--out must be a folder (got the file {out})")
@@ -77,19 +92,29 @@ def bake(
             raise InputError(f"{option} must be finite and > 0 (got {value})")
     if seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")
-    result = bake_asset(
-        mesh,
-        name=name or out.resolve().name,
-        class_name=class_name,
-        kind=kind,
-        light=light,
-        settings=BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed),
-        metres_per_unit=units,
-        up=up,
-        density=density,
-        friction=friction,
-    )
+    settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
+    finish = Finish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
+    with stage_bar() as progress:
+        result = bake_asset(
+            mesh,
+            name=name or out.resolve().name,
+            class_name=class_name,
+            kind=kind,
+            light=light,
+            settings=settings,
+            metres_per_unit=units,
+            up=up,
+            density=density,
+            friction=friction,
+            finish=finish,
+            any_size=any_size,
+            progress=progress,
+        )
     result.asset.save(out)
+    report = write_bake_report(out, result)
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}")
+    typer.echo(f"report: {report}")
     typer.echo(f"asset: {out} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -88,3 +89,20 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
             bar.update(task, completed=done, description=doing)
 
         yield update
+
+
+@contextmanager
+def stage_bar() -> Iterator[Progress]:
+    """A bar on stderr with the time left where that is a terminal, else a line for every stage."""
+    if sys.stderr.isatty():
+        with progress_bar("%/s") as bar:
+            yield bar
+        return
+    told: list[str] = []
+
+    def tell(done: int, total: int, doing: str) -> None:
+        if told[-1:] != [doing]:
+            told.append(doing)
+            typer.echo(f"{100 * done // total:3d} %: {doing}", err=True)
+
+    yield tell

@@ -17,6 +17,7 @@ from trimesh.visual.material import PBRMaterial
 from mitsplat.colour import decode_srgb
 from mitsplat.composite import black_body_colour
 from mitsplat.errors import InputError
+from mitsplat.plugins.device import ray_scene
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
 
@@ -151,8 +152,7 @@ def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool =
     Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
     """
     shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE if clay else _bsdf(part)) for k, part in enumerate(parts)}
-    scene: mi.Scene = mi.load_dict({"type": "scene", **shapes, **lights})
-    return scene
+    return ray_scene({**shapes, **lights})
 
 
 def _bsdf(part: Part) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import trimesh
 
 from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
-from mitsplat.plugins.device import plain_mesh, wrapped
+from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.march import respond_along
 from mitsplat.plugins.project import CloudSet, Placement
@@ -240,4 +240,4 @@ def _trace_alone(view: View, window: tuple[int, int, int, int], mesh: trimesh.Tr
 
 @lru_cache(maxsize=128)
 def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> Any:
-    return mi.load_dict({"type": "scene", "mesh": plain_mesh(mesh)})
+    return ray_scene({"mesh": plain_mesh(mesh)})

@@ -19,10 +19,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
-from mitsplat.plugins.march import Lanes, march
+from mitsplat.plugins.march import march
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians
+from mitsplat.plugins.walk import Lanes
 from mitsplat.quality import KERNELS, Quality
 
 LN_2 = 0.6931471805599453

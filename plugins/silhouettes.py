@@ -22,10 +22,10 @@ from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.plugins.gaussian import RECORD
-from mitsplat.plugins.march import respond_along
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians
+from mitsplat.plugins.walk import respond_along
 from mitsplat.quality import Quality
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)

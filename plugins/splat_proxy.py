@@ -244,7 +244,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
         alpha, depth, instance, front = splat.alpha, splat.depth, splat.instance, mi.Bool(False)
         if behind:
-            front = behind.valid & (splat.alpha < 0.5)
+            front = behind.valid & (splat.centre_alpha < 0.5)
             colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
             alpha = dr.select(behind.valid, 1, alpha)
             depth = dr.select(front, behind.depth, depth)

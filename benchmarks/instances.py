@@ -92,9 +92,7 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
         least = {case: min(seconds[1:]) for case, seconds in times.items()}
         share = unsure[-1] if unsure else 0.0
         told = ", ".join(f"{case} {least[case] / least['one']:.2f}" for case in ("first walk", "all"))
-        print(
-            f"{name}, {preset}: march of one instance {least['one']:.3f} s; times that: {told}; {share:.1%} walked again"
-        )
+        print(f"{name}, {preset}: march of one instance {least['one']:.3f} s, times that: {told}; again: {share:.1%}")
         unsure.clear()
 
 

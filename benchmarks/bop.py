@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsplat.plugins.device import ray_scene
 from mitsplat.render import ensure_variant
 
 
@@ -36,7 +37,6 @@ def cast(mesh: Any, rotation: Any, shift: Any, matrix: Any, width: int, height: 
 
 def main() -> None:
     """Print the differences."""
-    import mitsuba as mi
     from bop_toolkit_lib import inout, misc, visibility
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -51,7 +51,7 @@ def main() -> None:
         path = str(root / f"models/obj_{number:06d}.ply")
         extents = np.ptp(inout.load_ply(path)["pts"], axis=0)
         sizes.append(np.abs(extents - [stated[f"size_{axis}"] for axis in "xyz"]).max())
-        meshes[number] = mi.load_dict({"type": "scene", "mesh": {"type": "ply", "filename": path}})
+        meshes[number] = ray_scene({"mesh": {"type": "ply", "filename": path}})
     silhouettes, shares, boxes, counts, frames = [], [], [], [], 0
     for scene in sorted(path for path in root.glob("*/*") if (path / "scene_gt.json").is_file()):
         cameras, poses = (

@@ -87,9 +87,11 @@ def photograph(
     scene: Mapping[str, Any], views: list[Camera], folder: Path, *, samples: int, noise: float = 0.01
 ) -> dict[str, Camera]:
     """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files."""
+    from mitsplat.plugins.device import ray_scene
+
     ensure_variant()
     folder.mkdir(parents=True, exist_ok=True)
-    loaded = mi.load_dict(dict(scene))
+    loaded = ray_scene(scene)
     rng = np.random.default_rng(0)
     found = _named(views)
     sensors = _Sensors()
@@ -222,9 +224,9 @@ def chamfer(one: trimesh.Trimesh, truth: trimesh.Trimesh, samples: int = 20_000)
 
 def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> list[float]:
     """IoU of each photo's mask with the true silhouette."""
-    from mitsplat.plugins.device import plain_mesh
+    from mitsplat.plugins.device import plain_mesh, ray_scene
 
-    solid = mi.load_dict({"type": "scene", "solid": plain_mesh(mesh, mi.Properties())})
+    solid = ray_scene({"solid": plain_mesh(mesh, mi.Properties())})
     depths = mi.load_dict({"type": "aov", "aovs": "depth:depth"})
     overlaps, sensors = [], _Sensors()
     for photo in capture.photos:

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.known import chamfer, solid
 from mitsplat.camera import Camera
 from mitsplat.isolate import MaskedView
-from mitsplat.plugins.device import plain_mesh
+from mitsplat.plugins.device import plain_mesh, ray_scene
 from mitsplat.refine_mesh import MeshRefineSettings, refine_mesh
 from mitsplat.render import ensure_variant
 from mitsplat.splats import Splats
@@ -43,7 +43,7 @@ def cameras(count: int, width: int, middle: np.ndarray) -> list[Camera]:
 def masked(mesh: trimesh.Trimesh, cameras: list[Camera], finer: int = 4) -> list[MaskedView]:
     """What the cameras see of it, traced through ``finer`` squared points of every pixel."""
     ensure_variant()
-    scene = mi.load_dict({"type": "scene", "mesh": plain_mesh(mesh)})
+    scene = ray_scene({"mesh": plain_mesh(mesh)})
     views = []
     for camera in cameras:
         fine = camera.resized(finer * camera.width, finer * camera.height)

@@ -1,6 +1,6 @@
 """How much memory a process that makes frames of a scene takes at most, by which their number is chosen.
 
-``python -m benchmarks.memory budget`` measured the coefficients, and sets them beside peaks; they hold for the variant
+``python -m benchmarks.workers budget`` measured the coefficients, and sets them beside peaks; they hold for the variant
 ``llvm_ad_rgb``, where the device's memory is the process's own.
 """
 

@@ -29,6 +29,7 @@ from mitsplat.materials import (
     check_textures,
     read_material,
 )
+from mitsplat.plugins.device import ray_scene
 from mitsplat.scene import LightSpec
 from mitsplat.surfels import corner_normals
 from mitsplat.variant import ensure_variant
@@ -225,8 +226,7 @@ def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool =
     """
     ensure_variant()
     shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE if clay else _bsdf(part)) for k, part in enumerate(parts)}
-    scene: mi.Scene = mi.load_dict({"type": "scene", **shapes, **lights})
-    return scene
+    return ray_scene({**shapes, **lights})
 
 
 def _bsdf(part: Part) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.isolate import MaskedView
 from mitsplat.mend import mend_motion
-from mitsplat.plugins.device import plain_mesh, wrapped
+from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.render import ensure_variant
 
 FloatArray = npt.NDArray[np.float64]
@@ -221,7 +221,7 @@ class Silhouettes:
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         properties = mi.Properties()
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "uniform", "value": 1.0}})
-        self.scene = mi.load_dict({"type": "scene", "mesh": plain_mesh(mesh, properties)})
+        self.scene = ray_scene({"mesh": plain_mesh(mesh, properties)})
         # Directly seen light alone; inside a silhouette nothing changes.
         self.integrator = mi.load_dict({"type": "prb_projective", "max_depth": 1, "sppc": 0, "sppi": 0})
         self.integrator.sample_border_warning = False

@@ -56,6 +56,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {
         "type": "scene",
+        "embree_use_robust_intersections": True,  # for other integrators than this one
         "integrator": {
             "type": "splat_proxy",
             "quality": scene.spec.quality,

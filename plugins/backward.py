@@ -11,21 +11,26 @@ view records; Dr.Jit's own differentiation carries them on through the projectio
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
-from mitsplat.plugins.march import Lanes, march
+from mitsplat.plugins.march import march
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians
+from mitsplat.plugins.walk import Lanes
 from mitsplat.quality import KERNELS, Quality
 
 LN_2 = 0.6931471805599453
+
+PAIRS_AT_ONCE = 1 << 21
+"""Pairs of a Gaussian and a tile whose gradients are held at once, 256 bytes each."""
 
 
 def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[list[Any], Any]:
@@ -144,9 +149,59 @@ def march_backward(
     """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha."""
     if lists.pairs == 0:
         return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
+    if lists.pairs <= PAIRS_AT_ONCE:
+        return _gradient(lists, view, quality, image, gradient, slopes)
+    total = dr.zeros(mi.Float, RECORD * lists.visible)
+    for part, lane in _parts(lists):
+        us, vs = ([dr.gather(mi.Float, values, lane) for values in axis] for axis in slopes)
+        total += _gradient(part, view, quality, image, gradient, (us, vs))
+        dr.eval(total)
+    return total
+
+
+def _parts(lists: TileLists) -> Iterator[tuple[TileLists, Any]]:
+    """Lists of consecutive tiles with at most :data:`PAIRS_AT_ONCE` pairs, or of one tile; and numbers of their lanes.
+
+    Places by record are counted within each part.
+    """
+    begins = np.append(np.array(lists.start), lists.pairs).astype(np.int64)
+    first = 0
+    while first < len(begins) - 1:
+        last = int(np.searchsorted(begins, begins[first] + PAIRS_AT_ONCE, side="right")) - 1
+        last = min(max(last, first + 1), len(begins) - 1)
+        begin, pairs = int(begins[first]), int(begins[last] - begins[first])
+        if pairs:
+            entry = dr.arange(mi.UInt32, pairs) + dr.opaque(mi.UInt32, begin)
+            mine = dr.zeros(mi.UInt32, lists.pairs + 1)
+            dr.scatter(mine, mi.UInt32(1), dr.gather(mi.UInt32, lists.slots, entry))
+            place = dr.prefix_sum(mine)
+            tile = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
+            part = replace(
+                lists,
+                slots=dr.gather(mi.UInt32, place, lists.slots),
+                first=dr.gather(mi.UInt32, place, lists.first),
+                start=dr.gather(mi.UInt32, lists.start, tile),
+                stop=dr.gather(mi.UInt32, lists.stop, tile),
+                pairs=pairs,
+                tiles=tile,
+            )
+            dr.eval(part.slots, part.first, part.start, part.stop, tile)
+            yield part, dr.arange(mi.UInt32, (last - first) * TILE) + dr.opaque(mi.UInt32, first * TILE)
+        first = last
+
+
+def _gradient(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    image: Any,
+    gradient: list[Any],
+    slopes: tuple[list[Any], list[Any]],
+) -> Any:
+    """The gradient that comes from the tiles of some lists."""
     lanes = Lanes(lists, view)
     us, vs = slopes
-    column = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y * TILE) % TILE
+    column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE
     shares = dr.zeros(mi.Float, RECORD * TILE * lists.pairs)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end, near = dr.opaque(mi.Float, quality.transmittance_min), view.near_plane

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, TypeVar
 
@@ -31,6 +32,14 @@ def gathered(columns: Columns, index: Any) -> Columns:
     """The rows ``index`` of a dataclass of device arrays; those of one element hold for all rows."""
     values = [getattr(columns, f.name) for f in fields(columns)]  # type: ignore[arg-type]
     return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
+
+
+def ray_scene(contents: Mapping[str, Any]) -> mi.Scene:
+    """Mitsuba's scene of shapes, lights and what else ``contents`` names, between whose triangles no ray passes.
+
+    Embree loses rays that meet an edge which two triangles share, unless it is told not to; OptiX does not.
+    """
+    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents})
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import ray_scene, wrapped
 from mitsplat.splats import Splats
 
 SETS = 8
@@ -118,7 +118,7 @@ class SplatOccluders:
         params["faces"] = wrapped(mi.UInt32, triangles.astype(np.uint32))
         params.update()
         return cls(
-            mi.load_dict({"type": "scene", "mesh": mesh}),
+            ray_scene({"mesh": mesh}),
             mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in middle]),
             dr.opaque(mi.Float, float(radius)),
             wrapped(mi.Float, spared.astype(np.float32)),

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import ray_scene, wrapped
 from mitsplat.plugins.occlusion import Caster, SplatOccluders
 from mitsplat.surfels import CREASE_ANGLE, corner_normals
 
@@ -142,7 +142,7 @@ class _TraceScene:
             if not others:
                 return None
             nothing = mi.Float([0.0] * 9)
-            return cls(mi.load_dict({"type": "scene", **others}), None, mi.UInt32([0]), nothing, nothing)
+            return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing)
         corners, normals = [], []
         for occluder in occluders:
             turn, shift = occluder.world_from_mesh[:3, :3], occluder.world_from_mesh[:3, 3]
@@ -158,7 +158,7 @@ class _TraceScene:
         params.update()
         instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
         return cls(
-            mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh, **others}),
+            ray_scene({"mesh": mesh, **others}),
             mi.ShapePtr(mesh),
             wrapped(mi.UInt32, instances.astype(np.uint32)),
             positions,

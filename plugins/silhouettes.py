@@ -20,12 +20,12 @@ import trimesh
 
 from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
-from mitsplat.plugins.device import plain_mesh, wrapped
+from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.plugins.gaussian import RECORD
-from mitsplat.plugins.march import respond_along
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
-from mitsplat.plugins.tiles import TileLists, bin_gaussians
+from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, prefix_ranges
+from mitsplat.plugins.walk import respond_along
 from mitsplat.quality import Quality
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
@@ -44,14 +44,36 @@ def splat_silhouettes(
     if not objects:
         return {}
     canvas, left, top = _canvas(view)
-    fine = canvas.sampled(quality.samples)
-    lists = bin_gaussians(clouds, objects, fine, replace(quality, order="tile", sh_degree=0))
-    if lists.pairs == 0:
-        return {}
     ids = np.unique([placement.instance for placement in objects])
-    tile, slot = _occupied(lists, fine, ids)
-    covered = _covered(lists, fine, quality, tile, dr.gather(mi.Float, wrapped(mi.Float, ids.astype(np.float32)), slot))
-    return _assemble(np.array(tile), np.array(slot), np.array(covered), ids, canvas, left, top)
+    quality = replace(quality, order="tile", sh_degree=0)
+    covered = _cover(clouds, objects, canvas.sampled(quality.samples), quality, ids)
+    return _assemble(*covered, ids, canvas, left, top)
+
+
+def _cover(
+    clouds: CloudSet, objects: Sequence[Placement], canvas: View, quality: Quality, ids: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tile, instance (as position in ``ids``) and covered pixels of every pair of them, see :func:`_covered`.
+
+    A canvas that is too crowded for the memory is looked at in parts.
+    """
+    try:
+        lists = bin_gaussians(clouds, objects, canvas, quality)
+        found = _occupied(lists, canvas, ids)
+    except CrowdedError:
+        if canvas.tiles_y == 1:
+            raise
+        middle = canvas.tiles_y // 2
+        upper, lower = canvas.rows(0, middle * TILE), canvas.rows(middle * TILE, canvas.height)
+        (above, *rest), (below, *more) = (_cover(clouds, objects, part, quality, ids) for part in (upper, lower))
+        tile = np.concatenate([above, below + middle * canvas.tiles_x])
+        slot, bits = (np.concatenate(parts) for parts in zip(rest, more, strict=True))
+        return tile, slot, bits
+    if found is None:
+        return (np.zeros(0, dtype=np.uint32),) * 3
+    tile, slot = found
+    instance = dr.gather(mi.Float, wrapped(mi.Float, ids.astype(np.float32)), slot)
+    return np.array(tile), np.array(slot), np.array(_covered(lists, canvas, quality, tile, instance))
 
 
 def proxy_silhouettes(
@@ -114,28 +136,40 @@ def _margin(
     return MARGINS[-1]
 
 
-def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any]:
-    """Every pair of a tile and an instance (as position in ``ids``) that has a Gaussian in it."""
-    tiles, slots = view.tiles_x * view.tiles_y, len(ids)
+def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any] | None:
+    """Every pair of a tile and an instance (as position in ``ids``) that has a Gaussian in it; None if there is none.
+
+    They are found as one bit each.
+    """
+    if lists.pairs == 0:
+        return None
+    tile = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y)
     slot_of_id = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
-    slot_of_id[ids] = np.arange(slots, dtype=np.uint32)
-    # The tile of every entry: one more at each tile's first entry.
-    marks = dr.zeros(mi.UInt32, lists.pairs)
-    tile = dr.arange(mi.UInt32, tiles)
-    filled = dr.compress(lists.stop > lists.start)
-    dr.scatter(marks, mi.UInt32(1), dr.gather(mi.UInt32, lists.start, filled))
-    owner = dr.gather(mi.UInt32, filled, dr.cumsum(marks) - 1)
-    instance = dr.gather(mi.Float, lists.records, lists.entries * RECORD + RECORD - 1)
-    slot = dr.gather(mi.UInt32, wrapped(mi.UInt32, slot_of_id), mi.UInt32(instance))
-    seen = dr.zeros(mi.UInt32, tiles * slots)
-    count = dr.opaque(mi.UInt32, slots)
-    dr.scatter(seen, mi.UInt32(1), owner * count + slot)
-    dr.eval(seen, tile)
-    pair = dr.compress(seen != 0)
-    tile = pair // count
-    slot = pair - tile * count
-    dr.eval(tile, slot)
-    return tile, slot
+    slot_of_id[ids] = np.arange(len(ids), dtype=np.uint32)
+    slots, words = wrapped(mi.UInt32, slot_of_id), dr.opaque(mi.UInt32, -(-len(ids) // 32))
+    seen = dr.zeros(mi.UInt32, dr.width(tile) * -(-len(ids) // 32))
+
+    def mark(i: Any) -> tuple[Any]:
+        record = dr.gather(mi.UInt32, lists.entries, i)
+        instance = dr.gather(mi.Float, lists.records, record * RECORD + RECORD - 1)
+        slot = dr.gather(mi.UInt32, slots, mi.UInt32(instance))
+        dr.scatter_reduce(dr.ReduceOp.Or, seen, mi.UInt32(1) << (slot & 31), tile * words + (slot >> 5))
+        return (i + 1,)
+
+    dr.while_loop((mi.UInt32(lists.start),), lambda i: i < lists.stop, mark, label="occupied")
+    dr.eval(seen)
+    begin, pairs = prefix_ranges(dr.popcnt(seen))
+    word = dr.arange(mi.UInt32, dr.width(seen))
+    owner, slot = dr.empty(mi.UInt32, pairs), dr.empty(mi.UInt32, pairs)
+
+    def emit(left: Any, place: Any) -> tuple[Any, Any]:
+        dr.scatter(owner, word // words, place, mode=dr.ReduceMode.Permute)
+        dr.scatter(slot, word % words * 32 + dr.tzcnt(left), place, mode=dr.ReduceMode.Permute)
+        return left & (left - 1), place + 1
+
+    dr.while_loop((mi.UInt32(seen), mi.UInt32(begin)), lambda left, _: left != 0, emit, label="occupied pairs")
+    dr.eval(owner, slot)
+    return owner, slot
 
 
 def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance: Any) -> Any:
@@ -146,10 +180,8 @@ def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance
     row = tile // view.tiles_x
     x = mi.Float((tile - row * view.tiles_x) * TILE + column)
     y = mi.Float(row * TILE)
-    n = quality.samples
-    middle = n * n // 2  # the sample that the instance image shows
-    dx, dy = dr.opaque(mi.Float, (middle % n + 0.5) / n), dr.opaque(mi.Float, (middle // n + 0.5) / n)
-    slopes = [view.slopes(x + dx, y + k + dy) for k in range(TILE)]
+    centre = dr.opaque(mi.Float, 0.5)  # as in the instance image, whatever the number of samples
+    slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
     start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
@@ -240,4 +272,4 @@ def _trace_alone(view: View, window: tuple[int, int, int, int], mesh: trimesh.Tr
 
 @lru_cache(maxsize=128)
 def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> Any:
-    return mi.load_dict({"type": "scene", "mesh": plain_mesh(mesh)})
+    return ray_scene({"mesh": plain_mesh(mesh)})

@@ -14,7 +14,7 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
-from mitsplat.plugins.device import gathered, wrapped
+from mitsplat.plugins.device import gathered, ray_scene, wrapped
 from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
@@ -67,7 +67,7 @@ class _Contents:
     clouds: CloudSet | None
     placements: tuple[Placement, ...]
     proxies: Proxies
-    visible_meshes: bool
+    visible: Any | None
     relit: Any
     roughness: Any
     specular: Any
@@ -234,7 +234,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _layers(self, contents: _Contents, scene: Any, view: View, accuracy: Accuracy, seed: int) -> dict[str, Any]:
         """The layers that one point of the lens sees."""
         rays = view.rays()
-        behind = _trace_meshes(scene, view, rays) if contents.visible_meshes else None
+        behind = _trace_meshes(contents.visible, view, rays) if contents.visible is not None else None
         splat = self._trace_splats(contents, view, behind.depth if behind else None)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
@@ -244,7 +244,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
         alpha, depth, instance, front = splat.alpha, splat.depth, splat.instance, mi.Bool(False)
         if behind:
-            front = behind.valid & (splat.alpha < 0.5)
+            front = behind.valid & (splat.centre_alpha < 0.5)
             colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
             alpha = dr.select(behind.valid, 1, alpha)
             depth = dr.select(front, behind.depth, depth)
@@ -360,7 +360,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             self._upload(distinct),
             placements,
             Proxies(occluders, visible, casters),
-            bool(visible),
+            ray_scene({f"shape_{i}": shape for i, shape in enumerate(visible)}) if visible else None,
             wrapped(mi.Bool, relit),
             wrapped(mi.Float, roughness),
             wrapped(mi.Float, specular),
@@ -412,7 +412,7 @@ class _Behind:
 
 def _trace_meshes(scene: Any, view: View, rays: Any) -> _Behind:
     si = scene.ray_intersect(rays)
-    valid = si.is_valid() & (si.emitter(scene) == None)  # noqa: E711 - element-wise comparison of pointers
+    valid = si.is_valid()
     reflectance = si.bsdf().eval_diffuse_reflectance(si, valid)
     depth = dr.select(valid, si.t * view.cosine(rays), dr.inf)
     dr.eval(depth, reflectance, valid)

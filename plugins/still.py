@@ -14,10 +14,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.plugins.march import Image, Lanes, march
+from mitsplat.plugins.march import Image, march
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians, merge_lists
+from mitsplat.plugins.walk import Lanes
 from mitsplat.quality import Quality
 
 

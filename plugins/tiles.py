@@ -178,7 +178,7 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
     """Records (counted from ``shift``), places in ``tiles``, and levels of the entries of some tiles; None if none."""
     start = dr.gather(mi.UInt32, lists.start, tiles)
     length = dr.gather(mi.UInt32, lists.stop, tiles) - start
-    begin, size = _ranges(length)
+    begin, size = prefix_ranges(length)
     if size == 0:
         return None
     number, place, level = (dr.empty(mi.UInt32, size) for _ in range(3))
@@ -215,7 +215,7 @@ def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _
     count = dr.width(least)
     order = dr.arange(mi.UInt32, count)
     x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
-    row_of, rows = _ranges(dr.select(y1 > y0, y1 - y0, 0))
+    row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0))
     if rows == 0:
         return None
     # Rows first: one lane finds the spans of one record, and then one lane fills one span.
@@ -235,7 +235,7 @@ def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _
 
     dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
     dr.eval(owner, first_tile, length)
-    pair_of, pairs = _ranges(length)
+    pair_of, pairs = prefix_ranges(length)
     if pairs == 0:
         return None
     record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
@@ -262,7 +262,7 @@ def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _
     return _Pairs(number, tile_of, level_of, first)
 
 
-def _ranges(sizes: Any) -> tuple[Any, int]:
+def prefix_ranges(sizes: Any) -> tuple[Any, int]:
     """Where each of consecutive ranges begins, and their whole size.
 
     Raises:

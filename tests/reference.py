@@ -47,6 +47,22 @@ def render_reference(splats: Splats, camera: Camera, quality: Quality = PRESETS[
     return Reference(np.reshape(rgb, (*shape, 3)), np.reshape(alpha, shape), np.reshape(depth, shape))
 
 
+def reference_shares(splats: Splats, instances: npt.NDArray[np.integer], camera: Camera) -> Array:
+    """Share (H, W, max id + 1) that the Gaussians of each instance, whose ids are given by row, have of each ray.
+
+    What is left of a ray belongs to the environment, id 0.
+    """
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    shares = np.zeros((camera.height * camera.width, int(instances.max()) + 1))
+    for row, (u, v) in zip(shares, camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1)), strict=True):
+        opacity, z = responses(splats, camera, u, v)
+        order = np.argsort(z, kind="stable")
+        transmittance = np.concatenate([[1.0], np.cumprod(1.0 - opacity[order])])
+        np.add.at(row, instances[order], transmittance[:-1] * opacity[order])
+        row[0] += transmittance[-1]
+    return shares.reshape(camera.height, camera.width, -1)
+
+
 def responses(splats: Splats, camera: Camera, u: float, v: float) -> tuple[Array, Array]:
     """Opacity along the ray of slopes (u, v), and depth of the peak, of every Gaussian (N,); 0 if it is not ahead."""
     pose = camera.camera_from_world

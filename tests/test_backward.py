@@ -12,6 +12,7 @@ import pytest
 from reference import render_reference
 from test_render import CAMERA, make_splats
 
+from mitsplat.camera import Camera
 from mitsplat.plugins import backward
 from mitsplat.quality import Quality
 from mitsplat.render import ensure_variant, make_sensor
@@ -42,7 +43,7 @@ def loss_of_twin(splats: Splats) -> float:
     return float((twin.rgb * colour).sum() + (twin.alpha * alpha).sum())
 
 
-def gradients(splats: Splats) -> dict[str, np.ndarray]:
+def gradients(splats: Splats, camera: Camera = CAMERA) -> dict[str, np.ndarray]:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of
 
@@ -50,7 +51,7 @@ def gradients(splats: Splats) -> dict[str, np.ndarray]:
     for value in inputs.values():
         dr.enable_grad(value)
     cloud = backward.pack_cloud(*inputs.values(), splats.sh.shape[1])
-    rgb, alpha = backward.render_differentiable(cloud, view_of(make_sensor(CAMERA)), QUALITY)
+    rgb, alpha = backward.render_differentiable(cloud, view_of(make_sensor(camera)), QUALITY)
     colour_weight, alpha_weight = weights()
     loss = dr.sum(alpha * mi.Float(alpha_weight.ravel()))
     for i in range(3):
@@ -79,6 +80,24 @@ def test_gradients_equal_finite_differences_of_the_twin(bands: int) -> None:
             assert got == pytest.approx(expected, rel=2e-2, abs=2e-2)
         else:
             assert got == pytest.approx(expected, rel=1e-2, abs=1e-2), name
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
+@pytest.mark.parametrize("at_once", [1, 3000])
+def test_gradients_made_in_parts_are_those_of_the_whole(
+    at_once: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a view's are whose pairs do not fit in the memory: tile by tile, or in parts of many tiles."""
+    splats, camera = make_splats(300, 36, bands=4), replace(CAMERA, distortion=distortion)
+    whole = gradients(splats, camera)
+    parts: list[int] = []
+    gradient = backward._gradient
+    monkeypatch.setattr(backward, "_gradient", lambda lists, *rest: parts.append(lists.pairs) or gradient(lists, *rest))
+    monkeypatch.setattr(backward, "PAIRS_AT_ONCE", at_once)
+    found = gradients(splats, camera)
+    assert len(parts) > 1 and max(parts) <= max(at_once, len(splats))  # a tile has no more than all
+    for name, values in whole.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-4, atol=1e-5 * np.abs(values).max())
 
 
 def test_needles_thinner_than_rounding_have_finite_gradients() -> None:

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 import mitsplat as ms
+from mitsplat.errors import MissingResourceError
 from mitsplat.quality import Quality
 from mitsplat.render import ensure_variant, make_integrator, make_splats_shape, render_layers, render_silhouettes
 
@@ -116,3 +117,39 @@ def test_a_scene_without_instances_has_no_silhouettes() -> None:
     integrator = make_integrator(shadow="none")
     assert render_silhouettes(integrator, scene, camera()) == {}
     assert render_silhouettes(integrator, scene, camera(), source="proxies") == {}
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_crowded_silhouettes_are_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+    from mitsplat.plugins import tiles
+
+    ensure_variant()
+    scene = mi.load_dict({"type": "scene", **placed()})
+    integrator = make_integrator(quality=Quality(samples=samples), shadow="none")
+    whole = render_silhouettes(integrator, scene, camera())
+    monkeypatch.setattr(tiles, "PAIRS_MAX", 3000)
+    parts = render_silhouettes(integrator, scene, camera())
+    assert set(parts) == set(whole)
+    for number, silhouette in whole.items():
+        assert parts[number].box == silhouette.box
+        np.testing.assert_array_equal(parts[number].mask, silhouette.mask)
+    monkeypatch.setattr(tiles, "PAIRS_MAX", 10)
+    with pytest.raises(MissingResourceError, match="cover too much of the image"):
+        render_silhouettes(integrator, scene, camera())
+
+
+def test_many_instances_have_their_silhouettes_where_they_are() -> None:
+    """More instances than a word has bits, with ids that are far apart."""
+    ensure_variant()
+    splats, _ = ball(1, radius=0.01, count=40)
+    shapes = {}
+    for number in range(70):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.04 * (number % 10 - 4.5), 0, 0.04 * (number // 10 - 3)
+        shapes[f"instance_{number}"] = make_splats_shape(splats, pose, instance=900 * number + 1)
+    found = render_silhouettes(make_integrator(shadow="none"), mi.load_dict({"type": "scene", **shapes}), camera())
+    assert set(found) == {900 * number + 1 for number in range(70)}
+    for number in range(70):
+        pixel, _ = camera().project([(0.04 * (number % 10 - 4.5), 0, 0.04 * (number // 10 - 3))])
+        x0, y0, x1, y1 = found[900 * number + 1].box
+        assert np.abs(pixel[0] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() < 1.5

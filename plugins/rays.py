@@ -132,15 +132,19 @@ class View:
         """World-space rays through the pixels' centres, row-major, of unit direction."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         row = pixel // self.width
-        u, v = self.slopes(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
-        axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3].T]
-        right, down, forward, centre = axes
         ray = dr.zeros(mi.Ray3f, dr.width(pixel))
-        ray.d = dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
-        ray.o = mi.Point3f(*centre)
+        ray.d = self.direction(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
+        ray.o = mi.Point3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 3]])
         ray.maxt = dr.inf
         dr.eval(ray)
         return ray
+
+    def direction(self, x: Any, y: Any) -> Any:
+        """World-space unit vectors of the rays through pixel positions (x, y) [px]."""
+        u, v = self.slopes(x, y)
+        axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3, :3].T]
+        right, down, forward = axes
+        return dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
 
     def cosine(self, rays: Any) -> Any:
         """Depth along z per unit of distance along each ray."""

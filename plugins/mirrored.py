@@ -90,8 +90,8 @@ class SplatMirror:
         found = active & met & hit.is_valid()
         owner = dr.gather(mi.Point2u, self.gaussians, hit.prim_index, found)
         row = dr.gather(mi.ArrayXf, self.table, owner.x, found, shape=(_ROW, dr.width(owner)))
-        turn = mi.Matrix3f([[row[3 * i + j] for j in range(3)] for i in range(3)])
-        own = dr.normalize(turn @ ray.d)
+        axes_of = [mi.Vector3f(*[row[3 * i + j] for j in range(3)]) for i in range(3)]
+        own = mi.Vector3f(*[dr.dot(axis, ray.d) for axis in axes_of])
         stride = self.clouds.sh_stride
         packet = dr.gather(mi.ArrayXf, self.clouds.sh, owner.y, found, shape=(stride, dr.width(owner)))
         colour = evaluate_sh(own, lambda k: [packet[3 * k + i] for i in range(3)], self.clouds.sh_count)
@@ -104,7 +104,7 @@ class SplatMirror:
         return Glimpse(
             distance=dr.select(found, start + hit.t, dr.inf),
             colour=colour,
-            normal=dr.transpose(turn) @ side,
+            normal=axes_of[0] * side.x + axes_of[1] * side.y + axes_of[2] * side.z,
             relit=found & (row[9] > 0),
             footprint=row[10],
         )

@@ -24,6 +24,7 @@ from mitsplat.plugins.occlusion import Caster
 from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
+from mitsplat.plugins.sensors import view_of
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.still import StillLayer
 from mitsplat.plugins.tiles import CrowdedError
@@ -544,30 +545,6 @@ def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen,
         known=known,
         valid=valid,
     )
-
-
-def view_of(sensor: Any) -> View:
-    """The camera of a sensor: ``opencv_camera``, or Mitsuba's own ``perspective``.
-
-    Raises:
-        InputError: If the sensor is of another kind.
-    """
-    if hasattr(sensor, "view"):
-        return sensor.view()
-    width, height = (int(n) for n in sensor.film().size())
-    params = mi.traverse(sensor)
-    if "x_fov" not in params or "to_world" not in params:
-        raise InputError("integrator 'splat_proxy': the sensor must be 'opencv_camera' or 'perspective'")
-    focal = 0.5 * width / np.tan(0.5 * np.radians(float(np.array(params["x_fov"]).ravel()[0])))
-    shift = [
-        float(np.array(params[f"principal_point_offset_{a}"]).ravel()[0])
-        if f"principal_point_offset_{a}" in params
-        else 0.0
-        for a in "xy"
-    ]
-    pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-    near = float(np.array(params["near_clip"]).ravel()[0])
-    return View(width, height, focal, focal, width * (0.5 + shift[0]), height * (0.5 + shift[1]), pose, (), near)
 
 
 def _number(props: mi.Properties, name: str, default: float) -> float:

@@ -34,6 +34,9 @@ R7 = (3915259345, 3569120481, 3253582939, 2965941329, 2703729436, 2464699080, 22
 PER_VERTEX = 16
 """Random numbers that are kept for every vertex of a path."""
 
+ROUNDS = 8
+"""Of the hash behind them (Zafar et al. 2010): after four, numbers of neighbouring pixels are still alike."""
+
 _BENT = ("NormalMap", "BumpMap")
 """Materials that bend the normals of the one that they hold."""
 
@@ -381,10 +384,10 @@ class _Dice:
     def number_of(self, depth: int, dimension: int) -> Any:
         """A number in [0, 1)."""
         if depth == 0 and dimension < len(R7):
-            shift = mi.sample_tea_32(self.pixel, self.seed + self._dimension(0, dimension), 4)[0]
+            shift = mi.sample_tea_32(self.pixel, self.seed + self._dimension(0, dimension), ROUNDS)[0]
             return mi.Float((shift + self.number * R7[dimension]) >> 8) * 2.0**-24
-        own = mi.sample_tea_32(self.pixel, self.number + self.seed, 4)[0]
-        return mi.sample_tea_float32(own, self._dimension(depth, dimension), 4)
+        own = mi.sample_tea_32(self.pixel, self.number + self.seed, ROUNDS)[0]
+        return mi.sample_tea_float32(own, self._dimension(depth, dimension), ROUNDS)
 
     @staticmethod
     def _dimension(depth: int, dimension: int) -> Any:

@@ -207,6 +207,8 @@ class PathTracer:
         ``ray`` through the pixel's centre meets a mesh at ``hit``. Other rays of the pixel start paths where they do.
         """
         count = dr.width(pixel)
+        # Far apart, so that no two pictures share random numbers.
+        seed = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
         most = max(1, min(samples, LANES // count))
         total, done = mi.Color3f(dr.zeros(mi.Float, count)), 0
         while done < samples:
@@ -214,7 +216,7 @@ class PathTracer:
             lane = dr.arange(mi.UInt32, count * own)
             row = lane // dr.opaque(mi.UInt32, own)
             number = lane - row * own + dr.opaque(mi.UInt32, done)
-            dice = _Dice(dr.gather(mi.UInt32, pixel, row), number, dr.opaque(mi.UInt32, self.seed))
+            dice = _Dice(dr.gather(mi.UInt32, pixel, row), number, seed)
             centre = dr.gather(mi.Ray3f, ray, row), dr.gather(mi.PreliminaryIntersection3f, hit, row)
             dr.eval(lane, dice, centre)
             path = _Path(lane, *self._beside(view, dice, *centre), dr.full(mi.Color3f, 1, count * own))

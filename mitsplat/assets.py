@@ -34,7 +34,7 @@ from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 
-_FILE = "asset.yaml"
+ASSET_FILE = "asset.yaml"
 _Z_UP_FROM = {
     "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
@@ -150,12 +150,12 @@ class Asset:
             InputError: If ``asset.yaml`` or a file that it names is missing or breaks a rule.
         """
         folder = Path(folder)
-        spec = load_yaml(folder / _FILE, AssetSpec)
+        spec = read_spec(folder)
         splats = Splats.load(_named_file(folder, "splats", spec.splats))
         if spec.mesh is None:
             mesh = None
         elif spec.mesh == "hull":
-            mesh = _hull(opaque_core(splats), key_place(folder / _FILE, ("mesh",)))
+            mesh = _hull(opaque_core(splats), key_place(folder / ASSET_FILE, ("mesh",)))
         else:
             mesh = read_mesh(_named_file(folder, "mesh", spec.mesh))
         asset = cls(
@@ -223,7 +223,7 @@ class Asset:
             if stored.pieces:
                 _joined(stored.pieces).export(folder / "pieces.ply")
             # Last, so that an interrupted save is not mistaken for an asset.
-            YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), folder / _FILE)
+            YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), folder / ASSET_FILE)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
 
@@ -309,6 +309,15 @@ class Asset:
         return tuple(findings)
 
 
+def read_spec(folder: str | PathLike[str]) -> AssetSpec:
+    """What an asset folder's ``asset.yaml`` says.
+
+    Raises:
+        InputError: If it is missing or breaks a rule.
+    """
+    return load_yaml(Path(folder) / ASSET_FILE, AssetSpec)
+
+
 def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
     """Read any mesh file that trimesh knows; several parts become one mesh.
 
@@ -341,7 +350,7 @@ def _named_file(folder: Path, key: str, name: str) -> Path:
     try:
         return file_inside(folder, name)
     except InputError as error:
-        raise InputError(f"{key_place(folder / _FILE, (key,))}: {error}") from error
+        raise InputError(f"{key_place(folder / ASSET_FILE, (key,))}: {error}") from error
 
 
 def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:

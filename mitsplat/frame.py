@@ -250,6 +250,8 @@ def light_properties(scene: Scene) -> dict[str, Any]:
         "highlight": composite.highlight,
         "reference": list(reference_point(scene)),
         "white": white_irradiance(scene),
+        # What no splat covers is the grey of mitsplat.composite, which draws no light source.
+        "hide_emitters": True,
     }
 
 

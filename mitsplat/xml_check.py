@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from xml.parsers import expat
 
+from mitsplat.assets import ASSET_FILE
 from mitsplat.errors import InputError
 from mitsplat.files import is_inside
 
@@ -101,10 +102,14 @@ def _offence(folder: Path, element: str, key: str, value: str) -> str:
 
 
 def _names_outside(folder: Path, text: str) -> bool:
-    """Whether a text is the name of a file, seen from the scene or from here, that is not in the folder."""
+    """Whether a text names a file or an asset, seen from the scene or from here, that is not in the folder."""
     if not text or "\0" in text or len(text) > 4096:
         return False
     try:
-        return any((base / text).is_file() and not is_inside(folder, str(base / text)) for base in (folder, Path.cwd()))
+        return any(
+            ((base / text).is_file() or (base / text / ASSET_FILE).is_file())
+            and not is_inside(folder, str(base / text))
+            for base in (folder, Path.cwd())
+        )
     except OSError:
         return False

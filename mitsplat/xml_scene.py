@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,11 +94,9 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     picture.parent.mkdir(parents=True, exist_ok=True)
     try:
         scene = mi.load_file(str(path.resolve()))
-        if not scene.sensors():
-            raise InputError(f"{path}: the scene has no sensor")
-        image = np.array(mi.render(scene))
+        image = np.array(_render(path, scene))
     except RuntimeError as error:
-        raise InputError(f"{path}: {_last_sentence(error)}") from error
+        raise InputError(one_sentence(path, str(error))) from error
     if picture.suffix.lower() == ".exr":
         mi.Bitmap(image[..., :3]).write(str(picture))
         return picture
@@ -129,9 +128,63 @@ class _RenderOne:
         return render_xml(self.path, self.out, allow_outside=self.allow_outside)
 
 
-def _last_sentence(error: RuntimeError) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else "Mitsuba refuses it without a reason"
+def _render(path: Path, scene: Any) -> Any:
+    from mitsplat.plugins.sensors import view_of
+    from mitsplat.plugins.splat_proxy import SplatProxyIntegrator
+
+    if not scene.sensors():
+        raise InputError(f"{path}: the scene has no sensor")
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    if isinstance(integrator, SplatProxyIntegrator):
+        try:
+            view_of(sensor)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+    elif any(hasattr(shape, "world_from_splats") for shape in scene.shapes()):
+        raise InputError(f"{path}: shape 'splats' is only seen by the integrator 'splat_proxy'")
+    # Not by mi.render, which says "see above" in place of what is wrong.
+    return integrator.render(scene, sensor)
+
+
+_PLACE = re.compile(r"(?:[Ww]hile loading|At) (?P<file>.+?) \(line (?P<line>\d+), col \d+\):\s*")
+_UNKNOWN = re.compile(r'unreferenced propert\w+ in (?P<kind>\w+) plugin of type "(?P<type>[^"]+)"')
+_PROPERTY = re.compile(r'- \S+ "(?P<name>[^"]+)"')
+
+
+def one_sentence(path: Path, message: str) -> str:
+    """What Mitsuba says of a scene, as place, rule and value, without the stack that it went through."""
+    place = str(path)
+    found = _PLACE.search(message)
+    if found:
+        file = Path(found["file"])
+        # As the user has named it, where it is that file.
+        place = f"{path if file == path.resolve() else file}:{found['line']}"
+    unknown = _UNKNOWN.search(message)
+    if unknown:
+        names = ", ".join(repr(name) for name in _PROPERTY.findall(message[unknown.end() :]))
+        known = f"; it takes {', '.join(documented)}" if (documented := _documented(unknown["type"])) else ""
+        return f"{place}: {unknown['kind']} {unknown['type']!r} takes no {names}{known}"
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    last = lines[-1] if lines else "Mitsuba refuses it without a reason"
+    last = last.removeprefix(f"{InputError.__name__}: ")
+    last = re.sub(r"^\[\w+\.cpp:\d+\] ", "", last)
+    last = _PLACE.sub("", last.removeprefix("Error "))
+    last = re.sub(r"\[\w+\] (Error while \w+ing )?", "", last)
+    return last if last.startswith(place) else f"{place}: {last}"
+
+
+def _documented(plugin: str) -> list[str]:
+    """Properties that one of our plugins takes."""
+    from mitsplat.plugins import opencv_camera, splat_proxy, splats
+
+    classes = {
+        "splats": splats.SplatsShape,
+        "opencv_camera": opencv_camera.OpenCVCamera,
+        "splat_proxy": splat_proxy.SplatProxyIntegrator,
+    }
+    text = classes[plugin].__doc__ if plugin in classes else None
+    rows = re.findall(r"\* - ([\w, ]+)\n\s+- \|", text or "")
+    return [name for row in rows for name in row.split(", ")]
 
 
 def _write_asset(asset: Asset, stem: Path) -> Path:

@@ -121,6 +121,13 @@ def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
     return [dr.maximum(c, 0.0) for c in colour]
 
 
+def srgb_to_linear(value: Any) -> Any:
+    """IEC 61966-2-1 electro-optical transfer, extended above 1."""
+    return dr.select(
+        value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4)
+    )
+
+
 def rotation_axes(q: Any) -> Axes:
     """Columns of the rotation matrix of a quaternion xyzw: the Gaussian's axes in its frame."""
     x, y, z, w = q

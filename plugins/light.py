@@ -61,7 +61,8 @@ class Surface:
         lift: Displacement [m] from the triangle to the smooth surface that it stands for.
         to_camera: Unit vector towards the camera.
         offset: How far shadow rays start off the surface [m].
-        instance: Instance id (Float); light is not averaged across its borders.
+        instance: Instance id (Float).
+        trait: Row of the shape's traits (Float); light is not averaged across its borders.
         relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
         roughness, specular: GGX roughness and reflectance at normal incidence.
         known: Whether the proxy of what is seen says so; else position and normal are a guess.
@@ -75,6 +76,7 @@ class Surface:
     to_camera: Any
     offset: Any
     instance: Any
+    trait: Any
     relit: Any
     roughness: Any
     specular: Any

@@ -116,7 +116,7 @@ class LightFilter:
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        traits = _packed([*here.position, *here.normal, here.instance, known, rays, *(share or (0, 0))])
+        traits = _packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])
         steps = [s for r in range(1, radius + 1) for s in (-r, r)]
         for direction in ((1, 0), (0, 1)):
             values = self._average_along(values, traits, [(s * direction[0], s * direction[1]) for s in steps], share)
@@ -141,8 +141,8 @@ class LightFilter:
             same = inside & (place != NOWHERE)
             other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
             position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
-            instance, known, rays = other[6], other[7] > 0, other[8]
-            same &= instance == here.instance
+            trait, known, rays = other[6], other[7] > 0, other[8]
+            same &= trait == here.trait
             plane = dr.abs(dr.dot(here.normal, position - here.position))
             near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * (8 * distance))
             if share is not None:

@@ -65,36 +65,39 @@ class Caster:
 
 
 @dataclass(frozen=True, eq=False)
-class SplatOccluders:
-    """Sets of solids that shadow rays may be stopped by, all in one Mitsuba scene, beside each other along x.
+class Solids:
+    """Sets of solids that rays may be stopped by, all in one Mitsuba scene, beside each other along x.
 
     Attributes:
         scene: The scene, with the middle of the first set in its origin.
         middle: Middle of the splats in the world [m].
         radius: Radius around it [m].
-        spared: By instance, how far a ray goes before splats may stop it [m].
         sets: Number of sets.
+        owners: Caster, and number among its splats, of the Gaussian that every triangle stands for, shape (2, T).
+        footprints: Distance [m] within which the splats of each caster do not shadow their own object, shape (N,).
     """
 
     scene: Any
     middle: Any
     radius: Any
-    spared: Any
     sets: int
+    owners: npt.NDArray[np.uint32]
+    footprints: npt.NDArray[np.float64]
 
     @classmethod
-    def build(cls, casters: Sequence[Caster], sets: int = SETS) -> SplatOccluders | None:
-        """Occluders of some splats; None if nothing in them is opaque enough."""
+    def build(cls, casters: Sequence[Caster], sets: int = SETS) -> Solids | None:
+        """Solids of some splats; None if nothing in them is opaque enough."""
         rng = np.random.default_rng(0)
-        corners, faces, count = [], [], 0
-        spared = np.zeros(1 + max((c.instance for c in casters), default=0))
-        for caster in casters:
-            splats = caster.splats.select(caster.splats.opacities > FAINTEST)
-            if not len(splats):
+        corners, faces, owners, count = [], [], [], 0
+        footprints = np.zeros(len(casters))
+        for row, caster in enumerate(casters):
+            kept = np.flatnonzero(caster.splats.opacities > FAINTEST)
+            if not len(kept):
                 continue
+            splats = caster.splats.select(kept)
             axes, centres = _ellipsoids(splats, caster.world_from_splats)
             lengths = np.linalg.norm(axes, axis=1)
-            spared[caster.instance] = FOOTPRINT * np.quantile(lengths[:, 0], 0.9)
+            footprints[row] = FOOTPRINT * np.quantile(lengths[:, 0], 0.9)
             flat = lengths[:, 2] < FLAT * lengths[:, 1]
             for number, radii in enumerate(_radii(splats.opacities.astype(np.float64), sets, rng)):
                 for those, shape in ((flat & (radii > 0), _SQUARE), (~flat & (radii > 0), _OCTAHEDRON)):
@@ -104,6 +107,8 @@ class SplatOccluders:
                     points = np.einsum("nij,nkj->nki", axes[those], points) + centres[those, None]
                     corners.append((number, points.reshape(-1, 3)))
                     faces.append(shape[1] + len(shape[0]) * np.arange(len(points))[:, None, None] + count)
+                    gaussians = np.repeat(kept[those], len(shape[1]))
+                    owners.append(np.stack([np.full_like(gaussians, row), gaussians]))
                     count += points.size // 3
         if not count:
             return None
@@ -121,15 +126,17 @@ class SplatOccluders:
             ray_scene({"mesh": mesh}),
             mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in middle]),
             dr.opaque(mi.Float, float(radius)),
-            wrapped(mi.Float, spared.astype(np.float32)),
             sets,
+            np.concatenate(owners, axis=1).astype(np.uint32),
+            footprints,
         )
 
-    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
-        """Whether rays from points of some instances are stopped; a ``key`` per ray decides by chance."""
+    def enter(self, ray: Any, key: Any, near: Any) -> tuple[Any, Any, Any]:
+        """Rays as one of the sets sees them, how far on they start, and whether they meet its ball.
+
+        Each takes the set that its ``key`` decides, and starts ``near`` [m] on or later.
+        """
         number = mi.UInt32(mi.sample_tea_float32(key, mi.UInt32(self.sets), 4) * self.sets)
-        instance = mi.UInt32(instance)
-        near = dr.gather(mi.Float, self.spared, instance, active & (instance < dr.width(self.spared)))
         # Only what lies in the ball around its own set may stop a ray.
         start = ray.o - self.middle
         along = dr.dot(start, ray.d)
@@ -138,8 +145,37 @@ class SplatOccluders:
         near, far = dr.maximum(near, -along - reach), dr.minimum(ray.maxt, reach - along)
         inside = mi.Ray3f(start + ray.d * near + mi.Vector3f(2 * self.radius * mi.Float(number), 0, 0), ray.d)
         inside.maxt = dr.maximum(far - near, 0)
-        active &= (half > 0) & (far > near)
-        return active & self.scene.ray_test(inside, active=active)
+        return inside, near, (half > 0) & (far > near)
+
+
+@dataclass(frozen=True, eq=False)
+class SplatOccluders:
+    """Splats that shadow rays may be stopped by.
+
+    Attributes:
+        solids: What they are to a ray.
+        spared: By instance, how far a ray goes before splats may stop it [m].
+    """
+
+    solids: Solids
+    spared: Any
+
+    @classmethod
+    def build(cls, casters: Sequence[Caster], sets: int = SETS) -> SplatOccluders | None:
+        """Occluders of some splats; None if nothing in them is opaque enough."""
+        solids = Solids.build(casters, sets)
+        if solids is None:
+            return None
+        spared = np.zeros(1 + max(c.instance for c in casters), np.float32)
+        np.maximum.at(spared, [c.instance for c in casters], solids.footprints.astype(np.float32))
+        return cls(solids, wrapped(mi.Float, spared))
+
+    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+        """Whether rays from points of some instances are stopped; a ``key`` per ray decides by chance."""
+        instance = mi.UInt32(instance)
+        near = dr.gather(mi.Float, self.spared, instance, active & (instance < dr.width(self.spared)))
+        inside, _, met = self.solids.enter(ray, key, near)
+        return active & met & self.solids.scene.ray_test(inside, active=active & met)
 
 
 def _ellipsoids(

@@ -59,6 +59,8 @@ class OpenCVCamera(mi.Sensor):
         self.world_from_mitsuba = np.array(
             props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64
         ).reshape(4, 4)
+        if np.abs(self.world_from_mitsuba[:3, :3].T @ self.world_from_mitsuba[:3, :3] - np.eye(3)).max() > 1e-4:
+            raise InputError("sensor 'opencv_camera': 'to_world' must be a rotation and a translation")
         width, height = self.film().size()
         self.fx, self.fy = _positive(props, "fx", None), _positive(props, "fy", None)
         self.cx = _number(props, "cx", width / 2)

@@ -71,13 +71,13 @@ class Proxies:
     def __init__(
         self, occluders: Sequence[Occluder], visible: Sequence[Any] = (), casters: Sequence[Caster] | None = None
     ) -> None:
-        """Proxies from meshes, and visible Mitsuba shapes, which are static.
+        """Proxies from meshes, and visible Mitsuba shapes, which are dynamic: no capture holds their shadows.
 
-        The shadows of what is dynamic are cast by ``casters``, or else by its meshes.
+        The shadows of dynamic proxies are cast by ``casters``, or else by their meshes.
         """
-        self.static = _TraceScene.build([o for o in occluders if not o.dynamic], visible)
-        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic])
-        self.casting = self.dynamic if casters is None else SplatOccluders.build(casters)
+        self.static = _TraceScene.build([o for o in occluders if not o.dynamic])
+        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
+        self.casting = self.dynamic if casters is None else _Both.of(SplatOccluders.build(casters), visible)
 
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
         """What rays meet first, and what they would meet without the dynamic proxies."""
@@ -164,6 +164,27 @@ class _TraceScene:
             positions,
             wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Both:
+    """Splats and visible meshes that stop rays."""
+
+    splats: SplatOccluders
+    meshes: _TraceScene
+
+    @classmethod
+    def of(cls, splats: SplatOccluders | None, visible: Sequence[Any]) -> _Both | _TraceScene | SplatOccluders | None:
+        """What there is of the two."""
+        meshes = _TraceScene.build([], visible)
+        if splats is None or meshes is None:
+            return splats or meshes
+        return cls(splats, meshes)
+
+    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+        """Whether rays are stopped."""
+        stopped = self.meshes.stop(ray, instance, key, active)
+        return stopped | self.splats.stop(ray, instance, key, active & ~stopped)
 
 
 @lru_cache(maxsize=64)

@@ -138,14 +138,18 @@ class View:
 
     def rays_through(self, x: Any, y: Any) -> Any:
         """World-space rays through pixel positions (x, y) [px], of unit direction."""
-        u, v = self.slopes(x, y)
-        axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3].T]
-        right, down, forward, centre = axes
         ray = dr.zeros(mi.Ray3f, dr.width(x))
-        ray.d = dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
-        ray.o = mi.Point3f(*centre)
+        ray.d = self.direction(x, y)
+        ray.o = mi.Point3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 3]])
         ray.maxt = dr.inf
         return ray
+
+    def direction(self, x: Any, y: Any) -> Any:
+        """World-space unit vectors of the rays through pixel positions (x, y) [px]."""
+        u, v = self.slopes(x, y)
+        axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3, :3].T]
+        right, down, forward = axes
+        return dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
 
     def cosine(self, rays: Any) -> Any:
         """Depth along z per unit of distance along each ray."""

@@ -14,18 +14,22 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
-from mitsplat.plugins.device import gathered, ray_scene, wrapped
+from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import reference_irradiance
-from mitsplat.plugins.gaussian import Cloud, upload_cloud
+from mitsplat.plugins.gaussian import Cloud, srgb_to_linear, upload_cloud
 from mitsplat.plugins.light import Accuracy, Surface, light_factor
 from mitsplat.plugins.march import Image, trace
+from mitsplat.plugins.mirrored import SplatMirror
 from mitsplat.plugins.occlusion import Caster
 from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
 from mitsplat.plugins.proxies import Hit, Occluder, Proxies
 from mitsplat.plugins.rays import View
+from mitsplat.plugins.sensors import view_of
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.still import StillLayer
 from mitsplat.plugins.tiles import CrowdedError
+from mitsplat.plugins.traits import Traits
+from mitsplat.plugins.visible import Behind, PathTracer, SeenLights, VisibleMeshes, is_clear
 from mitsplat.quality import Quality, resolve_quality
 
 AOVS = (
@@ -52,13 +56,6 @@ AGREEMENT = 0.02
 """Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
 
 
-def srgb_to_linear(value: Any) -> Any:
-    """IEC 61966-2-1 electro-optical transfer, extended above 1."""
-    return dr.select(
-        value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4)
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _Contents:
     """What the shapes of a scene that emit nothing amount to on the device; kept while they stay the same."""
@@ -67,10 +64,9 @@ class _Contents:
     clouds: CloudSet | None
     placements: tuple[Placement, ...]
     proxies: Proxies
-    visible: Any | None
-    relit: Any
-    roughness: Any
-    specular: Any
+    meshes: VisibleMeshes | None
+    mirror: SplatMirror | None
+    traits: Traits
     grid: RadianceGrid | None
 
 
@@ -137,10 +133,28 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - |point|
        - A place in the middle of what is lit. (Default: origin)
 
-    Every :monosp:`splats` shape is blended front to back per pixel; other meshes of the scene are visible as diffuse
-    surfaces, hide splats behind them and are hidden by splats before them. The image holds linear R, G, B, A and the
-    channels that ``aov_names`` lists. One emitter or more are needed for ``shadow: traced``; without any, colours stay
-    as captured.
+     * - mesh_samples
+       - |int|
+       - Light paths per pixel of visible meshes that are not plainly diffuse, 1 to 65536. (Default: 64)
+
+     * - max_depth
+       - |int|
+       - Longest of these paths, as in Mitsuba's own integrators: 2 is direct light. From 2 to 64. (Default: 8)
+
+     * - hide_emitters
+       - |bool|
+       - Whether the camera sees no emitter: neither area lights nor, where nothing covers it, the sky. (Default: false)
+
+    Every :monosp:`splats` shape is blended front to back per pixel; other meshes of the scene hide splats behind them,
+    are hidden by splats before them, and cast shadows on them, unless light passes through them. Plainly diffuse ones
+    are lit as splats are, from both sides, by emitters and by what the surroundings reflect. All other materials of
+    Mitsuba are path traced: metal mirrors, and glass shows, splats, meshes and emitters. In mirrors, splats that were
+    captured under the scene's light lack the shadows of what was added.
+
+    The picture's white is the irradiance that ``white`` states: radiance is shown times pi over it. A sky makes alpha
+    1. The image holds linear R, G, B, A and the channels that ``aov_names`` lists. One emitter or more are needed for
+    ``shadow: traced``; without any, colours stay as captured. Sensors are :monosp:`opencv_camera`,
+    :monosp:`perspective` and :monosp:`thinlens`; their film's filter and their sampler are not used.
 
     .. tabs::
 
@@ -172,15 +186,16 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow_error = _number(props, "shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
             raise InputError(f"integrator 'splat_proxy': 'shadow_error' must be in [0, 1) (got {self.shadow_error!r})")
-        self.bounce, self.highlight = _truth(props, "bounce"), _truth(props, "highlight")
+        self.bounce, self.highlight = _truth(props, "bounce", True), _truth(props, "highlight", True)
+        self.hide_emitters = _truth(props, "hide_emitters", False)
+        self.mesh_samples, self.max_depth = (
+            _count(props, "mesh_samples", 64, 1, 65536),
+            _count(props, "max_depth", 8, 2, 64),
+        )
         self.white = _number(props, "white", 0.0)
         if not 0 <= self.white < np.inf:
             raise InputError(f"integrator 'splat_proxy': 'white' must be >= 0 (got {self.white!r})")
-        self.shadow_samples = props.get("shadow_samples", 64)
-        if type(self.shadow_samples) is not int or not 1 <= self.shadow_samples <= 4096:
-            raise InputError(
-                f"integrator 'splat_proxy': 'shadow_samples' must be from 1 to 4096 (got {self.shadow_samples!r})"
-            )
+        self.shadow_samples = _count(props, "shadow_samples", 64, 1, 4096)
         self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
@@ -218,40 +233,67 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """
         contents = self._read(scene)
         views = view_of(sensor).apertures(self.quality.lens_rings)
-        layers = self._layers(contents, scene, views[0], Accuracy(self.shadow_error, self.shadow_samples), seed)
+        accuracy = Accuracy(self.shadow_error, self.shadow_samples)
+        paths = -(-self.mesh_samples // len(views))
+        layers = self._layers(contents, scene, views[0], accuracy, paths, seed)
         if len(views) > 1:
             # The mean of n views has sqrt(n) times less noise than each of them.
             coarse = Accuracy(self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views)))
             blurred = {name: layers[name] for name in ("rgb", "alpha", "captured")}
             for number, view in enumerate(views[1:], start=1):
-                seen = self._layers(contents, scene, view, coarse, seed + number)
+                seen = self._layers(contents, scene, view, coarse, paths, seed + number)
                 blurred = {name: value + seen[name] for name, value in blurred.items()}
                 dr.eval(blurred)
             layers |= {name: value / len(views) for name, value in blurred.items()}
             dr.eval(layers)
         return layers
 
-    def _layers(self, contents: _Contents, scene: Any, view: View, accuracy: Accuracy, seed: int) -> dict[str, Any]:
+    def _layers(
+        self, contents: _Contents, scene: Any, view: View, accuracy: Accuracy, paths: int, seed: int
+    ) -> dict[str, Any]:
         """The layers that one point of the lens sees."""
         rays = view.rays()
-        behind = _trace_meshes(contents.visible, view, rays) if contents.visible is not None else None
-        splat = self._trace_splats(contents, view, behind.depth if behind else None)
+        behind = contents.meshes.trace(view, rays) if contents.meshes else None
+        lamps = None if self.hide_emitters else SeenLights.trace(scene, view, rays)
+        z_max = behind.depth if behind else None
+        if lamps:
+            z_max = lamps.depth if z_max is None else dr.minimum(z_max, lamps.depth)
+        splat = self._trace_splats(contents, scene, view, z_max)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
         dr.eval(splat, proxy_depth, hit, static)
 
         covered = dr.maximum(splat.alpha, 1e-6)
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
-        alpha, depth, instance, front = splat.alpha, splat.depth, splat.instance, mi.Bool(False)
+        alpha, depth, instance = splat.alpha, splat.depth, splat.instance
+        solid, plain = mi.Bool(False), mi.Bool(False)
         if behind:
-            front = behind.valid & (splat.centre_alpha < 0.5)
-            colour += dr.select(behind.valid, behind.reflectance * (1 - splat.alpha), 0)
-            alpha = dr.select(behind.valid, 1, alpha)
-            depth = dr.select(front, behind.depth, depth)
+            solid = behind.valid & (behind.depth <= z_max)
+            plain = solid & behind.plain
+            colour += dr.select(plain, behind.reflectance * (1 - splat.alpha), 0)
+            alpha = dr.select(solid, 1, alpha)
+        # What is lit where this is seen: light in it is traced already.
+        glow = self._glow(contents, scene, view, rays, behind, solid, splat.alpha, lamps, paths, seed)
+        if lamps:
+            alpha = dr.select(solid | lamps.everywhere | (lamps.depth < dr.inf), 1, alpha)
+        if z_max is not None:
+            front = (z_max < dr.inf) & (splat.centre_alpha < 0.5)
+            depth = dr.select(front, z_max, depth)
             instance = dr.select(front, 0, instance)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
+        lit_alpha = dr.select(plain, 1, splat.alpha)
         if self.shadow == "traced" and scene.emitters():
-            seen = _Seen(rays.d, alpha, depth, instance, front)
+            shown = plain & (splat.centre_alpha < 0.5)
+            seen = _Seen(
+                rays.d,
+                lit_alpha,
+                dr.select(shown, behind.depth, splat.depth) if behind else splat.depth,
+                dr.select(shown, 0, splat.instance),
+                contents.traits.seen(self._by_shape(contents, view, z_max), splat.instance),
+                shown,
+                behind.normal if behind else mi.Normal3f(0),
+                behind.face if behind else mi.Normal3f(0),
+            )
             dr.eval(seen)
             light, highlight = light_factor(
                 scene,
@@ -267,9 +309,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if not self.highlight:
             highlight = mi.Color3f(0)
         layers = {
-            "rgb": dr.maximum(colour * light + highlight * alpha, 0),
+            "rgb": dr.maximum(colour * light + highlight * lit_alpha, 0) + glow,
             "alpha": alpha,
-            "captured": colour,
+            "captured": colour + glow,
             "depth": depth,
             "instance": instance,
             "proxy_depth": proxy_depth,
@@ -280,6 +322,48 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         }
         dr.eval(layers)
         return layers
+
+    def _glow(
+        self,
+        contents: _Contents,
+        scene: Any,
+        view: View,
+        rays: Any,
+        behind: Behind | None,
+        solid: Any,
+        alpha: Any,
+        lamps: SeenLights | None,
+        paths: int,
+        seed: int,
+    ) -> Any:
+        """Emitters and path-traced meshes behind splats of opacity ``alpha``, in the picture's scale (Color3f)."""
+        glow = mi.Color3f(0)
+        lights = bool(scene.emitters())
+        white = self._white(scene) if lights else mi.Color3f(dr.opaque(mi.Float, float(np.pi)))
+        if lamps:
+            glow = dr.select(solid, 0, lamps.radiance * (dr.pi / white) * (1 - alpha))
+        if behind is None or contents.meshes is None or contents.meshes.plain is None:
+            return glow
+        pixel = dr.compress(solid & ~behind.plain & (alpha < 1 - 1e-3))
+        if not dr.width(pixel):
+            return glow
+        ray, hit = (dr.gather(type(v), v, pixel) for v in (mi.Ray3f(rays), behind.hit))
+        tracer = PathTracer(
+            contents.meshes,
+            scene,
+            contents.proxies,
+            contents.mirror,
+            exposure=dr.pi / white,
+            white=white,
+            max_depth=self.max_depth,
+            bounce=self.bounce,
+            seed=seed,
+        )
+        radiance = tracer.radiance(view, ray, hit, pixel, paths) * (1 - dr.gather(mi.Float, alpha, pixel))
+        glow = mi.Color3f(dr.zeros(mi.Float, dr.width(alpha))) + glow
+        dr.eval(glow)
+        dr.scatter(glow, radiance, pixel)
+        return glow
 
     def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
         """Every instance above 0 as it would be seen alone, by its splats or its proxies (``source``).
@@ -304,23 +388,32 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
         )
 
-    def _trace_splats(self, contents: _Contents, view: View, z_max: Any | None) -> Image:
+    def _by_shape(self, contents: _Contents, view: View, z_max: Any | None) -> Any | None:
+        """Which of an instance's shapes a pixel shows, where these are not lit alike; see :class:`Traits`."""
+        if contents.traits.placements is None or contents.clouds is None:
+            return None
+        fine = view.sampled(self.quality.samples)
+        return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
+
+    def _trace_splats(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
         fine = view.sampled(self.quality.samples)
-        still = self._still_layer(contents, fine, z_max)
+        still = self._still_layer(contents, scene, fine, z_max)
         if still is not None:
             objects = [p for p in contents.placements if p.instance]
             with suppress(CrowdedError):
                 return still.with_objects(contents.clouds, objects, fine, self.quality, z_max)
         return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
 
-    def _still_layer(self, contents: _Contents, view: View, z_max: Any | None) -> StillLayer | None:
+    def _still_layer(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> StillLayer | None:
         """What is static as seen from here, from the second time that the camera is in the same place."""
         static = [p for p in contents.placements if p.instance == 0]
         if not static or len(static) == len(contents.placements):
             return None
         fixed = [s for s in contents.shapes if getattr(s, "instance", 0) == 0]
+        if not self.hide_emitters:
+            fixed += [s for s in scene.shapes() if s.is_emitter()]
         seen = view.key, self.quality, fixed
         if self._still is None or not _same(self._still[0], seen):
             self._still = seen, None
@@ -344,26 +437,21 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         occluders = [
             Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats) for c in carriers if c.proxy is not None
         ]
-        size = 1 + max([0, *(c.instance for c in carriers)])
         casters = None
         if self.occluders == "splats":
             casters = [Caster(c.splats, c.instance, c.world_from_splats) for c in carriers if c.dynamic]
-        relit, roughness, specular = np.zeros(size, bool), np.full(size, 0.4, np.float32), np.zeros(size, np.float32)
-        for c in carriers:
-            relit[c.instance], roughness[c.instance], specular[c.instance] = (
-                c.capture_light == "uniform",
-                c.roughness,
-                c.specular,
-            )
+        clouds, meshes = self._upload(distinct), VisibleMeshes.build(visible)
+        mirror = None
+        if meshes is not None and meshes.plain is not None:
+            mirror = SplatMirror.build(clouds, placements, distinct, [c.capture_light == "uniform" for c in carriers])
         self._contents = _Contents(
             shapes,
-            self._upload(distinct),
+            clouds,
             placements,
-            Proxies(occluders, visible, casters),
-            ray_scene({f"shape_{i}": shape for i, shape in enumerate(visible)}) if visible else None,
-            wrapped(mi.Bool, relit),
-            wrapped(mi.Float, roughness),
-            wrapped(mi.Float, specular),
+            Proxies(occluders, [s for s in visible if not is_clear(s.bsdf())], casters),
+            meshes,
+            mirror,
+            Traits.of(carriers, placements),
             self._surroundings(carriers),
         )
         return self._contents
@@ -402,32 +490,25 @@ def _identical(some: Sequence[Any], others: Sequence[Any]) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Behind:
-    """Visible meshes as the camera sees them."""
-
-    depth: Any
-    reflectance: Any
-    valid: Any
-
-
-def _trace_meshes(scene: Any, view: View, rays: Any) -> _Behind:
-    si = scene.ray_intersect(rays)
-    valid = si.is_valid()
-    reflectance = si.bsdf().eval_diffuse_reflectance(si, valid)
-    depth = dr.select(valid, si.t * view.cosine(rays), dr.inf)
-    dr.eval(depth, reflectance, valid)
-    return _Behind(depth, reflectance, valid)
-
-
-@dataclass(frozen=True, eq=False)
 class _Seen:
-    """What pixels show: direction of their rays, opacity, depth, instance, and whether it is a visible mesh."""
+    """What pixels show.
+
+    Attributes:
+        direction: Of their rays.
+        alpha, depth, instance: As in the layers.
+        trait: Row of what is shown in :class:`Traits`.
+        mesh: Whether it is a visible mesh.
+        normal, face: Normals of that.
+    """
 
     direction: Any
     alpha: Any
     depth: Any
     instance: Any
+    trait: Any
     mesh: Any
+    normal: Any
+    face: Any
 
 
 def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen, hit: Hit, static: Hit) -> Surface:
@@ -436,10 +517,10 @@ def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen,
     ray, depth, instance = mi.Ray3f(eye, seen.direction), seen.depth, seen.instance
     cosine = view.cosine(ray)
     met = hit.distance < dr.inf
-    known = ~met | (hit.instance == instance)
+    known = seen.mesh | ~met | (hit.instance == instance)
     # What shows through or beside a dynamic object's proxy lies on a static one.
     behind = instance == 0
-    same = dr.select(behind, static.distance < dr.inf, met & known)
+    same = ~seen.mesh & dr.select(behind, static.distance < dr.inf, met & known)
     proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
     shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
     towards = mi.Normal3f(-ray.d)
@@ -451,42 +532,19 @@ def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen,
     reach = dr.max(dr.abs(position))
     return Surface(
         position=position,
-        normal=mi.Vector3f(dr.select(same, shown[0], towards)),
-        face=mi.Vector3f(dr.select(same, shown[1], towards)),
+        normal=mi.Vector3f(dr.select(seen.mesh, seen.normal, dr.select(same, shown[0], towards))),
+        face=mi.Vector3f(dr.select(seen.mesh, seen.face, dr.select(same, shown[1], towards))),
         lift=dr.select(on_proxy, shown[2], 0),
         to_camera=-ray.d,
         offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
         instance=mi.Float(instance),
-        relit=dr.gather(mi.Bool, contents.relit, instance) | seen.mesh,
-        roughness=dr.gather(mi.Float, contents.roughness, instance),
-        specular=dr.gather(mi.Float, contents.specular, instance),
+        trait=mi.Float(seen.trait),
+        relit=dr.gather(mi.Bool, contents.traits.relit, seen.trait) | seen.mesh,
+        roughness=dr.gather(mi.Float, contents.traits.roughness, seen.trait),
+        specular=dr.select(seen.mesh, 0, dr.gather(mi.Float, contents.traits.specular, seen.trait)),
         known=known,
         valid=valid,
     )
-
-
-def view_of(sensor: Any) -> View:
-    """The camera of a sensor: ``opencv_camera``, or Mitsuba's own ``perspective``.
-
-    Raises:
-        InputError: If the sensor is of another kind.
-    """
-    if hasattr(sensor, "view"):
-        return sensor.view()
-    width, height = (int(n) for n in sensor.film().size())
-    params = mi.traverse(sensor)
-    if "x_fov" not in params or "to_world" not in params:
-        raise InputError("integrator 'splat_proxy': the sensor must be 'opencv_camera' or 'perspective'")
-    focal = 0.5 * width / np.tan(0.5 * np.radians(float(np.array(params["x_fov"]).ravel()[0])))
-    shift = [
-        float(np.array(params[f"principal_point_offset_{a}"]).ravel()[0])
-        if f"principal_point_offset_{a}" in params
-        else 0.0
-        for a in "xy"
-    ]
-    pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-    near = float(np.array(params["near_clip"]).ravel()[0])
-    return View(width, height, focal, focal, width * (0.5 + shift[0]), height * (0.5 + shift[1]), pose, (), near)
 
 
 def _number(props: mi.Properties, name: str, default: float) -> float:
@@ -496,8 +554,15 @@ def _number(props: mi.Properties, name: str, default: float) -> float:
     return float(value)
 
 
-def _truth(props: mi.Properties, name: str) -> bool:
-    value = props.get(name, True)
+def _count(props: mi.Properties, name: str, default: int, least: int, most: int) -> int:
+    value = props.get(name, default)
+    if type(value) is not int or not least <= value <= most:
+        raise InputError(f"integrator 'splat_proxy': {name!r} must be from {least} to {most} (got {value!r})")
+    return value
+
+
+def _truth(props: mi.Properties, name: str, default: bool) -> bool:
+    value = props.get(name, default)
     if type(value) is not bool:
         raise InputError(f"integrator 'splat_proxy': {name!r} must be true or false (got {value!r})")
     return value

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.assets import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.splats import Splats
 
@@ -19,14 +20,25 @@ class SplatsShape(mi.Mesh):
 
     .. pluginparameters::
 
+     * - asset
+       - |string|
+       - Asset folder: splats, mesh, scale and axes, and defaults of ``capture_light``, ``roughness`` and ``specular``.
+         (Default: none)
+
      * - filename
        - |string|
-       - Splat file: 3DGS ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or ``.sog``.
+       - Splat file, where there is no asset: 3DGS ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or
+         ``.sog``.
 
      * - proxy
        - |string|
-       - Mesh in the splats' own frame that stands for them where light is traced: it receives and casts shadows.
-         (Default: none)
+       - Mesh file in the splats' own frame that stands for them where light is traced: it receives and casts shadows.
+         (Default: that of the asset, or none)
+
+     * - units
+       - |float|
+       - Metres per unit of ``filename`` and ``proxy``. (Default: 1; must be given for the splats of an asset folder
+         that has others)
 
      * - to_world
        - |transform|
@@ -62,8 +74,7 @@ class SplatsShape(mi.Mesh):
         .. code-tab:: xml
 
             <shape type="splats">
-                <string name="filename" value="nut/splats.ply"/>
-                <string name="proxy" value="nut/mesh.ply"/>
+                <string name="asset" value="assets/hex_nut_m20"/>
                 <integer name="instance" value="1"/>
                 <transform name="to_world"><translate z="0.01"/></transform>
             </shape>
@@ -79,29 +90,43 @@ class SplatsShape(mi.Mesh):
         params["faces"] = mi.UInt32([0, 0, 0])
         params.update()
 
-        filename, proxy_file = _typed(props, "filename", str, ""), _typed(props, "proxy", str, "")
+        folder, filename, proxy_file = (_typed(props, name, str, "") for name in ("asset", "filename", "proxy"))
+        units = _typed(props, "units", float, 0.0)
+        if "units" in props and not 0 < units < np.inf:
+            raise InputError(f"shape 'splats': 'units' must be finite and > 0 (got {units})")
+        asset = None
+        if folder:
+            if filename or proxy_file or units:
+                raise InputError("shape 'splats': 'asset' takes the place of 'filename', 'proxy' and 'units'")
+            path, _ = _stamp(folder, ASSET_FILE)
+            asset = _load_asset(path, max(file.stat().st_mtime_ns for file in path.parent.iterdir()))
+            splats, proxy = asset.splats, asset.mesh
         if splats is None:
             if not filename:
-                raise InputError("shape 'splats': 'filename' is missing")
-            splats = _load_splats(*_stamp(filename))
+                raise InputError("shape 'splats': 'asset' or 'filename' is missing")
+            path, modified = _stamp(filename)
+            if not units:
+                _refuse_other_units(path)
+            splats = _load_splats(path, modified)
         if proxy is None and proxy_file:
             proxy = _load_mesh(*_stamp(proxy_file))
         self.splats = splats
         self.proxy = proxy
-        self.world_from_splats = _matrix(props)
+        self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
         self.instance = _typed(props, "instance", int, 0)
         if not 0 <= self.instance < 65536:
             raise InputError(f"shape 'splats': 'instance' must be from 0 to 65535 (got {self.instance})")
         self.dynamic = _typed(props, "dynamic", bool, self.instance > 0)
-        self.capture_light = _typed(props, "capture_light", str, "uniform" if self.instance else "scene")
+        light = asset.capture_light if asset else "uniform" if self.instance else "scene"
+        self.capture_light = _typed(props, "capture_light", str, light)
         if self.capture_light not in ("uniform", "scene"):
             raise InputError(
                 f"shape 'splats': 'capture_light' must be 'uniform' or 'scene' (got {self.capture_light!r})"
             )
-        self.roughness = _typed(props, "roughness", float, 0.4)
+        self.roughness = _typed(props, "roughness", float, float(asset.roughness) if asset else 0.4)
         if not 0 < self.roughness <= 1:
             raise InputError(f"shape 'splats': 'roughness' must be in (0, 1] (got {self.roughness})")
-        self.specular = _typed(props, "specular", float, 0.0)
+        self.specular = _typed(props, "specular", float, float(asset.specular) if asset and self.instance else 0.0)
         if not 0 <= self.specular <= 1:
             raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
 
@@ -133,12 +158,34 @@ def _matrix(props: mi.Properties) -> np.ndarray:
     return matrix
 
 
-def _stamp(filename: str) -> tuple[Path, int]:
+def _stamp(filename: str, inside: str = "") -> tuple[Path, int]:
     path = mi.file_resolver().resolve(filename)
-    path = Path(str(path)).resolve()
+    path = Path(str(path)).resolve() / inside
     if not path.is_file():
         raise InputError(f"shape 'splats': no such file: {path}")
     return path, path.stat().st_mtime_ns
+
+
+def _refuse_other_units(path: Path) -> None:
+    """Refuse splats of an asset whose files are not in metres with z up, which the file alone does not say."""
+    folder = path.parent
+    if not (folder / ASSET_FILE).is_file():
+        return
+    spec = read_spec(folder)
+    if path != (folder / spec.splats).resolve() or (spec.units in (None, 1.0) and spec.size is None and spec.up == "z"):
+        return
+    raise InputError(
+        f"shape 'splats': {path} is in the units and axes that {folder / ASSET_FILE} states: name the folder as "
+        "'asset', or give 'units'"
+    )
+
+
+@lru_cache(maxsize=64)
+def _load_asset(path: Path, _modified: int) -> Asset:
+    asset = Asset.load(path.parent)
+    if asset.units == "unknown":
+        raise InputError(f"shape 'splats': {path}: units are unknown: give it a size [m]")
+    return asset
 
 
 @lru_cache(maxsize=64)
@@ -148,7 +195,7 @@ def _load_splats(path: Path, _modified: int) -> Splats:
 
 @lru_cache(maxsize=64)
 def _load_mesh(path: Path, _modified: int) -> trimesh.Trimesh:
-    return trimesh.load_mesh(path, process=False)
+    return read_mesh(path, merge=False)
 
 
 mi.register_shape("splats", lambda props: SplatsShape(props))

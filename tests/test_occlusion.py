@@ -84,7 +84,7 @@ def test_chance_to_pass_is_the_product_of_transmittances() -> None:
     exact = np.array([transmittance(placed, *one) for one in zip(origin, direction, reach, strict=True)])
     assert exact.min() < 0.2 and exact.max() > 0.7
     # Of so many sets, and of solids with corners.
-    noise = np.sqrt(exact * (1 - exact) / occluders.sets)
+    noise = np.sqrt(exact * (1 - exact) / occluders.solids.sets)
     assert (np.abs(passed - exact) < 4 * noise + 0.02).all()
     assert abs((passed - exact).mean()) < 0.01
 

@@ -34,7 +34,7 @@ PixelArray = npt.NDArray[np.float32]
 HELD_OUT_EVERY = 8
 """One photo in so many, by name, is kept for evaluation (Kerbl et al. 2023, after Mip-NeRF 360)."""
 
-_FILE = "capture.json"
+CAPTURE_FILE = "capture.json"
 _POINTS = "points.npz"
 _Row = tuple[float, float, float, float]
 
@@ -222,6 +222,7 @@ class Capture:
         folder = Path(folder)
         photos = []
         try:
+            (folder / CAPTURE_FILE).unlink(missing_ok=True)  # an earlier capture's is not of these photos
             for photo in self.photos:
                 file = _kept(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
                 mask = None if photo.mask is None else _kept(photo.mask, folder / "masks" / mask_name(photo.name))
@@ -251,7 +252,7 @@ class Capture:
                 photos=[_photo_spec(photo, folder) for photo in photos],
             )
             # Last, so that an interrupted save is not mistaken for a capture.
-            write_text(folder / _FILE, json.dumps(spec.model_dump(), indent=1) + "\n")
+            write_text(folder / CAPTURE_FILE, json.dumps(spec.model_dump(), indent=1) + "\n")
         except OSError as error:
             raise InputError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
         return replace(self, photos=tuple(photos))
@@ -264,7 +265,7 @@ class Capture:
             InputError: If a file is missing or breaks a rule.
         """
         folder = Path(folder)
-        spec = load_yaml(folder / _FILE, CaptureSpec)
+        spec = load_yaml(folder / CAPTURE_FILE, CaptureSpec)
         try:
             with (folder / _POINTS).open("rb") as stored, np.load(stored, allow_pickle=False) as arrays:
                 points, colours = arrays["points"], arrays["colours"]
@@ -283,7 +284,7 @@ class Capture:
             try:
                 camera = Camera(**{**entry.camera.model_dump(), "world_from_camera": entry.camera.world_from_camera})
             except ValueError as error:
-                raise InputError(f"{folder / _FILE}: {entry.name}: {error}") from error
+                raise InputError(f"{folder / CAPTURE_FILE}: {entry.name}: {error}") from error
             file = _named_file(folder, entry.file)
             mask = None if entry.mask is None else _named_file(folder, entry.mask)
             photos.append(Photo(entry.name, file, camera, mask, indices))
@@ -317,7 +318,7 @@ def _named_file(folder: Path, name: str) -> Path:
     try:
         return file_inside(folder, name)
     except InputError as error:
-        raise InputError(f"{folder / _FILE}: {error}") from error
+        raise InputError(f"{folder / CAPTURE_FILE}: {error}") from error
 
 
 def _photo_spec(photo: Photo, folder: Path) -> PhotoSpec:

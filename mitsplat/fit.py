@@ -1,8 +1,7 @@
 """Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
 
-Gaussians start at the capture's points and are densified (:mod:`mitsplat.densify`). A fit lives in a folder:
-``checkpoint.npz`` to go on from, ``splats.ply``, ``fit.json`` (:class:`FitResult` and the settings), and for every
-held-out photo ``held_out/NAME.png``: photo | render | difference.
+Gaussians start at the capture's points and are densified (:mod:`mitsplat.densify`). A fit lives in a folder, see
+:mod:`mitsplat.fit_folder`.
 """
 
 from __future__ import annotations
@@ -10,8 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,19 +19,20 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.capture import Capture, Photo
+from mitsplat import __version__
+from mitsplat.capture import HELD_OUT_EVERY, Capture, Photo
 from mitsplat.densify import Densification, Mcmc, seed_splats
 from mitsplat.densify_classic import Classic
 from mitsplat.depth_maps import DepthMap, DepthMaps, align_maps
 from mitsplat.errors import InputError
-from mitsplat.files import add_content, write_file, write_text
+from mitsplat.files import add_content
+from mitsplat.fit_folder import FitFolder, FitResult
 from mitsplat.metrics import psnr_of
 from mitsplat.optimise import Adam, Model
 from mitsplat.quality import Quality
 from mitsplat.render import ensure_variant
 from mitsplat.seeds import seed_points
 from mitsplat.sight import HeldOut, Sight
-from mitsplat.splats import Splats
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -49,7 +48,8 @@ class FitSettings:
         iterations: Optimiser steps; each takes one photo, all photos in turn.
         budget: Time [s] in which the schedule of the iterations runs off even if it must leave some out; then the
             result depends on the machine.
-        target_psnr: Mean PSNR of held-out photos [dB] at which the fit ends early.
+        target_psnr: Mean PSNR [dB] at which the fit ends early: of one in eight of the training photos, which are then
+            set aside for that. Held-out photos take part in no decision.
         size: Longest edge of the pictures [px]; photos are made smaller, never larger.
         sh_degree: Degree of the spherical harmonics, 0 to 3; a degree more every fifth of the fit.
         masks: ``alpha``: only what masks show is fitted, and they supervise alpha; ``ignore``: what they leave out may
@@ -123,37 +123,6 @@ class FitSettings:
                 raise InputError(f"{name} must be in [0, 1] (got {getattr(self, name)})")
 
 
-@dataclass(frozen=True, eq=False)
-class FitResult:
-    """What a fit came to.
-
-    Attributes:
-        splats: The Gaussians, in the capture's frame and units.
-        iterations: Steps made.
-        seconds: Time that they took, over all runs.
-        held_out: Photos that were not fitted.
-        inputs: SHA-256 of photos, masks, depth maps, cameras, points and settings.
-        warnings: What was given and is of no use, a sentence each.
-    """
-
-    splats: Splats
-    iterations: int
-    seconds: float
-    held_out: tuple[HeldOut, ...]
-    inputs: str
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def psnr(self) -> float:
-        """Mean PSNR of the held-out photos [dB]."""
-        return float(np.mean([h.psnr for h in self.held_out]))
-
-    @property
-    def ssim(self) -> float:
-        """Mean SSIM of the held-out photos."""
-        return float(np.mean([h.ssim for h in self.held_out]))
-
-
 @dataclass(frozen=True)
 class FitProgress:
     """Where a fit stands.
@@ -162,14 +131,14 @@ class FitProgress:
         step: Steps made.
         fraction: Share of the schedule that has run off.
         psnr: Of the photos of the last steps [dB].
-        held_out: Mean over the held-out photos when they were last looked at [dB], if they were.
+        validation: Mean over the photos that the target is for, when they were last looked at [dB], if they were.
         gaussians: Number of Gaussians.
     """
 
     step: int
     fraction: float
     psnr: float
-    held_out: float | None
+    validation: float | None
     gaussians: int
 
 
@@ -178,6 +147,8 @@ _EVERY = 25
 """Steps between reports: reading a loss waits for the device."""
 _EXTENT = 1.1
 _CHECKPOINT_SECONDS = 60.0
+_LOOK_EVERY = 0.05
+"""Share of the schedule between looks at the photos that the target is for."""
 _DEPTH_EVERY = 4
 """Steps between looks at depth, which double the time of a step."""
 _MAPS_FALL_TO = 0.01
@@ -202,12 +173,11 @@ def fit_capture(
         out: Folder of the fit.
         settings: How to fit.
         depths: Depth maps of photos, which take the place of the points that these see in the loss.
-        overwrite: Whether a fit of other inputs in the folder is replaced.
+        overwrite: Whether what the folder holds of other inputs, or damaged, is replaced.
         progress: Told every few steps where the fit stands.
 
     Raises:
-        InputError: If there are fewer than two photos, a photo or a depth map cannot be read, or the folder holds
-            another fit.
+        InputError: If there are too few photos, a photo or a depth map cannot be read, or the folder holds another fit.
     """
     training, held_out = _usable(capture.training, settings), _usable(capture.held_out, settings)
     if not (training and held_out):
@@ -215,38 +185,44 @@ def fit_capture(
             "a fit needs a photo to learn from and a held-out one, with masks if any has one "
             f"(got {len(training)} of {len(capture.training)} and {len(held_out)} of {len(capture.held_out)})"
         )
+    validation: tuple[Photo, ...] = ()
+    if settings.target_psnr is not None:
+        training, validation = _set_aside(training)
     ensure_variant()
-    out = Path(out)
-    inputs = _digest(capture, settings, depths)
-    done = None if overwrite else _finished(out, inputs)
+    folder = FitFolder(Path(out), _digest(capture, settings, depths))
+    done = folder.finished(overwrite=overwrite)
     if done is not None:
         return done
+    state = folder.checkpoint(overwrite=overwrite)
     maps, warnings = ({}, ()) if depths is None else align_maps(training, capture.points, depths, settings.size)
-    fit = _Fit(capture, training, held_out, settings, maps)
-    checkpoint = out / "checkpoint.npz"
-    if checkpoint.exists() and not overwrite:
-        fit.load(checkpoint, inputs)
-    out.mkdir(parents=True, exist_ok=True)
+    fit = _Fit(capture, training, validation, settings, maps)
+    if state is not None:
+        fit.restore(state)
+    held = [_sight(photo, settings) for photo in held_out]
+    folder.begin(goes_on=state is not None)
     saved = time.monotonic()
     while fit.fraction < 1:
         fit.step()
         if fit.steps % _EVERY == 0 or fit.fraction >= 1:
-            state = fit.report()
+            now = fit.report()
             if progress is not None:
-                progress(state)
-            if settings.target_psnr is not None and (state.held_out or 0) >= settings.target_psnr:
+                progress(now)
+            if settings.target_psnr is not None and (now.validation or 0) >= settings.target_psnr:
                 break
             if time.monotonic() - saved > _CHECKPOINT_SECONDS:
-                fit.save(checkpoint, inputs)
+                folder.save_checkpoint(fit.state())
                 saved = time.monotonic()
     seconds = fit.elapsed
-    result = FitResult(fit.model.splats(), fit.steps, seconds, fit.check(out / "held_out"), inputs, warnings)
-    result.splats.save(out / "splats.ply")
-    record = {name: getattr(result, name) for name in ("inputs", "iterations", "seconds", "psnr", "ssim", "warnings")}
-    record |= {"gaussians": len(result.splats), "units": capture.units, "variant": mi.variant()}
-    record |= {"held_out": [asdict(photo) for photo in result.held_out], "settings": asdict(settings)}
-    write_text(out / "fit.json", json.dumps(record, indent=1) + "\n")
-    checkpoint.unlink(missing_ok=True)
+    result = FitResult(
+        fit.model.splats(),
+        fit.steps,
+        seconds,
+        fit.check(held, folder.held_out),
+        folder.inputs,
+        warnings,
+        fit.check(fit.validation, None),
+    )
+    folder.save(result, {"units": capture.units, "variant": mi.variant(), "settings": asdict(settings)})
     return result
 
 
@@ -257,13 +233,13 @@ class _Fit:
         self,
         capture: Capture,
         training: tuple[Photo, ...],
-        held_out: tuple[Photo, ...],
+        validation: tuple[Photo, ...],
         settings: FitSettings,
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
         self.photos = [_sight(photo, settings, maps.get(photo.name)) for photo in training]
-        self.held_out = [_sight(photo, settings) for photo in held_out]
+        self.validation = [_sight(photo, settings) for photo in validation]
         centres = np.array([photo.camera.centre for photo in training])
         self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
         rng = np.random.default_rng([settings.seed, 0])
@@ -279,9 +255,8 @@ class _Fit:
         self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
-        self.held_out_psnr: float | None = None
         self.began = time.monotonic()
-        self.looked = 0.0
+        self.looked, self.validated = 0.0, float("nan")
 
     @property
     def elapsed(self) -> float:
@@ -368,51 +343,36 @@ class _Fit:
         return loss, error
 
     def report(self) -> FitProgress:
-        """Where the fit stands; looks at the held-out photos now and then if their PSNR decides."""
+        """Where the fit stands; looks now and then at the photos that the target is for."""
         error = float(np.mean([e.numpy()[0] for e in self.errors]))
         self.errors = []
         fraction = self.fraction
-        if self.settings.target_psnr is not None and fraction >= self.looked + 0.05:
+        if self.validation and (fraction >= self.looked + _LOOK_EVERY or fraction >= 1):
             self.looked = fraction
-            self.held_out_psnr = float(np.mean([photo.psnr for photo in self.check(None)]))
-        return FitProgress(self.steps, fraction, psnr_of(error), self.held_out_psnr, self.model.count)
+            self.validated = float(np.mean([photo.psnr for photo in self.check(self.validation, None)]))
+        validated = None if np.isnan(self.validated) else self.validated
+        return FitProgress(self.steps, fraction, psnr_of(error), validated, self.model.count)
 
-    def check(self, folder: Path | None) -> tuple[HeldOut, ...]:
-        """The held-out photos, with a picture of each in the folder."""
+    def check(self, photos: Sequence[Sight], folder: Path | None) -> tuple[HeldOut, ...]:
+        """Photos that are not fitted, with a picture of each in the folder."""
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
         found = []
-        for sight in self.held_out:
+        for sight in photos:
             seen, _ = sight.render(self.model, quality)
             if self.settings.masks == "ignore":
                 seen = seen * sight.mask[..., None]
             found.append(sight.compare(seen, folder))
         return tuple(found)
 
-    def save(self, path: Path, inputs: str) -> None:
-        """Write a checkpoint."""
-        arrays: dict[str, Any] = {"inputs": inputs, "steps": self.steps, "seconds": self.elapsed}
-        arrays |= {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
+    def state(self) -> dict[str, Any]:
+        """Everything that decides how the fit goes on after a report, as arrays that :meth:`restore` takes."""
+        own = {"steps": self.steps, "seconds": self.elapsed, "looked": self.looked, "validated": self.validated}
+        return own | {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
 
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as file:
-                np.savez(file, **arrays)
-
-        write_file(path, write)
-
-    def load(self, path: Path, inputs: str) -> None:
-        """Go on from a checkpoint.
-
-        Raises:
-            InputError: If it cannot be read, or is of other inputs.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                state = dict(stored)
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a checkpoint of a fit ({error})") from error
-        if str(state["inputs"]) != inputs:
-            raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what :meth:`state` gave."""
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
+        self.looked, self.validated = float(state["looked"]), float(state["validated"])
         for name, part in self._parts.items():
             part.restore({k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")})
 
@@ -460,6 +420,18 @@ def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ..
     return photos if settings.masks == "off" or not masked else masked
 
 
+def _set_aside(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    """The photos to learn from and those that a target is for: the middle one of every eight, or the last.
+
+    Raises:
+        InputError: If there is only one.
+    """
+    if len(training) < 2:
+        raise InputError(f"a target takes at least two photos besides the held-out ones (got {len(training)})")
+    validation = training[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or training[-1:]
+    return tuple(photo for photo in training if photo not in validation), validation
+
+
 def _sight(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None) -> Sight:
     scale = min(1.0, settings.size / max(photo.camera.width, photo.camera.height))
     return Sight(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth)
@@ -467,7 +439,7 @@ def _sight(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None =
 
 def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
     """SHA-256 of everything that decides a fit."""
-    digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([__version__, asdict(settings)], sort_keys=True).encode())
     for photo in capture.photos:
         camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
         digest.update(json.dumps([photo.name, camera]).encode())
@@ -481,24 +453,3 @@ def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -
             digest.update(name.encode())
             add_content(digest, file)
     return digest.hexdigest()
-
-
-def _finished(out: Path, inputs: str) -> FitResult | None:
-    """The fit of these inputs that the folder holds, if any.
-
-    Raises:
-        InputError: If it holds another one.
-    """
-    path = out / "fit.json"
-    if not path.exists():
-        return None
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        held_out = tuple(HeldOut(**photo) for photo in record["held_out"])
-        found, iterations, seconds = record["inputs"], int(record["iterations"]), float(record["seconds"])
-        warnings = tuple(record.get("warnings", ()))
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not the record of a fit ({error})") from error
-    if found != inputs:
-        raise InputError(f"{path}: belongs to a fit of other photos or settings; --overwrite replaces it")
-    return FitResult(Splats.load(out / "splats.ply"), iterations, seconds, held_out, inputs, warnings)

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from mitsplat.fit import FitSettings
     from mitsplat.take import CaptureSettings
 
-_FIT_INPUTS = "asset_inputs.txt"
-
 Progress = Callable[[int, int, str], None]
 """Told how many of how many steps are done, and what is being done."""
 
@@ -134,21 +132,9 @@ def make_photo_asset(
             done = int(now.fraction * fit.iterations)
             progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
 
-    inputs = _fit_inputs(out / "capture", found, fit)
-    marker = out / "fit" / _FIT_INPUTS
-    stale = marker.exists() and marker.read_text() != inputs
-    write_text(marker, inputs)
-    fit_capture(found, out / "fit", fit, overwrite=stale, progress=fitting)
+    fit_capture(found, out / "fit", fit, overwrite=True, progress=fitting)
     done = make_asset(out / "capture", out / "fit", out, job, progress=progress)
     return replace(done, warnings=taken.warnings)
-
-
-def _fit_inputs(folder: Path, capture: Capture, settings: FitSettings) -> str:
-    """Hash of what decides a fit."""
-    digest = hashlib.sha256(json.dumps([__version__, asdict(settings)], sort_keys=True).encode())
-    for path in _files(folder, capture):
-        add_content(digest, path)
-    return digest.hexdigest()
 
 
 def make_asset(

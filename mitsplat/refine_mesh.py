@@ -88,7 +88,8 @@ class RefinedMesh:
         mesh: Refined if that was kept, or as it was.
         kept: Whether it is the refined one.
         before: Mean of 1 - IoU between the silhouettes of the mesh and the masks of the views that judge.
-        after: The same of the best refined mesh; infinite if none was valid.
+        after: The same of the best refined mesh; infinite if none was valid. These views chose it among those on the
+            way, so others may differ by a little more: a verdict judges by photos that had no say.
         judges: Number of these views; 0 if there were too few views to try.
     """
 
@@ -106,7 +107,7 @@ class RefinedMesh:
             return "dropped: it broke the mesh"
         fate = "kept" if self.kept else "dropped" if self.after >= self.before else "dropped, as it may be chance"
         return (
-            f"{fate}: silhouettes and masks of {self.judges} photos set aside differ by "
+            f"{fate}: silhouettes and masks of the {self.judges} photos that decide differ by "
             f"{self.before:.2%} of the object before and by {self.after:.2%} after"
         )
 

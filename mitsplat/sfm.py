@@ -213,7 +213,10 @@ def _run(job: Mapping[str, Any], folder: Path, progress: Progress | None) -> dic
         (folder / name).unlink(missing_ok=True)
     with (folder / "log.txt").open("wb") as log:
         child = subprocess.Popen(
-            [sys.executable, "-m", "mitsplat.sfm_child", str(file.resolve())], stdout=log, stderr=subprocess.STDOUT
+            [sys.executable, "-m", "mitsplat.sfm_child", str(file.resolve())],
+            stdin=subprocess.PIPE,  # closes when this process ends, and the child with it
+            stdout=log,
+            stderr=subprocess.STDOUT,
         )
         try:
             while True:
@@ -227,6 +230,8 @@ def _run(job: Mapping[str, Any], folder: Path, progress: Progress | None) -> dic
             if child.poll() is None:
                 child.kill()
                 child.wait()
+            if child.stdin is not None:
+                child.stdin.close()
     if status:
         if (folder / "error").exists():
             raise InputError((folder / "error").read_text())

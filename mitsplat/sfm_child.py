@@ -9,8 +9,10 @@ JOB is a JSON file, see :func:`run`; ``model.npz`` next to it is the result, ``s
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
+import threading
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -40,6 +42,20 @@ def main(job_file: Path) -> None:
         sys.exit(1)
 
 
+def end_with_parent() -> None:
+    """End this process when the one at the other end of its standard input does, however that ends.
+
+    Left alone it would write on into the database that the next run takes up.
+    """
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def run(job: dict[str, Any], folder: Path) -> None:
     """Find or read a model and store it.
 
@@ -60,7 +76,8 @@ def run(job: dict[str, Any], folder: Path) -> None:
         say(folder, "triangulating")
         known = known_model(job["cameras"], database)
         (folder / "known").mkdir(exist_ok=True)
-        store(folder, [pycolmap.triangulate_points(known, database, images, folder / "known")])
+        found = pycolmap.triangulate_points(known, database, images, folder / "known", options=mapping())
+        store(folder, [found])
     else:
         models = reconstruct(images, database, folder, job["enough"])
         store(folder, models, agreement(models[0], database) if models else {})
@@ -71,25 +88,38 @@ def say(folder: Path, doing: str) -> None:
     (folder / "status").write_text(doing)
 
 
+def number(job: dict[str, Any], images: Path, database: Path) -> None:
+    """Give the photos their ids in the order of the job; photos of a group share a camera.
+
+    Features are stored by several threads as they come. Left to that, ids would differ from run to run, and with them
+    which of two photos is the first of a pair, the order of all pairs, and so every camera found.
+    """
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = job["camera_model"]
+    wanted = [name for names in job["groups"] for name in names]
+    with pycolmap.Database.open(database) as opened:
+        found = [image.name for image in sorted(opened.read_all_images(), key=lambda image: image.image_id)]
+    if found == wanted:
+        return
+    database.unlink()  # interrupted before all were in
+    pycolmap.Database.open(database).close()
+    for names in job["groups"]:
+        pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, names, reader)
+
+
 def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
-    """SIFT features of the photos that have none yet; photos of a group share a camera."""
+    """SIFT features of the photos that have none yet."""
     say(folder, "finding features")
+    number(job, images, database)
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = job["features"]
     options.sift.first_octave = job["first_octave"]
     for names in job["groups"]:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = job["camera_model"]
-        if database.exists():
-            with pycolmap.Database.open(database) as opened:
-                known = {image.name: image.camera_id for image in opened.read_all_images()}
-            reader.existing_camera_id = next((known[name] for name in names if name in known), -1)
         pycolmap.extract_features(
             database,
             images,
             image_names=names,
             camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
@@ -117,9 +147,7 @@ def match(job: dict[str, Any], database: Path, folder: Path) -> None:
 def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list[pycolmap.Reconstruction]:
     """All models found, the largest first: by the incremental mapper, or the global one where that registers more."""
     say(folder, "finding cameras")
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-    options.min_model_size = 3
+    options = mapping()
     registered = 0
 
     def count() -> None:
@@ -137,9 +165,12 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
     say(folder, "finding cameras at once")
     copy = folder / "global.db"
     shutil.copyfile(database, copy)  # calibration rewrites the two-view geometries
-    pycolmap.calibrate_view_graph(copy)
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = SEED
+    pycolmap.calibrate_view_graph(copy, calibration)
     at_once = pycolmap.GlobalPipelineOptions()
-    at_once.random_seed = SEED
+    at_once.random_seed = at_once.mapper.random_seed = SEED
+    at_once.num_threads = at_once.mapper.num_threads = 1
     (output / "global").mkdir()
     others = largest_first(pycolmap.global_mapping(copy, images, output / "global", at_once))
     copy.unlink()
@@ -148,6 +179,16 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
             model.extract_colors_for_all_images(images)
         return others
     return models
+
+
+def mapping() -> pycolmap.IncrementalPipelineOptions:
+    """Options of the incremental mapper."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    # Several threads of bundle adjustment sum up in any order, and the cameras would differ from run to run.
+    options.num_threads = options.mapper.num_threads = 1
+    options.min_model_size = 3
+    return options
 
 
 def largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
@@ -257,4 +298,5 @@ def model_arrays(model: pycolmap.Reconstruction) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     main(Path(sys.argv[1]))

@@ -16,7 +16,7 @@ import numpy as np
 from mitsplat.anchor import DEFAULT_BOARD, Anchor, find_anchor
 from mitsplat.bare_board import bare_squares
 from mitsplat.board import Board
-from mitsplat.capture import Capture, Photo
+from mitsplat.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture_sheet import capture_sheet
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
@@ -155,7 +155,8 @@ def capture_photos(
     if (done := _finished(out, inputs)) is not None:
         return done
     work = out / "sfm"
-    (out / _INPUTS).unlink(missing_ok=True)
+    for marker in (_INPUTS, CAPTURE_FILE):  # pictures and masks are about to be others
+        (out / marker).unlink(missing_ok=True)
     _forget_other_photos(out, inputs, settings)
     prepared, rejected = prepare_photos(
         photos, out / "images", max_size=settings.max_size, upright=settings.poses is None, progress=progress

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import hypothesis
 import numpy as np
 import pytest
 import trimesh
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     from mitsplat.take import CaptureResult
 
 WriteScene = Callable[..., Path]
+
+# The same examples in every run, however slow: new ones are for benchmarks/fuzz.py.
+hypothesis.settings.register_profile("suite", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("suite")
 
 
 def box_asset(name: str, size: tuple[float, float, float] = (0.02, 0.03, 0.01), class_name: str | None = None) -> Asset:

@@ -47,6 +47,20 @@ def write(folder: Path, text: str, **files: bytes) -> Path:
     return folder
 
 
+def test_a_save_over_an_earlier_asset_may_be_interrupted(asset, tmp_path, monkeypatch):
+    """Splats of the one are never read with the mesh of the other."""
+    asset.save(tmp_path)
+
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trimesh.Trimesh, "export", stop)
+    with pytest.raises(KeyboardInterrupt):
+        asset.scaled(2.0).save(tmp_path)
+    with pytest.raises(InputError, match=r"asset\.yaml: "):
+        Asset.load(tmp_path)
+
+
 class TestRoundTrip:
     @pytest.mark.parametrize(("splats", "tolerance"), [("splats.ply", 1e-8), ("splats.spz", 1e-8), ("a.splat", 1e-8)])
     def test_geometry(self, asset, tmp_path, splats, tolerance):

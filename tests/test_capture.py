@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +68,28 @@ def test_saved_captures_come_back_exactly(capture: Capture, tmp_path: Path) -> N
         assert (one.mask is None) == (other.mask is None)
         for mine, theirs in zip(one.picture(), other.picture(), strict=True):
             np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("place", range(1, 16))
+def test_a_save_over_an_earlier_capture_may_be_interrupted(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    """Pictures of the one are never read with the cameras of the other: 10 photos, 5 masks, points, capture.json."""
+    out = tmp_path / "out"
+    capture.save(out)
+    other = capture.transformed(np.diag([2.0, 2.0, 2.0, 1.0]))
+    move, left = Path.replace, iter(range(place))
+
+    def stop(*args: Any) -> Any:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return move(*args)
+
+    monkeypatch.setattr(Path, "replace", stop)
+    with pytest.raises(KeyboardInterrupt):
+        replace(other, photos=tuple(replace(photo, file=capture.photos[0].file) for photo in other.photos)).save(out)
+    with pytest.raises(InputError, match=r"capture\.json: "):
+        Capture.load(out)
 
 
 def test_every_eighth_photo_is_held_out(capture: Capture) -> None:

@@ -26,7 +26,8 @@ from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
 from mitsplat.depth_maps import DepthMaps
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
-from mitsplat.fit import FitProgress, FitResult, FitSettings
+from mitsplat.fit import FitProgress, FitSettings
+from mitsplat.fit_folder import FitResult
 from mitsplat.materials import Finish
 from mitsplat.pipeline import Finished
 from mitsplat.scene import Scene
@@ -207,7 +208,9 @@ def test_export(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 @pytest.fixture
 def fit_capture(monkeypatch: pytest.MonkeyPatch) -> Calls:
     seen = HeldOut(name="a.jpg", psnr=28.0, ssim=0.9, psnr_object=25.0, psnr_corrected=26.0)
-    calls = Calls(FitResult(box_asset("nut").splats, 70, 3.5, (seen,), "inputs"))
+    calls = Calls(
+        FitResult(box_asset("nut").splats, 70, 3.5, (seen,), "inputs", validation=(replace(seen, psnr=29.0),))
+    )
     monkeypatch.setattr(fit, "fit_capture", calls)
     monkeypatch.setattr(Capture, "load", lambda folder: folder)
     return calls
@@ -262,7 +265,9 @@ def test_fit_below_its_target_exits_with_4(
     fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert run("fit", "photos", "-o", tmp_path, "--target-psnr", 30) == 4
-    assert "held-out PSNR must reach 30.00 dB (got 28.00)" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "held-out photos: 28.00 dB" in out and "target: 29.00 dB on 1 photos set aside for it" in out
+    assert "PSNR must reach 30.00 dB (got 29.00)" in err
 
 
 @pytest.mark.parametrize("budget", ["10", "ten min", "1d"])

@@ -138,14 +138,18 @@ def test_workers_end_with_their_parent(tmp_path):
     parent.kill()
     parent.wait()
     for path in folder.iterdir():
-        wait_for(lambda path=path: not Path("/proc", path.name).exists() or "Z" in state_of(path.name))
+        wait_for(lambda path=path: ended(path.name))
 
 
-def state_of(process):
-    return Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0]
+def ended(process):
+    """Whether a process is gone, or a zombie; it may go while it is looked at."""
+    try:
+        return "Z" in Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return True
 
 
-def wait_for(condition, seconds=60):
+def wait_for(condition, seconds=300):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -303,14 +307,15 @@ def test_few_frames_start_no_process():
 
 def test_closing_stops_the_workers_at_once():
     results = run_frames(Make(how="slow"), LAYOUTS, workers=2, note=lambda text: stop())
+    stopped = []
 
     def stop():
+        stopped.append(time.monotonic())  # starting takes as long as it takes
         raise KeyboardInterrupt
 
-    start = time.monotonic()
     with closing(results), pytest.raises(KeyboardInterrupt):
         next(results)
-    assert time.monotonic() - start < 30
+    assert time.monotonic() - stopped[0] < 30
 
 
 def test_workers_must_be_positive():

@@ -32,13 +32,16 @@ from test_dataset import settle
 from test_faults import slow
 
 if __name__ == "__main__":
-    dataset._default_render = lambda: partial(slow, {seconds})
+    dataset._default_render = lambda: partial(slow, {seconds}, {stop})
     dataset._default_settle = lambda: settle
     main(sys.argv[1:])
 """
 
 
-def slow(seconds, scene, index, *, layout):
+def slow(seconds, stop, scene, index, *, layout):
+    """A drawn frame, after a while; none once a folder holds so many, for whoever is to end the process may be late."""
+    if stop is not None and lines(Path(stop[0])) >= stop[1]:
+        time.sleep(3600)
     time.sleep(seconds)
     return render(scene, index, layout=layout)
 
@@ -57,17 +60,18 @@ def undisturbed(scene, tmp_path_factory):
     return contents(folder)
 
 
-def command(tmp_path, *args, seconds=0.05):
+def command(tmp_path, *args, seconds=0.05, stop=None):
     script = tmp_path / "child.py"
-    script.write_text(CHILD.format(tests=str(Path(__file__).parent), seconds=seconds))
+    script.write_text(CHILD.format(tests=str(Path(__file__).parent), seconds=seconds, stop=stop))
     return [sys.executable, str(script), "render", *map(str, args)]
 
 
-def start(tmp_path, scene, out, *options, seconds=0.05):
-    """The command line on synthetic frames, in a session of its own, as from a terminal."""
+def start(tmp_path, scene, out, *options, frames):
+    """The command line on so many synthetic frames, in a session of its own, as from a terminal."""
+    stop = str(out), lines(out) + frames
     with (tmp_path / "said").open("w") as said:
         return subprocess.Popen(
-            command(tmp_path, scene.path, "-o", out, *options, seconds=seconds),
+            command(tmp_path, scene.path, "-o", out, *options, stop=stop),
             stdout=said,
             stderr=said,
             start_new_session=True,
@@ -82,7 +86,7 @@ def lines(out):
 
 
 def wait_for_frames(process, out, count):
-    end = time.monotonic() + 120
+    end = time.monotonic() + 300
     while lines(out) < count:
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.002)
@@ -92,7 +96,7 @@ def test_killed_at_random_moments(scene, tmp_path, undisturbed):
     """Three runs are killed while they write; the lock refuses others by name and goes with its holder."""
     out, rng = tmp_path / "out", random.Random(8)
     for options in (["--workers", "1"], ["--workers", "2"], ["--workers", "2"]):
-        process = start(tmp_path, scene, out, *options)
+        process = start(tmp_path, scene, out, *options, frames=4)
         wait_for_frames(process, out, lines(out) + 2)
         with pytest.raises(InputError, match=rf"by another run \(process {process.pid} on {socket.gethostname()}\)"):
             write(scene, out)
@@ -108,7 +112,7 @@ def test_killed_at_random_moments(scene, tmp_path, undisturbed):
 def test_interrupted(scene, tmp_path, undisturbed):
     """Ctrl-C, which goes to all processes of a terminal, stops at once with status 130 and leaves nothing half done."""
     out = tmp_path / "out"
-    process = start(tmp_path, scene, out, "--workers", 2, seconds=0.5)  # not finished before the signal
+    process = start(tmp_path, scene, out, "--workers", 2, frames=4)
     wait_for_frames(process, out, 3)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=60) == 130

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -144,6 +146,36 @@ def test_interrupted_fit_goes_on_to_the_same_bytes(
     assert (out / "splats.ply").read_bytes() == (tmp_path / "whole" / "splats.ply").read_bytes()
 
 
+def test_interrupted_fit_ends_at_its_target_where_it_would_have(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looks every 10 steps, also after an interruption in between."""
+    monkeypatch.setattr(fit, "_EVERY", 2)
+    monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
+    settings = replace(SMALL, iterations=200, gaussians=300, coarse=0.0, target_psnr=99.0)
+    found: dict[int, float | None] = {}
+
+    def stop_at(step: int) -> Callable[[FitProgress], None]:
+        def look(state: FitProgress) -> None:
+            found[state.step] = state.validation
+            if state.step == step:
+                raise KeyboardInterrupt
+
+        return look
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_capture(capture, tmp_path / "probe", settings, progress=stop_at(22))
+    assert [step for step in range(4, 22, 2) if found[step] != found[step - 2]] == [10, 20]
+    settings = replace(settings, target_psnr=found[20])
+    whole = fit_capture(capture, tmp_path / "whole", settings)
+    assert whole.iterations == 20 and whole.validation_psnr == found[20]
+    with pytest.raises(KeyboardInterrupt):
+        fit_capture(capture, tmp_path / "again", settings, progress=stop_at(14))
+    again = fit_capture(capture, tmp_path / "again", settings)
+    assert (again.iterations, again.validation) == (whole.iterations, whole.validation)
+    assert (tmp_path / "again/splats.ply").read_bytes() == (tmp_path / "whole/splats.ply").read_bytes()
+
+
 @pytest.mark.parametrize("densification", ["mcmc", "classic"])
 def test_no_fit_has_more_gaussians_than_asked_for(
     capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
@@ -216,11 +248,31 @@ def test_corrections_are_shifted_to_the_identity_as_their_mean() -> None:
     np.testing.assert_allclose(np.diff(found, axis=1), np.diff(table, axis=1), atol=1e-5)
 
 
-def test_fit_keeps_to_its_time_and_ends_at_its_target(capture: Capture, tmp_path: Path) -> None:
-    short = fit_capture(capture, tmp_path / "short", replace(SMALL, iterations=10**6, budget=2.0))
-    assert 2 <= short.seconds < 20 and short.iterations < 10**4
-    early = fit_capture(capture, tmp_path / "early", replace(SMALL, iterations=400, target_psnr=12.0))
-    assert early.iterations < 200 and early.psnr >= 12
+def test_fit_keeps_to_its_time(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a clock that goes on by 10 ms whenever it is read."""
+    now = itertools.count()
+    monkeypatch.setattr(fit.time, "monotonic", lambda: 0.01 * next(now))
+    short = fit_capture(capture, tmp_path, replace(SMALL, iterations=10**6, budget=2.0))
+    assert short.seconds == pytest.approx(2, abs=0.05) and 20 < short.iterations < 200
+    assert short.validation == ()
+
+
+def test_fit_ends_at_its_target_on_photos_apart_from_those_reported(capture: Capture, tmp_path: Path) -> None:
+    """What is held out may be replaced by noise: it moves what is reported, and neither splats nor end."""
+    settings = replace(SMALL, iterations=400, target_psnr=12.0)
+    early = fit_capture(capture, tmp_path / "early", settings)
+    assert early.iterations < 200 and early.validation_psnr is not None and early.validation_psnr >= 12
+    assert [photo.name for photo in early.held_out] == ["00.png", "08.png", "16.png"]
+    assert [photo.name for photo in early.validation] == ["05.png", "14.png"]
+    noise = tmp_path / "noise.png"
+    Image.fromarray(np.random.default_rng(4).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)).save(noise)
+    photos = [replace(p, file=noise) if p in capture.held_out else p for p in capture.photos]
+    other = fit_capture(replace(capture, photos=tuple(photos)), tmp_path / "other", settings)
+    assert other.psnr < early.psnr - 3
+    assert other.iterations == early.iterations
+    assert (tmp_path / "other/splats.ply").read_bytes() == (tmp_path / "early/splats.ply").read_bytes()
+    with pytest.raises(InputError, match="a target takes at least two photos besides the held-out ones"):
+        fit_capture(replace(capture, photos=capture.photos[:2]), tmp_path / "few", settings)
 
 
 @pytest.mark.parametrize("masks", ["ignore", "off"])

@@ -20,7 +20,8 @@ from test_fit import SMALL, photograph, seeing
 
 from mitsplat import fit
 from mitsplat.capture import Capture
-from mitsplat.fit import FitResult, FitSettings, fit_capture
+from mitsplat.fit import FitSettings, fit_capture
+from mitsplat.fit_folder import FitResult
 from mitsplat.metrics import psnr
 from mitsplat.render import render_splats
 from mitsplat.splats import Splats

@@ -93,7 +93,7 @@ def test_what_the_photos_set_aside_deny_is_dropped(truth: trimesh.Trimesh, views
     assert not found.kept
     assert found.mesh is truth
     assert found.after > found.before
-    assert str(found).startswith("dropped: silhouettes and masks of 4 photos set aside differ by ")
+    assert str(found).startswith("dropped: silhouettes and masks of the 4 photos that decide differ by ")
 
 
 def test_what_stands_on_the_table_stays_on_it() -> None:

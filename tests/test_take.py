@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import zlib
@@ -50,7 +51,7 @@ def test_a_rendered_capture_comes_back(
     # Photos of 480 px whose lens is found from themselves hold the scale to a few tenths of a per cent.
     assert abs(scale - 1) < 5e-3
     assert np.degrees(np.arccos(matrix[2, 2] / scale)) < 0.2
-    # Feature matching runs on several threads and differs from run to run: no camera may be off by 1 % of its distance.
+    # No camera may be off by 1 % of its distance.
     assert np.linalg.norm(residuals, axis=1).max() < 0.01 * 0.26
     assert abs(matrix[2, 3]) < 5e-4
     for photo in capture.photos:
@@ -81,6 +82,23 @@ print(json.dumps([before, agreement(model, folder / "database.db")]))
     assert min(before.values()) > 0.7
     assert after["photo05.png"] < 0.5
     assert min(share for name, share in after.items() if name != "photo05.png") > 0.5
+
+
+def test_a_capture_that_is_made_anew_is_none_until_it_is_whole(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Copies of other photographs, or in another size, are never read with cameras of the earlier ones."""
+    given, finished, _ = captured
+    out = Path(shutil.copytree(finished, tmp_path / "capture"))
+
+    def interrupt(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(take, "prepare_photos", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        capture_photos(given, out, CaptureSettings(board=rendered.BOARD, max_size=240))
+    with pytest.raises(InputError, match=r"capture\.json: "):
+        Capture.load(out)
 
 
 def overlap(mask: np.ndarray, true: Camera) -> float:
@@ -424,6 +442,57 @@ def test_photos_as_they_come_end_in_a_capture(
     assert (cameras["photo06.png"].width, cameras["photo06.png"].height) == (360, 270)
     found, true = (np.array([of[name].centre for name in cameras]) for of in (cameras, photos[1]))
     assert np.linalg.norm(fit_similarity(found, true)[1], axis=1).max() < 0.01 * 0.26
+
+
+@pytest.mark.slow
+def test_a_capture_is_the_same_bytes_however_it_came_about(photos: tuple[Path, object], tmp_path: Path) -> None:
+    """On all cores, or on one in a process that is killed while it matches and goes on later."""
+    given = tmp_path / "given"
+    given.mkdir()
+    for number in range(6):
+        shutil.copy(photos[0] / f"photo{number:02}.png", given)
+    settings = CaptureSettings(board=rendered.BOARD, kind="environment")
+    capture_photos(given, tmp_path / "whole", settings)
+    code = """
+import os, signal, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from test_take import CaptureSettings, capture_photos, rendered
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+def progress(done, total, what):
+    if what == "matching":
+        os.kill(os.getpid(), signal.SIGKILL)
+given, out = map(Path, sys.argv[2:])
+capture_photos(given, out, CaptureSettings(board=rendered.BOARD, kind="environment"), progress=progress)
+"""
+    out = tmp_path / "killed"
+    ended = subprocess.run(
+        [sys.executable, "-c", code, str(Path(__file__).parent), str(given), str(out)], capture_output=True, text=True
+    )
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert (out / "sfm/database.db").exists() and not (out / "capture.json").exists()
+    capture_photos(given, out, settings)
+    for name in ("capture.json", "points.npz", "capture.png", "inputs.json"):
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_colmap_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
+    """One that went on by itself would write into the database of the next run."""
+    (tmp_path / "job.json").write_text('{"task": "reconstruct"}')
+    code = f"""
+import time
+from mitsplat import sfm_child
+sfm_child.run = lambda job, folder: print("working", flush=True) or time.sleep(3600)
+sfm_child.end_with_parent()
+sfm_child.main(sfm_child.Path({str(tmp_path / "job.json")!r}))
+"""
+    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert child.stdout is not None and child.stdin is not None
+    assert child.stdout.readline() == b"working\n"
+    assert child.poll() is None
+    child.stdin.close()
+    assert child.wait(timeout=300) == 1
+    child.stdout.close()
 
 
 @pytest.mark.slow

@@ -128,7 +128,9 @@ def fit(
     ] = "mcmc",
     iterations: Iterations = 3000,
     budget: Budget = None,
-    target_psnr: Annotated[float | None, typer.Option(help="End early at this PSNR of held-out photos [dB].")] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option(help="End early at this PSNR [dB] of photos that are set aside for it.")
+    ] = None,
     edge: Edge = 800,
     sh_degree: ShDegree = 3,
     masks: Annotated[
@@ -152,12 +154,13 @@ def fit(
     ] = False,
     seed: Seed = 0,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite/--resume", help="Replace a fit in the folder, or go on with it.")
+        bool,
+        typer.Option("--overwrite/--resume", help="Replace what the folder holds of another fit, or refuse to."),
     ] = False,
 ) -> None:
     """Fit Gaussians to the photos of CAPTURE.
 
-    Every eighth photo is held out to check the result.
+    Every eighth photo is held out to check the result. Runs again where it stopped.
     """
     from mitsplat.capture import Capture
     from mitsplat.depth_maps import find_maps
@@ -193,7 +196,7 @@ def fit(
     with progress_bar("steps/s") as show:
 
         def progress(now: FitProgress) -> None:
-            checked = "" if now.held_out is None else f" ({now.held_out:.1f} held out)"
+            checked = "" if now.validation is None else f" ({now.validation:.1f} set aside)"
             show(int(now.fraction * iterations), iterations, f"{now.psnr:.1f} dB{checked}, {now.gaussians} Gaussians")
 
         result = fit_capture(loaded, out, settings, depths=maps, overwrite=overwrite, progress=progress)
@@ -203,11 +206,14 @@ def fit(
         f"splats: {out / 'splats.ply'} ({len(result.splats)} Gaussians; {len(result.held_out)} held-out photos: "
         f"{result.psnr:.2f} dB, SSIM {result.ssim:.3f})"
     )
-    if target_psnr is not None and result.psnr < target_psnr:
-        raise PartialResultError(
-            f"{out}: held-out PSNR must reach {target_psnr:.2f} dB (got {result.psnr:.2f}); more iterations or "
-            "Gaussians, or more photos with overlap and even light, would help"
-        )
+    reached = result.validation_psnr
+    if target_psnr is not None and reached is not None:
+        typer.echo(f"target: {reached:.2f} dB on {len(result.validation)} photos set aside for it")
+        if reached < target_psnr:
+            raise PartialResultError(
+                f"{out}: PSNR must reach {target_psnr:.2f} dB (got {reached:.2f}); more iterations or Gaussians, or "
+                "more photos with overlap and even light, would help"
+            )
 
 
 def capture(

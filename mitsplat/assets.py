@@ -217,7 +217,7 @@ class Asset:
             raise InputError(f"asset {self.name!r} cannot be saved: {rule}") from error
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / _FILE).unlink(missing_ok=True)  # an earlier asset's is not of what is written now
+            (folder / ASSET_FILE).unlink(missing_ok=True)  # an earlier asset's is not of what is written now
             stored.splats.save(folder / splats)
             if stored.mesh is not None:
                 _joined([stored.mesh]).export(folder / "mesh.ply")

@@ -17,7 +17,6 @@ from mitsplat.cad import Part, read_parts
 from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
 from mitsplat.materials import Finish, read_material
-from mitsplat.mesh import convex_pieces
 
 COLOUR = (200, 120, 40)
 QUICK = BakeSettings(gaussians=300, sh_degree=0, directions=8, samples=4, fit_steps=0, fit_views=1, verify_views=1)
@@ -194,11 +193,3 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
     (tmp_path / "box.mtl").unlink()
     with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing"):
         read_parts(path)
-
-
-def test_piece_of_a_scan_that_lacks_a_triangle_is_closed_first() -> None:
-    """CoACD would rebuild an open mesh of voxels: slow, and too thick."""
-    ball = trimesh.creation.icosphere(3, 0.05)
-    torn = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
-    (piece,) = convex_pieces(torn)
-    assert piece.volume == pytest.approx(ball.volume, rel=1e-6)

@@ -1,15 +1,17 @@
 """The process that writes lines, over many frames: time and memory of every record, and of the end of a run.
 
-    python -m benchmarks.driver [--frames 100000] [--folder FOLDER] [--instances 3]
+    python -m benchmarks.driver [--frames 100000] [--begun 0] [--formats yolo coco bop] [--folder FOLDER]
 
 A whole run of :func:`mitsplat.dataset.write_dataset`, and then another that finds everything done, but for the images:
-frames are given to it as fast as it takes them, in pairs in the wrong order, as from two workers, with files that are
-further names of a few. A thousand frames of three instances take 12 MB while the run ends.
+frames are given to it as fast as it takes them, in pairs in the wrong order, as from two workers, with pictures that
+are further names of a few. ``--begun`` frames are there before, as an earlier run left them: put there at once, not
+appended one by one, so that what a record costs after a million can be seen in minutes.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import resource
 import tempfile
@@ -23,6 +25,7 @@ from pycocotools import mask as coco_mask
 
 from benchmarks.faults import SCENE
 from mitsplat import dataset
+from mitsplat.manifest import encode_line
 from mitsplat.scene import load_scene
 
 LINKS = 60_000
@@ -37,6 +40,11 @@ POSE = [
 SIZE = 64, 48
 
 
+def split_of(index: int) -> str:
+    """Every fifth layout is for validation."""
+    return "val" if index // VIEWS % 5 == 1 else "train"
+
+
 class Frames:
     """Stands for :class:`mitsplat.frame_maker.FrameMaker`: frames whose files workers have put in the folder."""
 
@@ -48,9 +56,9 @@ class Frames:
         self._out = out
         picture = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
         self._picture = cv2.imencode(".png", picture)[1].tobytes()
-        self._sources: dict[str, Path] = {}
-        for folder in (f"{kind}/{split}" for kind in ("images", "labels") for split in ("train", "val")):
-            (out / folder).mkdir(parents=True, exist_ok=True)
+        self._source: Path | None = None
+        for split in ("train", "val"):
+            (out / "images" / split).mkdir(parents=True, exist_ok=True)
         covered = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8, order="F")
         for number in range(3):
             layer = np.zeros((SIZE[1], SIZE[0]), dtype=np.uint8)
@@ -61,23 +69,22 @@ class Frames:
         self._codes = [code["counts"].decode() for code in codes]
         self._areas = [int(area) for area in coco_mask.area(codes)]
 
+    def file(self, index: int, split: str) -> str:
+        """The frame's picture, made."""
+        file = f"images/{split}/{index:06d}.png"
+        if index % LINKS < 2 or self._source is None:
+            self._source = self._out / file
+            self._source.write_bytes(self._picture)
+        else:
+            os.link(self._source, self._out / file)
+        return file
+
     def __call__(self, index: int, note: Any, /) -> tuple[dict[str, Any], dict[str, float]]:
         """Frame ``index``'s neighbour."""
         start, begun = time.perf_counter(), time.process_time()
         index ^= 1
-        split = "val" if index // VIEWS % 5 == 1 else "train"
-        files = {}
-        for file, content in (
-            (f"images/{split}/{index:06d}.png", self._picture),
-            (f"labels/{split}/{index:06d}.txt", b""),
-        ):
-            kind = file[:6]
-            if index % LINKS < 2 or kind not in self._sources:
-                (self._out / file).write_bytes(content)
-                self._sources[kind] = self._out / file
-            else:
-                os.link(self._sources[kind], self._out / file)
-            files[file] = f"{index:064x}"
+        split = split_of(index)
+        files = {self.file(index, split): f"{index:064x}"}
         labels = [
             {
                 **{"id": number + 1, "asset": 0, "class_index": 0, "class": "nut", "box": box, "area": area},
@@ -109,6 +116,23 @@ class Frames:
         Frames.seconds += time.perf_counter() - start
         Frames.cpu += time.process_time() - begun
         return record, {"march": 0.4, "light": 0.5, "settle": 0.0, "write": 0.01}
+
+
+def begin(scene: Any, out: Path, frames: int) -> None:
+    """Put the first frames into a dataset, in the same order and bytes as a run would."""
+    dataset.write_dataset(scene, out, frames=2)
+    make = Frames(scene, None, out)
+    like = encode_line(make(3, None)[0]).decode()
+    tail = like[like.index('"draws"') : like.index(',"check"')] + "}"
+    with (out / "manifest.jsonl").open("ab") as manifest:
+        manifest.write(like.encode())
+        for place in range(3, frames):
+            index = place if place == 3 else place ^ 1
+            split = split_of(index)
+            file = make.file(index, split)
+            head = f'"index":{index},"layout":{index // VIEWS},"view":{index % VIEWS},"split":"{split}","seed":{index}'
+            text = f'{{{head},"files":{{"{file}":"{index:064x}"}},{tail}'.encode()
+            manifest.write(text[:-1] + f',"check":"{hashlib.sha256(text).hexdigest()[:16]}"}}\n'.encode())
 
 
 class Syncs:
@@ -143,10 +167,12 @@ def run(scene: Any, out: Path, frames: int, syncs: Syncs) -> None:
     def clocks() -> list[float]:
         return [time.perf_counter() - Frames.seconds - syncs.seconds, time.process_time() - Frames.cpu, syncs.seconds]
 
-    begun, step, last = time.perf_counter(), max(1, frames // 10), clocks()
+    begun, step, last = time.perf_counter(), 1, clocks()
 
     def hear(done: int, total: int, text: str) -> None:
+        nonlocal step
         if text == "starting":
+            step = max(1, (frames - done) // 10)
             print(f"opened in {time.perf_counter() - begun:.1f} s, {done} frames, {resident():.0f} MiB", flush=True)
         elif done % step == 0:
             wall, cpu, synced = (1e3 * (b - a) / step for a, b in zip(last, clocks(), strict=True))
@@ -172,6 +198,8 @@ def main() -> None:
     """Print what both runs take."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=100_000)
+    parser.add_argument("--begun", type=int, default=0)
+    parser.add_argument("--formats", nargs="+", default=["yolo", "coco", "bop"])
     parser.add_argument("--instances", type=int, default=3)
     parser.add_argument("--sync-every", type=int, default=1, help="do only so many of the fsyncs, to time the rest")
     parser.add_argument("--folder", type=Path, help="where to make a temporary folder")
@@ -184,8 +212,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path, out = Path(folder) / "scene.yaml", Path(folder) / "out"
         layouts = f"layouts: {options.frames // VIEWS}, views: {VIEWS}"
-        path.write_text(SCENE.replace("layouts: 3, views: 5", layouts).replace("yolo, coco, exr", "yolo, coco, bop"))
+        formats = ", ".join(options.formats)
+        path.write_text(SCENE.replace("layouts: 3, views: 5", layouts).replace("yolo, coco, exr", formats))
         scene = load_scene(path, allow_outside=True)
+        if options.begun:
+            begin(scene, out, options.begun)
+            print(f"begun with {options.begun} frames", flush=True)
         for _ in range(2):
             run(scene, out, options.frames, syncs)
         print(syncs.told())

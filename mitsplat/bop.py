@@ -14,8 +14,8 @@ numbers. The one difference: what is visible is known exactly, where the toolkit
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,8 @@ from mitsplat.label import Labels
 from mitsplat.maps import encode_mask_png
 
 MILLIMETRES = 1000.0
-_TOGETHER = 768
-"""Files."""
+_TOGETHER, _WAITING = 768, 32
+"""Files, and how many of them are waited for at a time."""
 
 
 def scene_folder(record: Record) -> str:
@@ -52,8 +52,8 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
 class ScenesWriter:
     """Writes the annotations of all scenes: frames come by layout.
 
-    Scenes are put on disk together, as many as :data:`_TOGETHER`: a million images have 300,000 files, and waiting for
-    each would take longer than all the rest.
+    Files of scenes are put on disk side by side, as many as :data:`_TOGETHER`: a million images have 300,000, and
+    waiting for one after the other would take longer than all the rest.
     """
 
     def __init__(self, root: Path) -> None:
@@ -85,7 +85,8 @@ class ScenesWriter:
         self._files = {}
 
     def _name_ended(self) -> None:
-        os.sync()
+        with ThreadPoolExecutor(_WAITING) as pool:
+            list(pool.map(GrowingFile.sync, self._ended))
         for file in self._ended:
             file.name()
         self._ended = []

@@ -90,8 +90,13 @@ class GrowingFile:
         """Write no more."""
         self._file.close()
 
+    def sync(self) -> None:
+        """Wait until a closed file is on disk."""
+        with self._temporary.open("rb") as file:
+            os.fsync(file.fileno())
+
     def name(self) -> None:
-        """Give a closed file its name, once the caller has seen to it that it is on disk."""
+        """Give a closed file its name; it must be on disk."""
         self._temporary.replace(self._path)
         self._named = True
 

@@ -21,7 +21,7 @@ from mitsplat.dataset import write_dataset
 from mitsplat.folder import Shard
 from mitsplat.merge import merge_shards
 from mitsplat.scene import Scene
-from mitsplat.spec import FORMATS
+from mitsplat.spec import FORMATS, Intrinsics
 
 Patch = Callable[[pytest.MonkeyPatch], None]
 
@@ -441,3 +441,25 @@ def test_the_audit_shares_nothing_with_the_writers() -> None:
                 ahead |= modules & {"described"}
         ahead -= seen
     assert seen >= {"described", "bop_check", "listed", "owned", "truth", "layers_check", "scene_check", "stored"}
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"lens": "fisheye", "fx": 40.0, "fy": 41.0, "cx": 31.0, "cy": 25.0, "distortion": (0.02, -0.01, 0.003, 0.001)},
+        {"fov_x": 70.0, "distortion": (0.05, -0.02, 0.002, -0.001, 0.01, 0.003, 0.002, 0.001)},
+    ],
+    ids=["fisheye", "distorted"],
+)
+def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
+    """Right writers pass, and coefficients in the wrong order do not, whatever reads them."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=2, views=2)
+    seen = scene.spec.camera.model_copy(update={"intrinsics": Intrinsics(**lens)})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))
+    out = write(scene, tmp_path / "out", ["colmap", "depth", "exr", "flow", "poses"])
+    assert audit_dataset(out).violations == ()
+    path = out / "colmap/cameras.txt"
+    words = path.read_text().split()
+    words[8], words[9] = words[9], words[8]
+    path.write_text(" ".join(words) + "\n")
+    assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}

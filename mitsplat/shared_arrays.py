@@ -11,6 +11,7 @@ import mmap
 import os
 import pickle
 import tempfile
+from contextlib import suppress
 from multiprocessing.reduction import DupFd
 from typing import IO, Any, Generic, TypeVar
 
@@ -65,7 +66,8 @@ class SharedArrays(Generic[Value]):
     def close(self) -> None:
         """Let go of the file; processes that were started keep it."""
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # of a full disk, which is told of already
+                self._file.close()
             self._file = None
 
 

@@ -339,8 +339,8 @@ class MujocoWorld(World):
         model, data = self._model, self._data
         for stage in (*_BEFORE_CONTACTS, mujoco.mj_collision):
             stage(model, data)
-        contacts, friction = data.contact, model.geom_friction
-        contacts.friction[:] = pair_friction(friction[contacts.geom[:, 0]], friction[contacts.geom[:, 1]])
+        pairs, friction = data.contact.geom, model.geom_friction
+        data.contact.friction[:] = pair_friction(friction[pairs[:, 0]], friction[pairs[:, 1]])
         for stage in _AFTER_CONTACTS:
             stage(model, data)
 

@@ -19,8 +19,8 @@ from conftest import WriteScene, box_asset
 from PIL import Image, ImageSequence
 from ruamel.yaml import YAML
 
-from mitsplat import bake, chart, dataset, depth_maps, depth_model, fit, frame, pipeline, settle, xml_scene
-from mitsplat.bake import BakeResult, BakeSettings
+from mitsplat import chart, dataset, depth_maps, depth_model, fit, frame, pipeline, settle, xml_scene
+from mitsplat.assets import Asset
 from mitsplat.capture import Capture
 from mitsplat.cli import app, main
 from mitsplat.dataset import DatasetSummary
@@ -28,7 +28,6 @@ from mitsplat.depth_maps import DepthMaps
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.fit import FitProgress, FitSettings
 from mitsplat.fit_folder import FitResult
-from mitsplat.materials import Finish
 from mitsplat.pipeline import Finished
 from mitsplat.scene import Scene
 from mitsplat.settle import Layout
@@ -278,31 +277,78 @@ def test_fit_wants_a_budget_with_a_unit(
     assert "--budget must be a time such as 90s" in capsys.readouterr().err
 
 
-def test_bake_passes_every_option_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calls = Calls(BakeResult(asset=box_asset("gear"), psnr=31.26, psnr_object=28.0))
-    monkeypatch.setattr(bake, "bake_asset", calls)
-    status = run(
-        "bake", "gear.glb", "-o", tmp_path / "gear", "--class", "wheel", "--light", "studio", "--gaussians", 500,
-        "--sh-degree", 1, "--units", 0.001, "--up", "y", "--density", 7800, "--friction", 0.2, "--seed", 4,
-        "--kind", "environment", "--name", "cog", "--colour", "steelblue", "--roughness", 0.3, "--metallic", 1,
-        "--specular", 0.05, "--any-size",
+def test_bake_takes_every_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What each does is read from the asset; processes of their own bake in test_shell.py and test_fresh.py."""
+    box_asset("gear", (20.0, 30.0, 10.0)).mesh.export(tmp_path / "gear.glb")
+    options = (
+        "--class", "wheel", "--light", "studio", "--gaussians", 60, "--sh-degree", 1, "--units", 0.001, "--up", "y",
+        "--density", 7800, "--friction", 0.2, "--seed", 4, "--kind", "environment", "--name", "cog",
+        "--colour", "steelblue", "--roughness", 0.3, "--metallic", 1, "--specular", 0.05, "--any-size",
     )  # fmt: skip
-    assert status == 0
-    assert calls.args == (Path("gear.glb"),)
-    assert callable(calls.kwargs.pop("progress"))
-    assert calls.kwargs == {
-        "name": "cog", "class_name": "wheel", "kind": "environment", "light": "studio",
-        "settings": BakeSettings(gaussians=500, sh_degree=1, seed=4), "metres_per_unit": 0.001, "up": "y",
-        "density": 7800.0, "friction": 0.2,
-        "finish": Finish(colour="steelblue", roughness=0.3, metallic=1.0, specular=0.05), "any_size": True,
-    }  # fmt: skip
-    assert (tmp_path / "gear/asset.yaml").is_file()
+    assert run("bake", tmp_path / "gear.glb", "-o", tmp_path / "gear", *options) == 0
+    asset = Asset.load(tmp_path / "gear")
+    assert (asset.name, asset.class_name, asset.kind) == ("cog", "wheel", "environment")
+    assert (asset.density, asset.friction, asset.splats.sh_degree) == (7800.0, 0.2, 1)
+    assert 30 < len(asset.splats) < 120
+    np.testing.assert_allclose(asset.mesh.extents, (0.02, 0.01, 0.03), atol=1e-6)
+    assert asset.roughness == pytest.approx(0.3)
+    red, _, blue = asset.splats.sh[:, 0].mean(axis=0)
+    assert red < blue
     assert (tmp_path / "gear/report.html").is_file()
-    assert "31.3 dB" in capsys.readouterr().out
-    assert run("bake", "gear.glb", "-o", tmp_path / "gear") == 0
-    assert calls.kwargs["name"] == "gear"
+    assert re.search(r"Gaussians, \d+\.\d dB", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
+        (["--density", "nan"], "--density must be finite and > 0 (got nan)"),
+        (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
+        (["--gaussians", "0"], "gaussians must be at least 1 (got 0)"),
+    ],
+)
+def test_bad_option_of_bake_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
+    box_asset("gear").mesh.export(tmp_path / "gear.stl")
+    assert run("bake", tmp_path / "gear.stl", "-o", tmp_path / "gear", *options) == 2
+    assert capsys.readouterr().err == f"mitsplat: {sentence}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            "bake plant.splat -o a",
+            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got splats, which an asset.yaml",
+        ),
+        ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
+        ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
+        ("check plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
+        ("render plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
+        (
+            "render part.stl",
+            "part.stl: must be a scene file (.yaml) (got a mesh, of which `mitsplat bake` makes an asset)",
+        ),
+        ("render nut", "nut: must be a scene file (.yaml) (got a folder: an asset, which a scene names"),
+        ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene, which `mitsplat render`"),
+        ("audit folder", "folder must be a dataset of mitsplat (dataset.json: No such file or directory)"),
+        ("audit gone", "gone must be a dataset of mitsplat (no such folder)"),
+        ("render gone.yaml --address auto", "--address and --resources are of a cluster: give --engine ray as well"),
+    ],
+)
+def test_another_kind_of_file_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: str, sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    box_asset("nut").save("nut")
+    box_asset("nut").splats.save("plant.splat")
+    box_asset("nut").mesh.export("part.stl")
+    Path("folder").mkdir()
+    Path("scene.xml").write_text('<scene version="3.9.0"/>')
+    assert run(*words.split()) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"mitsplat: {sentence}") and told.count("\n") == 1
 
 
 def test_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -374,9 +420,9 @@ def test_bad_option_of_settle_is_one_sentence(
     [
         (["--size", "12"], "--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got 12)"),
         (["--size", "-1x3"], "--size must be WIDTHxHEIGHT"),
-        (["--size", "0x3"], "scene.yaml: output.width: must be >= 1 (got 0)"),
-        (["--seed", "-1"], "scene.yaml: seed: must be >= 0 (got -1)"),
-        (["--format", "yolo,zip"], "output.formats[1]: must be 'yolo', 'yolo-detect', "),
+        (["--size", "0x3"], "--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got 0x3)"),
+        (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
+        (["--format", "yolo,zip"], "--format must be among yolo, yolo-detect, "),
         (["-n", "13"], "(got 13)"),
         (["-n", "0"], "(got 0)"),
         (["--workers", "0"], "(got 0)"),
@@ -421,10 +467,15 @@ def test_other_errors_have_a_status_of_their_own(
     assert f"mitsplat: {error}\n" in capsys.readouterr().err
 
 
-def test_our_own_bugs_keep_their_traceback(scene_path: Path, write_dataset: Calls) -> None:
+def test_our_own_bugs_are_a_sentence(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_dataset.error = ZeroDivisionError()
-    with pytest.raises(ZeroDivisionError):
-        main(["render", str(scene_path)])
+    assert run("render", scene_path) == 70
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told.startswith(
+        "mitsplat: this is a fault of mitsplat, not of what it was given: ZeroDivisionError (the log"
+    )
 
 
 @pytest.mark.parametrize(
@@ -432,7 +483,10 @@ def test_our_own_bugs_keep_their_traceback(scene_path: Path, write_dataset: Call
     [
         (InputError("a.ply: broken"), 2),
         (MissingResourceError("disk full"), 3),
+        (OSError(28, "No space left on device"), 3),
+        (MemoryError(), 3),
         (PartialResultError("half"), 4),
+        (KeyError("ours"), 70),
         (KeyboardInterrupt(), 130),
     ],
 )

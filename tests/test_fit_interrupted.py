@@ -164,6 +164,9 @@ def test_an_asset_whose_fit_was_interrupted_goes_on(
         make_photo_asset(tmp_path, tmp_path, AssetJob(name="part"), capture=CaptureSettings(), fit=settings)
 
     make(TINY)
+    before = (tmp_path / "fit/splats.ply").stat().st_mtime_ns
+    make(TINY)
+    assert (tmp_path / "fit/splats.ply").stat().st_mtime_ns == before
     with Places(place).watched(), pytest.raises(Interrupted):
         make(NEW)
     make(NEW)

@@ -82,6 +82,8 @@ class Proxies:
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
         """What rays meet first, and what they would meet without the dynamic proxies."""
         static = _TraceScene.nearest(self.static, ray, Hit.nothing())
+        # A kernel of its own: on CUDA none may trace two scenes.
+        dr.eval(static)
         return _TraceScene.nearest(self.dynamic, ray, static), static
 
 

@@ -291,14 +291,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 dr.select(shown, 0, splat.instance),
                 contents.traits.seen(self._by_shape(contents, view, z_max), splat.instance),
                 shown,
-                behind.normal if behind else mi.Normal3f(0),
-                behind.face if behind else mi.Normal3f(0),
             )
-            dr.eval(seen)
+            # Light is traced at visible meshes as at static proxies, also where splats touch them.
+            ground = behind.before(static) if behind else static
+            dr.eval(seen, ground)
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
-                lambda pixel: _surface(contents, view, rays.o, pixel, seen, hit, static),
+                lambda pixel: _surface(contents, view, rays.o, pixel, seen, hit, ground),
                 view,
                 accuracy=accuracy,
                 seed=seed,
@@ -498,7 +498,6 @@ class _Seen:
         alpha, depth, instance: As in the layers.
         trait: Row of what is shown in :class:`Traits`.
         mesh: Whether it is a visible mesh.
-        normal, face: Normals of that.
     """
 
     direction: Any
@@ -507,8 +506,6 @@ class _Seen:
     instance: Any
     trait: Any
     mesh: Any
-    normal: Any
-    face: Any
 
 
 def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen, hit: Hit, static: Hit) -> Surface:
@@ -517,10 +514,10 @@ def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen,
     ray, depth, instance = mi.Ray3f(eye, seen.direction), seen.depth, seen.instance
     cosine = view.cosine(ray)
     met = hit.distance < dr.inf
-    known = seen.mesh | ~met | (hit.instance == instance)
+    known = ~met | (hit.instance == instance)
     # What shows through or beside a dynamic object's proxy lies on a static one.
     behind = instance == 0
-    same = ~seen.mesh & dr.select(behind, static.distance < dr.inf, met & known)
+    same = dr.select(behind, static.distance < dr.inf, met & known)
     proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
     shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
     towards = mi.Normal3f(-ray.d)
@@ -532,8 +529,8 @@ def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen,
     reach = dr.max(dr.abs(position))
     return Surface(
         position=position,
-        normal=mi.Vector3f(dr.select(seen.mesh, seen.normal, dr.select(same, shown[0], towards))),
-        face=mi.Vector3f(dr.select(seen.mesh, seen.face, dr.select(same, shown[1], towards))),
+        normal=mi.Vector3f(dr.select(same, shown[0], towards)),
+        face=mi.Vector3f(dr.select(same, shown[1], towards)),
         lift=dr.select(on_proxy, shown[2], 0),
         to_camera=-ray.d,
         offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),

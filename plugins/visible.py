@@ -22,7 +22,7 @@ from mitsplat.plugins.device import gathered, ray_scene, wrapped
 from mitsplat.plugins.emitters import receiver
 from mitsplat.plugins.gaussian import srgb_to_linear
 from mitsplat.plugins.mirrored import Glimpse, SplatMirror
-from mitsplat.plugins.proxies import Proxies
+from mitsplat.plugins.proxies import Hit, Proxies
 from mitsplat.plugins.rays import View
 
 LANES = 1 << 20
@@ -76,6 +76,17 @@ class Behind:
     normal: Any
     face: Any
     hit: Any
+
+    def before(self, other: Hit) -> Hit:
+        """The nearer of the meshes and what else the same rays meet."""
+        closer = self.valid & (self.hit.t < other.distance)
+        return Hit(
+            dr.select(closer, self.hit.t, other.distance),
+            dr.select(closer, self.face, other.face),
+            dr.select(closer, self.normal, other.normal),
+            dr.select(closer, 0, other.lift),
+            dr.select(closer, 0, other.instance),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -188,7 +188,7 @@ def run(scene: Any, out: Path, frames: int, syncs: Syncs) -> None:
     wall, cpu, synced = (b - a for a, b in zip(last, clocks(), strict=True))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"ended in {wall:.1f} s ({cpu:.1f} s CPU) and {synced:.1f} s in fsync, {summary.frames} frames; "
+        f"ended in {wall + synced:.1f} s ({cpu:.1f} s CPU; fsync {synced:.1f} s), {summary.frames} frames; "
         f"{resident():.0f} MiB, at most {peak:.0f} MiB so far",
         flush=True,
     )

@@ -47,7 +47,6 @@ _MOST_GAUSSIANS = 2_000_000
 _SMALLEST, _LARGEST = 0.001, 5.0
 """Size of objects [m] outside of which units are wrong rather than objects unusual."""
 _STAGES = {
-    "reading the mesh": 1,
     "placing Gaussians": 14,
     "tracing their radiance": 16,
     "path-tracing pictures": 14,
@@ -181,7 +180,6 @@ def bake_asset(
     if not (friction >= 0 and np.isfinite(friction)):
         raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
     stages = _Stages(progress)
-    stages("reading the mesh")
     lights = bake_lights(light)
     parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
     surface = trimesh.util.concatenate([part.mesh for part in parts])

@@ -15,6 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from mitsplat.mesh import contact_points, join_meshes
+from mitsplat.warp_start import quiet_warp
 
 FloatArray = NDArray[np.float64]
 
@@ -32,6 +33,7 @@ class Surface:
         points: Contact points in the mesh's frame [m], shape (N, 3).
     """
 
+    @quiet_warp()
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.points = contact_points(mesh)
         self._mesh = wp.Mesh(
@@ -40,6 +42,7 @@ class Surface:
             support_winding_number=True,
         )
 
+    @quiet_warp()
     def signed_distances(self, points: FloatArray) -> NDArray[np.float32]:
         """Distance of each point (N, 3) [m], in the mesh's frame, to the surface; negative inside."""
         distances = wp.empty(len(points), dtype=wp.float32, device="cpu")
@@ -53,6 +56,7 @@ class Surface:
         found: NDArray[np.float32] = np.array(distances.numpy())
         return found
 
+    @quiet_warp()
     def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The surface's points (N, 3) that are nearest to ``points`` (N, 3), unit normals (N, 3), distances (N,)."""
         positions, normals = (wp.empty(len(points), dtype=wp.vec3, device="cpu") for _ in range(2))
@@ -92,6 +96,7 @@ class PlacedSurface:
             return reach
         return min(reach, float(self.signed_distances(near).min()))
 
+    @quiet_warp()
     def signed_distances(self, points: FloatArray) -> NDArray[np.float32]:
         """Distance of each world-space point (N, 3) [m] to the surface; negative inside."""
         return self._surface.signed_distances((points - self._pose[:3, 3]) @ self._pose[:3, :3])

@@ -17,7 +17,7 @@ from pathlib import Path
 from mitsplat.cache import cache_folder
 from mitsplat.findings import Finding
 from mitsplat.llvm import OLDEST_USABLE, VARIABLE
-from mitsplat.warp_start import init_warp
+from mitsplat.warp_start import quiet_warp
 
 NEEDED_MEMORY = 2.5
 """For the default scene, see :func:`mitsplat.budget.worker_memory` [GiB]."""
@@ -124,9 +124,8 @@ def _warp() -> Finding:
     try:
         import warp
 
-        warp.config.log_level = warp.LOG_ERROR
-        init_warp()
-        devices = ", ".join(str(device) for device in warp.get_devices())
+        with quiet_warp():
+            devices = ", ".join(str(device) for device in warp.get_devices())
     except (ImportError, RuntimeError) as error:
         return Finding("warp", False, str(error), remedy)
     return Finding("warp", True, f"{version('warp-lang')} on {devices}")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mitsplat.cache import cache_folder, keep_file
 from mitsplat.errors import InputError
 from mitsplat.variant import one_at_a_time
-from mitsplat.warp_start import init_warp
+from mitsplat.warp_start import quiet_warp
 
 if TYPE_CHECKING:
     import trimesh
@@ -250,13 +250,13 @@ def warp_settings(progress: Progress | None = None) -> Iterator[None]:
     """Keep Warp quiet and leave gradients out, without which the simulation compiles in two thirds of the time."""
     import warp as wp
 
-    kept = wp.config.log_level, wp.config.enable_backward
-    wp.config.log_level, wp.config.enable_backward = wp.LOG_ERROR, False
+    kept = wp.config.enable_backward
+    wp.config.enable_backward = False
     try:
-        init_warp()
-        compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
-        if progress is not None and not any(compiled):
-            progress("compiling physics, once (about a minute)")
-        yield
+        with quiet_warp():
+            compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
+            if progress is not None and not any(compiled):
+                progress("compiling physics, once (about a minute)")
+            yield
     finally:
-        wp.config.log_level, wp.config.enable_backward = kept
+        wp.config.enable_backward = kept

@@ -1,4 +1,4 @@
-"""Starting Warp without what it says of machines that have no GPU."""
+"""Warp without its greeting, and without what it says of machines that have no GPU."""
 
 from __future__ import annotations
 
@@ -8,15 +8,29 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_started = False
 _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 
 
-def init_warp() -> None:
-    """Start Warp; on machines without a GPU this is no news, and its warning, which no setting mutes, is left out."""
+@contextmanager
+def quiet_warp() -> Iterator[None]:
+    """Warp, started, telling of nothing but errors; a function may be decorated by this.
+
+    That a machine has no GPU is no news: the warning, which no setting mutes, is left out.
+    """
     import warp as wp
 
-    with _stderr_without(_NO_GPU):
-        wp.init()  # type: ignore[no-untyped-call]
+    global _started
+    kept = wp.config.log_level
+    wp.config.log_level = wp.LOG_ERROR
+    try:
+        if not _started:
+            with _stderr_without(_NO_GPU):
+                wp.init()  # type: ignore[no-untyped-call]
+            _started = True
+        yield
+    finally:
+        wp.config.log_level = kept
 
 
 @contextmanager

@@ -297,7 +297,7 @@ def test_large_object_bakes_where_the_user_insists_and_tells_its_stages() -> Non
     assert len(result.asset.splats) > 100
     assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
     assert told[-1] == (100, 100, "done")
-    assert len({stage for _, _, stage in told}) == 7
+    assert len({stage for _, _, stage in told}) == 6
 
 
 def test_picture_is_that_of_single_rays_through_the_same_pixels() -> None:

@@ -142,7 +142,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0__count": -3}, "objects[0].count: must be >= 1 (got -3)"),
         ({"objects__0__count": [3, 2]}, "objects[0].count: must be [low, high] with low <= high (got [3, 2])"),
         ({"objects__0__count": [-1, 2]}, "objects[0].count[0]: must be >= 0 (got -1)"),
-        ({"objects__0__count": 1.5}, "objects[0].count: must be a list (got 1.5)"),
+        ({"objects__0__count": 1.5}, "objects[0].count: must be a whole number, or [least, most] of them (got 1.5)"),
         ({"objects__0__scale": 0}, "objects[0].scale: must be > 0 (got 0)"),
         ({"region__max": [0.2, -0.3, 1]}, "region.max: must be above min along y (got -0.3, min is -0.2)"),
         ({"shapes__0__visible": False, "shapes__0__collider": False}, "must be visible, a collider or a proxy"),

@@ -124,6 +124,6 @@ def test_a_lamp_that_is_a_shape_hides_nothing() -> None:
     place = mi.ScalarTransform4f().translate([0, 0, 0.3]).rotate([1, 0, 0], 180).scale(0.02)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
     lamp = {"type": "rectangle", "to_world": place, "emitter": light}
-    layers = render(camera, {"table": plain_mesh(SOLIDS["table"]), "lamp": lamp})
+    layers = render(camera, {"table": plain_mesh(SOLIDS["table"]), "lamp": lamp}, hide_emitters=True)
     np.testing.assert_allclose(layers.depth, 0.5, atol=1e-4)
     assert (layers.alpha == 1).all()

@@ -11,52 +11,53 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mitsplat.llvm import use_bundled_llvm
+from mitsplat.version import __version__ as __version__
 
 use_bundled_llvm()
 
 import mitsuba as _mi  # noqa: E402 - after Dr.Jit was told which LLVM to load
 
-__version__ = "0.1.0"
-
 _HOME = {
-    "Asset": "assets",
+    "Asset": "asset",
     "Camera": "camera",
-    "Frame": "frame",
+    "Frame": "frames.frame",
     "InputError": "errors",
-    "Labels": "label",
-    "Layers": "render",
-    "Layout": "settle",
+    "Labels": "labels.labels",
+    "Layers": "render.layers",
+    "Layout": "scene.layout",
     "Quality": "quality",
-    "Scene": "scene",
-    "SceneSpec": "scene",
+    "Renderer": "frames.frame",
+    "Scene": "scene.scene",
+    "SceneSpec": "scene.spec",
     "Splats": "splats",
-    "bake_asset": "bake",
-    "load_scene": "scene",
-    "render_frame": "frame",
-    "render_splats": "render",
-    "settle_layout": "settle",
-    "write_dataset": "dataset",
+    "bake_asset": "bake.bake",
+    "load_scene": "scene.scene",
+    "render_frame": "frames.frame",
+    "render_splats": "render.layers",
+    "settle_layout": "physics.settle",
+    "write_dataset": "dataset.write",
 }
 
 __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
-    from mitsplat.assets import Asset as Asset
-    from mitsplat.bake import bake_asset as bake_asset
+    from mitsplat.asset import Asset as Asset
+    from mitsplat.bake.bake import bake_asset as bake_asset
     from mitsplat.camera import Camera as Camera
-    from mitsplat.dataset import write_dataset as write_dataset
+    from mitsplat.dataset.write import write_dataset as write_dataset
     from mitsplat.errors import InputError as InputError
-    from mitsplat.frame import Frame as Frame
-    from mitsplat.frame import render_frame as render_frame
-    from mitsplat.label import Labels as Labels
+    from mitsplat.frames.frame import Frame as Frame
+    from mitsplat.frames.frame import Renderer as Renderer
+    from mitsplat.frames.frame import render_frame as render_frame
+    from mitsplat.labels.labels import Labels as Labels
+    from mitsplat.physics.settle import settle_layout as settle_layout
     from mitsplat.quality import Quality as Quality
-    from mitsplat.render import Layers as Layers
-    from mitsplat.render import render_splats as render_splats
-    from mitsplat.scene import Scene as Scene
-    from mitsplat.scene import SceneSpec as SceneSpec
-    from mitsplat.scene import load_scene as load_scene
-    from mitsplat.settle import Layout as Layout
-    from mitsplat.settle import settle_layout as settle_layout
+    from mitsplat.render.layers import Layers as Layers
+    from mitsplat.render.layers import render_splats as render_splats
+    from mitsplat.scene.layout import Layout as Layout
+    from mitsplat.scene.scene import Scene as Scene
+    from mitsplat.scene.scene import SceneSpec as SceneSpec
+    from mitsplat.scene.scene import load_scene as load_scene
     from mitsplat.splats import Splats as Splats
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-FloatArray = npt.NDArray[np.float64]
+from mitsplat.arrays import Float64Array
 
 Lens = Literal["opencv", "fisheye"]
 """OpenCV's camera models: rational with tangential distortion, or fisheye."""
@@ -51,7 +51,7 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    world_from_camera: FloatArray
+    world_from_camera: Float64Array
     distortion: tuple[float, ...] = ()
     near: float = 0.01
     lens: Lens = "opencv"
@@ -129,12 +129,12 @@ class Camera:
         )
 
     @property
-    def intrinsics(self) -> FloatArray:
+    def intrinsics(self) -> Float64Array:
         """Intrinsic matrix K for pixel centres at +0.5, shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
-    def camera_from_world(self) -> FloatArray:
+    def camera_from_world(self) -> Float64Array:
         """Extrinsics: rigid inverse of ``world_from_camera``, shape (4, 4)."""
         rotation, centre = self.world_from_camera[:3, :3], self.world_from_camera[:3, 3]
         inverse = np.eye(4)
@@ -143,7 +143,7 @@ class Camera:
         return inverse
 
     @property
-    def centre(self) -> FloatArray:
+    def centre(self) -> Float64Array:
         """Centre of projection in the world [m], shape (3,)."""
         return self.world_from_camera[:3, 3]
 
@@ -160,7 +160,7 @@ class Camera:
             cy=self.cy * sy,
         )
 
-    def project(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def project(self, points: npt.ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Pixel positions (N, 2), lens distortion included, and depths along z [m] (N,) of world points (N, 3).
 
         A point at or behind the camera plane has pixel position NaN.
@@ -186,7 +186,7 @@ class Camera:
             pixels[front] = projected.reshape(-1, 2)
         return pixels, depth
 
-    def ray_slopes(self, pixels: npt.ArrayLike) -> FloatArray:
+    def ray_slopes(self, pixels: npt.ArrayLike) -> Float64Array:
         """Undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
@@ -219,7 +219,7 @@ def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
     return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
 
 
-def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Float64Array:
     """``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that looks at ``target`` [m].
 
     When the view is along ``up`` the image's upper edge points along +y of the world.
@@ -240,7 +240,7 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     return pose
 
 
-def interpolate_poses(key_poses: Sequence[npt.ArrayLike], times: npt.ArrayLike) -> FloatArray:
+def interpolate_poses(key_poses: Sequence[npt.ArrayLike], times: npt.ArrayLike) -> Float64Array:
     """Poses (M, 4, 4) along a smooth path through ``key_poses`` (K, 4, 4) at ``times`` (M,) in [0, 1].
 
     Positions follow a natural cubic spline and orientations a rotation spline (SciPy), keys evenly spaced in time.

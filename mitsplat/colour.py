@@ -1,20 +1,45 @@
-"""The transfer function between linear light and display-encoded colours."""
+"""Colours: the transfer function between linear light and display-encoded values, luminance, and black bodies."""
 
 from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from mitsplat.arrays import Float64Array
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Rec. 709 luminance of linear sRGB."""
 
 
-def encode_srgb(linear: npt.ArrayLike) -> FloatArray:
+def encode_srgb(linear: npt.ArrayLike) -> Float64Array:
     """Display-encoded values of linear ones (IEC 61966-2-1), continued above 1 and clipped below 0."""
     linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def decode_srgb(encoded: npt.ArrayLike) -> FloatArray:
+def decode_srgb(encoded: npt.ArrayLike) -> Float64Array:
     """Linear values of display-encoded ones (IEC 61966-2-1)."""
     encoded = np.asarray(encoded, dtype=np.float64)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+@lru_cache(maxsize=256)
+def black_body_colour(kelvin: float) -> tuple[float, float, float]:
+    """Linear sRGB of a black body (Kang et al. 2002), of luminance 1; a negative component counts as 0."""
+    colour = colour_science()
+    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="Kang 2002"))
+    rgb = np.maximum(np.linalg.inv(colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ) @ white, 0.0)
+    red, green, blue = (rgb / (LUMINANCE @ rgb)).tolist()
+    return red, green, blue
+
+
+def colour_science() -> Any:
+    """colour-science, without its warning that plots need matplotlib."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    return colour

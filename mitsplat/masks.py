@@ -7,10 +7,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from pycocotools import mask as coco_mask
 
-BoolArray = npt.NDArray[np.bool_]
+from mitsplat.arrays import BoolArray
+
 Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
 

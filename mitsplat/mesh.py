@@ -16,8 +16,8 @@ import coacd
 import manifold3d
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from mitsplat.arrays import Float64Array
 from mitsplat.cache import cache_folder, keep_file
 from mitsplat.errors import InputError
 
@@ -51,8 +51,8 @@ class MassProperties:
     """
 
     mass: float
-    centre: NDArray[np.float64]
-    inertia: NDArray[np.float64]
+    centre: Float64Array
+    inertia: Float64Array
 
 
 def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> trimesh.Trimesh:
@@ -127,7 +127,7 @@ def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     return cast(trimesh.Trimesh, trimesh.util.concatenate(list(meshes)))
 
 
-def contact_points(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+def contact_points(mesh: trimesh.Trimesh) -> Float64Array:
     """Points that touch first when two solids meet: vertices, and points along sharp edges; shape (N, 3) [m].
 
     Where two polyhedra overlap, a vertex of one is inside the other or two edges cross; edges are sampled every 0.5 mm,

@@ -23,23 +23,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
-
-FloatArray = npt.NDArray[np.float32]
-
-SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
-_SH_C1 = 0.4886025119029199
-_SH_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-_SH_C3 = (
-    -0.5900435899266435,
-    2.890611442640554,
-    -0.4570457994644658,
-    0.3731763325901154,
-    -0.4570457994644658,
-    1.445305721320277,
-    -0.5900435899266435,
-)
+from mitsplat.spherical_harmonics import sh_rotation
+from mitsplat.splat_files import SplatArrays, read_splats, write_splats
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +47,11 @@ class Splats:
         ValueError: If a shape is wrong or a value breaks its rule; the sentence names field, rule, value and row.
     """
 
-    means: FloatArray
-    quats: FloatArray
-    scales: FloatArray
-    opacities: FloatArray
-    sh: FloatArray
+    means: Float32Array
+    quats: Float32Array
+    scales: Float32Array
+    opacities: Float32Array
+    sh: Float32Array
 
     def __post_init__(self) -> None:
         with np.errstate(over="ignore"):  # beyond float32 becomes inf, which the rules below refuse
@@ -98,7 +85,7 @@ class Splats:
         return int(np.sqrt(self.sh.shape[1])) - 1
 
     @property
-    def bounds(self) -> FloatArray:
+    def bounds(self) -> Float32Array:
         """Lowest and highest coordinates of the centres [m], shape (2, 3).
 
         Raises:
@@ -110,7 +97,7 @@ class Splats:
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, units: float = 1.0) -> Splats:
-        """Read a file; :mod:`mitsplat.formats` says which formats there are and what each one keeps.
+        """Read a file; :mod:`mitsplat.splat_files` says which formats there are and what each one keeps.
 
         Args:
             path: A ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or ``.sog`` file.
@@ -119,9 +106,11 @@ class Splats:
         Raises:
             InputError: If the file is missing, of another kind, damaged, or holds a value that breaks a rule.
         """
-        from mitsplat import formats  # it builds Splats, so it cannot be imported above
-
-        splats = formats.read_splats(Path(path))
+        arrays = read_splats(Path(path))
+        try:
+            splats = cls(**arrays._asdict())
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
         return splats if units == 1.0 else splats.transformed(np.diag([units, units, units, 1.0]))
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -131,9 +120,7 @@ class Splats:
             InputError: If the suffix is another one, the format cannot hold these splats, or the file cannot be
                 written; no partial file is left.
         """
-        from mitsplat import formats
-
-        formats.write_splats(self, Path(path))
+        write_splats(SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh), Path(path))
 
     def select(self, index: Any) -> Splats:
         """The Gaussians that a Boolean mask (N,), an integer array or a slice picks, in its order."""
@@ -176,87 +163,7 @@ class Splats:
         return Splats(**joined, sh=np.concatenate(padded))
 
 
-def sh_basis(directions: npt.ArrayLike, degree: int) -> npt.NDArray[np.float64]:
-    """Real spherical harmonics in the order and with the signs of 3DGS.
-
-    Constants and polynomials are those of 3DGS's ``eval_sh`` (Kerbl et al. 2023; after Sloan 2008, "Stupid Spherical
-    Harmonics Tricks", appendix A2).
-
-    Args:
-        directions: Unit vectors, shape (..., 3).
-        degree: Highest band, 0 to 3.
-
-    Returns:
-        ``Y_k(direction)``, shape (..., K) with K = (degree + 1)^2.
-
-    Raises:
-        ValueError: If the degree is not 0, 1, 2 or 3.
-    """
-    if degree not in (0, 1, 2, 3):
-        raise ValueError(f"degree must be 0, 1, 2 or 3 (got {degree})")
-    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
-    xx, yy, zz = x * x, y * y, z * z
-    bands = [
-        np.full_like(x, SH_C0),
-        -_SH_C1 * y,
-        _SH_C1 * z,
-        -_SH_C1 * x,
-        _SH_C2[0] * x * y,
-        _SH_C2[1] * y * z,
-        _SH_C2[2] * (2 * zz - xx - yy),
-        _SH_C2[3] * x * z,
-        _SH_C2[4] * (xx - yy),
-        _SH_C3[0] * y * (3 * xx - yy),
-        _SH_C3[1] * x * y * z,
-        _SH_C3[2] * y * (4 * zz - xx - yy),
-        _SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-        _SH_C3[4] * x * (4 * zz - xx - yy),
-        _SH_C3[5] * z * (xx - yy),
-        _SH_C3[6] * x * (xx - 3 * yy),
-    ]
-    return np.stack(bands[: (degree + 1) ** 2], axis=-1)
-
-
-def evaluate_sh(sh: npt.ArrayLike, directions: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Display-encoded colours ``max(0, 0.5 + sum_k sh[k] Y_k(direction))``.
-
-    Args:
-        sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.
-        directions: Unit vectors from the camera to the Gaussian, shape (..., 3); both broadcast.
-
-    Returns:
-        Colours, shape (..., 3).
-    """
-    coefficients = np.asarray(sh, dtype=np.float64)
-    basis = sh_basis(directions, int(np.sqrt(coefficients.shape[-2])) - 1)
-    colours: npt.NDArray[np.float64] = np.maximum(0.0, 0.5 + np.einsum("...k,...kc->...c", basis, coefficients))
-    return colours
-
-
-def sh_rotation(rotation: npt.ArrayLike, degree: int) -> npt.NDArray[np.float64]:
-    """Matrix that turns SH coefficients with an object: ``sum_k (D sh)_k Y_k(R d) = sum_k sh_k Y_k(d)`` for every d.
-
-    A rotation maps each band onto itself (Sloan 2008), so ``Y(R^T d)`` is an exact linear function of ``Y(d)``, and
-    the least-squares fit over well-spread directions finds it to rounding; the result is block diagonal.
-
-    Args:
-        rotation: Rotation matrix ``new_from_old``, shape (3, 3).
-        degree: Highest band, 0 to 3.
-
-    Returns:
-        Matrix of shape (K, K), K = (degree + 1)^2; the new coefficients are ``D @ sh``.
-    """
-    # Fibonacci sphere: 64 directions determine 16 functions with a condition number near 1.
-    index = np.arange(64) + 0.5
-    azimuth, z = index * np.pi * (1.0 + np.sqrt(5.0)), 1.0 - index / 32.0
-    radius = np.sqrt(1.0 - z * z)
-    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
-    turned = sh_basis(directions @ np.asarray(rotation, dtype=np.float64), degree)
-    solution = np.linalg.pinv(sh_basis(directions, degree)) @ turned
-    return np.asarray(solution, dtype=np.float64)
-
-
-def split_similarity(matrix: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], float, npt.NDArray[np.float64]]:
+def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float64Array]:
     """Rotation (3, 3), uniform scale and translation (3,) of a similarity transform (4, 4).
 
     Raises:
@@ -278,7 +185,7 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], fl
     return u @ vt, scale, matrix[:3, 3]
 
 
-def _require(valid: npt.NDArray[np.bool_], name: str, rule: str, values: npt.NDArray[Any]) -> None:
+def _require(valid: BoolArray, name: str, rule: str, values: npt.NDArray[Any]) -> None:
     """Raise InputError that names the first row of ``values`` (N, ...) where ``valid`` (N, ...) does not hold."""
     if not valid.all():
         place = np.unravel_index(int(np.argmin(valid)), valid.shape)

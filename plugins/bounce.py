@@ -16,7 +16,8 @@ from scipy.ndimage import distance_transform_edt
 
 from mitsplat.colour import decode_srgb
 from mitsplat.plugins.device import wrapped
-from mitsplat.splats import SH_C0, Splats
+from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.splats import Splats
 
 CELLS = 80
 """Cells of the grid along its longest side."""

@@ -24,7 +24,7 @@ SMALL = 64 / 9
 
 GAIN = 5.0
 """By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3
-pixels. With this, ``python -m benchmarks.light`` finds the wanted error over all shadows, and a third more in
+pixels. With this, ``python -m benchmarks.light.traced`` finds the wanted error over all shadows, and a third more in
 penumbrae."""
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from mitsplat.arrays import Float64Array
 from mitsplat.plugins.device import ray_scene, wrapped
 from mitsplat.splats import Splats
 
@@ -61,7 +62,7 @@ class Caster:
 
     splats: Splats
     instance: int
-    world_from_splats: npt.NDArray[np.float64]
+    world_from_splats: Float64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Solids:
     radius: Any
     sets: int
     owners: npt.NDArray[np.uint32]
-    footprints: npt.NDArray[np.float64]
+    footprints: Float64Array
 
     @classmethod
     def build(cls, casters: Sequence[Caster], sets: int = SETS) -> Solids | None:
@@ -178,9 +179,7 @@ class SplatOccluders:
         return active & met & self.solids.scene.ray_test(inside, active=active & met)
 
 
-def _ellipsoids(
-    splats: Splats, world_from_splats: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _ellipsoids(splats: Splats, world_from_splats: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Axes (N, 3, 3), the columns as long as the standard deviations and the shortest last, and centres (N, 3)."""
     turn, shift = world_from_splats[:3, :3], world_from_splats[:3, 3]
     axes = Rotation.from_quat(splats.quats).as_matrix() * splats.scales[:, None].astype(np.float64)
@@ -188,7 +187,7 @@ def _ellipsoids(
     return turn @ np.take_along_axis(axes, order[:, None], axis=2), splats.means @ turn.T + shift
 
 
-def _radii(opacities: npt.NDArray[np.float64], sets: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _radii(opacities: Float64Array, sets: int, rng: np.random.Generator) -> Float64Array:
     """Standard deviations (sets, N) of every Gaussian's solid in each set, 0 where it is not in it.
 
     The u_i of a Gaussian are stratified over the sets, in an order of its own.
@@ -198,7 +197,7 @@ def _radii(opacities: npt.NDArray[np.float64], sets: int, rng: np.random.Generat
     return np.sqrt(2 * np.log(np.maximum(opacities / u, 1)))
 
 
-def _turned(points: npt.NDArray[np.float64], count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _turned(points: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
     """``count`` copies of a shape, each turned at random: in its plane if it is flat, so that none has corners."""
     flat = not points[:, 2].any()
     turns = (

@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.plugins.device import ray_scene, wrapped
 from mitsplat.plugins.occlusion import Caster, SplatOccluders
-from mitsplat.surfels import CREASE_ANGLE, corner_normals
 
 NOISE_CREASE = 10.0
 """Dihedral angle of a crease over the lower quartile of a mesh, which is zero where it was drawn: flat faces have edges

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.assets import ASSET_FILE, Asset, read_mesh, read_spec
+from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.splats import Splats
 

@@ -15,22 +15,22 @@ import pytest
 import trimesh
 from ruamel.yaml import YAML
 
-from mitsplat.assets import Asset
+from mitsplat.asset import Asset
 from mitsplat.cache import cache_folder
 from mitsplat.camera import Camera
-from mitsplat.capture import Capture, Photo
-from mitsplat.dataset import write_dataset
-from mitsplat.scene import Scene, load_scene
-from mitsplat.settle import warp_settings
-from mitsplat.spec import FORMATS
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.dataset.write import write_dataset
+from mitsplat.physics.settle import warp_settings
+from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.scene.spec import FORMATS
 from mitsplat.splats import Splats
 
 if TYPE_CHECKING:
-    from mitsplat.take import CaptureResult
+    from mitsplat.capture.pipeline import CaptureResult
 
 WriteScene = Callable[..., Path]
 
-# The same examples in every run, however slow: new ones are for benchmarks/fuzz.py.
+# The same examples in every run, however slow: new ones are for benchmarks/scale/fuzz.py.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("suite")
 
@@ -123,7 +123,7 @@ BOTH = [{"asset": "assets/nut"}, {"asset": "assets/bolt"}]
 @pytest.fixture(scope="session")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small dataset of drawn frames in every format but COLMAP's, which takes a process to read; left as it is."""
-    from drawn import large_boxes, render_boxes, scatter_boxes
+    from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
     folder = tmp_path_factory.mktemp("clean")
     scene = small_scene(
@@ -141,7 +141,7 @@ def dataset(clean: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
     """Rendered photos, and their true cameras."""
-    import rendered
+    from tests import rendered
 
     folder = tmp_path_factory.mktemp("rendered")
     return folder, rendered.render_capture(folder)
@@ -152,9 +152,8 @@ def captured(
     photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, CaptureResult]:
     """Their capture, with one torn photo among them: photos, folder, result."""
-    import rendered
-
-    from mitsplat.take import CaptureSettings, capture_photos
+    from mitsplat.capture.pipeline import CaptureSettings, capture_photos
+    from tests import rendered
 
     given, out = tmp_path_factory.mktemp("given"), tmp_path_factory.mktemp("capture")
     shutil.copytree(photos[0], given, dirs_exist_ok=True)
@@ -186,9 +185,9 @@ def known_object(tmp_path_factory: pytest.TempPathFactory) -> KnownObject:
     import mitsuba as mi
     from PIL import Image
 
+    from mitsplat.bake.surfels import place_surfels
     from mitsplat.colour import encode_srgb
-    from mitsplat.render import make_integrator, make_splats_shape, render_layers
-    from mitsplat.surfels import place_surfels
+    from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
 
     ball = trimesh.creation.icosphere(3, 0.05)
     box = trimesh.creation.box((0.06, 0.04, 0.05))

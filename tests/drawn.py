@@ -8,15 +8,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from conftest import box_asset
 from scipy.spatial.transform import Rotation
-from test_dataset import CERTIFICATE
 
-from mitsplat.assets import Asset
-from mitsplat.label import LabelRules, Truth, label_instances
+from mitsplat.asset import Asset
+from mitsplat.labels.labels import LabelRules, Truth, label_instances
 from mitsplat.masks import Silhouette
-from mitsplat.scene import plan_frame, random_stream
-from mitsplat.settle import Instance, Layout
+from mitsplat.scene.layout import Instance, Layout
+from mitsplat.scene.scene import plan_frame, random_stream
+from tests.conftest import box_asset
+from tests.dataset.test_write import CERTIFICATE
 
 MARGIN = 80
 """Pixels that silhouettes are drawn beyond the image."""

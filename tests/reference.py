@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
 from mitsplat.quality import KERNELS, PRESETS, Quality
-from mitsplat.splats import Splats, evaluate_sh
+from mitsplat.spherical_harmonics import evaluate_sh
+from mitsplat.splats import Splats
 
 Array = npt.NDArray[np.float64]
 

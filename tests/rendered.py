@@ -8,9 +8,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.known import paint, photograph, speckle, table_scene
-from mitsplat.board import Board
+from benchmarks.assets.known import paint, photograph, speckle, table_scene
 from mitsplat.camera import Camera
+from mitsplat.capture.targets import Board
 
 BOARD = Board(7, 5, 0.035)
 BOX = np.array([0.07, 0.05, 0.07])

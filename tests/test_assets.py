@@ -9,7 +9,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mitsplat.assets import Asset, read_mesh
+from mitsplat.asset import Asset, read_mesh
 from mitsplat.errors import InputError
 from mitsplat.splats import Splats
 

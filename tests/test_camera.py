@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mitsplat.camera import Camera
-from mitsplat.colmap import camera_model
 from mitsplat.errors import InputError
-from mitsplat.render import describe_sensor, ensure_variant
+from mitsplat.formats.colmap import camera_model
+from mitsplat.render.layers import describe_sensor, ensure_variant
 
 PINHOLE = Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), width=640, height=480, fov_x=60)
 BENT = (0.02, -0.01, 0.004, -0.001)

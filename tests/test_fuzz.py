@@ -1,6 +1,7 @@
 """Damaged files are read, or refused in one sentence that names them; nothing else may come of them.
 
-A few inputs of each reader; ``python -m benchmarks.fuzz`` tries as many as time allows, each in a process of its own.
+A few inputs of each reader; ``python -m benchmarks.scale.fuzz`` tries as many as time allows, each in a process of its
+own.
 """
 
 import random
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.fuzz import READERS, attempt, make_samples, mutate
+from benchmarks.scale.fuzz import READERS, attempt, make_samples, mutate
 
 SETTINGS = {
     "deadline": None,

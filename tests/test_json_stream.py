@@ -12,11 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mitsplat import bop, json_stream
+from mitsplat import json_stream
+from mitsplat.dataset.manifest import Manifest, encode_line
 from mitsplat.files import GrowingFile
+from mitsplat.formats import bop
+from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.json_stream import EntriesFile, ListsFile, read_entries, read_lists
-from mitsplat.manifest import Manifest, encode_line
-from mitsplat.writers import Catalogue, CollectionWriter
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),

@@ -5,9 +5,9 @@ import pytest
 import shapely
 import trimesh
 
-from mitsplat.clearance import Surface, standoff
 from mitsplat.errors import InputError
 from mitsplat.mesh import contact_points, convex_pieces, mass_properties, prepare_mesh, simplify_solid
+from mitsplat.mesh_distance import Surface, standoff
 
 
 @pytest.fixture(autouse=True)

@@ -8,15 +8,15 @@ import time
 import zipfile
 
 import pytest
-from conftest import box_asset
-from test_cli import run
 
-from mitsplat import xml_scene
-from mitsplat.assets import Asset
+from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.scene import load_scene
+from mitsplat.frames import mitsuba_xml as xml_scene
+from mitsplat.scene.scene import load_scene
+from mitsplat.scene.untrusted_xml import check_xml
 from mitsplat.splats import Splats
-from mitsplat.xml_check import check_xml
+from tests.cli.test_cli import run
+from tests.conftest import box_asset
 
 
 class TestScenes:

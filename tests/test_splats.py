@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from mitsplat.errors import InputError
-from mitsplat.splats import SH_C0, Splats, evaluate_sh, sh_basis, sh_rotation
+from mitsplat.spherical_harmonics import SH_C0, evaluate_sh, sh_basis, sh_rotation
+from mitsplat.splats import Splats
 
 DATA = Path(__file__).parents[2] / "shared/data/splats"
 TURN = Rotation.from_rotvec([0.3, -1.1, 0.7])

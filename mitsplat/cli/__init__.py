@@ -12,9 +12,9 @@ from typing import Annotated
 
 import typer
 
-from mitsplat import __version__
 from mitsplat.cli import assets, datasets, fault
 from mitsplat.errors import exit_status, sentence_of
+from mitsplat.version import __version__
 
 app = typer.Typer(
     help="Labelled training images of settled objects, from Gaussian splats, physics and traced light.",

@@ -13,8 +13,8 @@ from mitsplat.cli.options import Seed, progress_bar, stage_bar
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
-    from mitsplat.board import Board
-    from mitsplat.pipeline import Finished
+    from mitsplat.capture.targets import Board
+    from mitsplat.reconstruct.pipeline import Finished
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -81,9 +81,9 @@ def bake(
 
     It has Gaussians with baked radiance, a proxy mesh and convex pieces; report.html shows the mesh beside the splats.
     """
-    from mitsplat.bake import BakeSettings, bake_asset
-    from mitsplat.bake_report import write_bake_report
-    from mitsplat.materials import Finish
+    from mitsplat.bake.bake import BakeSettings, bake_asset
+    from mitsplat.bake.materials import Finish
+    from mitsplat.bake.report import write_bake_report
 
     if out.exists() and not out.is_dir():
         raise InputError(f"--out must be a folder (got the file {out})")
@@ -162,10 +162,10 @@ def fit(
 
     Every eighth photo is held out to check the result. Runs again where it stopped.
     """
-    from mitsplat.capture import Capture
-    from mitsplat.depth_maps import find_maps
-    from mitsplat.depth_model import model_maps
-    from mitsplat.fit import FitProgress, FitSettings, fit_capture
+    from mitsplat.capture.capture import Capture
+    from mitsplat.fit.depth_network import model_maps
+    from mitsplat.fit.depth_priors import find_maps
+    from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 
     if depths is not None and depth_model is not None:
         raise InputError("depth maps come from a folder or from a network: give --depths or --depth-model")
@@ -239,7 +239,7 @@ def capture(
 
     Runs again where it stopped. If too many photos are of no use, the exit status is 4.
     """
-    from mitsplat.take import CaptureSettings, capture_photos
+    from mitsplat.capture.pipeline import CaptureSettings, capture_photos
 
     settings = CaptureSettings(
         kind=kind,
@@ -314,12 +314,12 @@ def mesh(
     The object is isolated by its masks, its surface found, and both are judged by held-out photos in report.html. If a
     threshold is missed, the exit status is 4.
     """
-    from mitsplat.align import invert_transform
-    from mitsplat.assets import read_mesh
-    from mitsplat.pipeline import AssetJob, make_asset
-    from mitsplat.reconstruct import ImportedMesh, ReconstructSettings
-    from mitsplat.refine_mesh import MeshRefineSettings
-    from mitsplat.surface import SurfaceSettings
+    from mitsplat.asset import read_mesh
+    from mitsplat.reconstruct.pipeline import AssetJob, make_asset
+    from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings
+    from mitsplat.reconstruct.registration import invert_transform
+    from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
+    from mitsplat.reconstruct.surface import SurfaceSettings
 
     if take is None and (normalisation is not None or units is not None):
         raise InputError("--normalisation and --units say where an imported mesh belongs: give --import as well")
@@ -364,12 +364,12 @@ def asset(
     Cameras, splats, isolation, mesh and verdict: `capture`, `fit` and `mesh` in one. Runs again where it stopped;
     report.html shows what came of it. If a threshold is missed, the exit status is 4.
     """
-    from mitsplat.fit import FitSettings
-    from mitsplat.pipeline import AssetJob, make_photo_asset
-    from mitsplat.reconstruct import ReconstructSettings
-    from mitsplat.refine_mesh import MeshRefineSettings
-    from mitsplat.surface import SurfaceSettings
-    from mitsplat.take import CaptureSettings
+    from mitsplat.capture.pipeline import CaptureSettings
+    from mitsplat.fit.trainer import FitSettings
+    from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
+    from mitsplat.reconstruct.reconstruct import ReconstructSettings
+    from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
+    from mitsplat.reconstruct.surface import SurfaceSettings
 
     job = AssetJob(
         name=name or out.resolve().name,
@@ -398,7 +398,7 @@ def asset(
 
 
 def _board(squares: str, square: float) -> Board:
-    from mitsplat.board import Board
+    from mitsplat.capture.targets import Board
 
     columns, _, rows = squares.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal()):

@@ -14,7 +14,7 @@ from mitsplat.errors import InputError, PartialResultError
 from mitsplat.quality import PresetName
 
 if TYPE_CHECKING:
-    from mitsplat.dataset import DatasetSummary
+    from mitsplat.dataset.write import DatasetSummary
     from mitsplat.findings import Finding
 
 # Commands import what they need themselves, so that help appears at once.
@@ -82,14 +82,14 @@ def render(
         if scene.suffix == ".xml":
             if overrides or frames is not None or tolerance is not None or shard is not None:
                 raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
-            from mitsplat.xml_scene import render_apart
+            from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside)}")
             return
-        from mitsplat.cluster import Cluster
-        from mitsplat.dataset import write_dataset
-        from mitsplat.folder import Shard
-        from mitsplat.scene import load_scene
+        from mitsplat.dataset.folder import Shard
+        from mitsplat.dataset.write import write_dataset
+        from mitsplat.engine.ray import Cluster
+        from mitsplat.scene.scene import load_scene
 
         part = None if shard is None else Shard.parse(shard)
         if engine != "ray" and (address is not None or resources is not None):
@@ -99,8 +99,8 @@ def render(
         if tolerance is not None:
             if quality is not None:
                 raise InputError("--quality and --tolerance both choose the preset: give one of them")
-            from mitsplat.chart import choose_preset
-            from mitsplat.prospects import refuse, run_faults
+            from mitsplat.dataset.prospects import refuse, run_faults
+            from mitsplat.frames.speed_accuracy import choose_preset
 
             refuse(loaded, run_faults(loaded))
             with progress_bars() as progress:
@@ -134,7 +134,7 @@ def merge(
 
     Every file is checked against its hash, and no frame may be missing. The result is that of a single run.
     """
-    from mitsplat.merge import merge_shards
+    from mitsplat.dataset.shards import merge_shards
 
     with command_log(json_log, "merge") as progress_bars, progress_bars() as progress:
         summary = merge_shards(shards, out, overwrite=overwrite, progress=progress)
@@ -173,7 +173,7 @@ def chart(
     from rich.console import Console
     from rich.table import Table
 
-    from mitsplat.chart import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
+    from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
@@ -200,7 +200,7 @@ def audit(dataset: DatasetFolder) -> None:
 
     Every violation is one line; with any, the exit status is 1.
     """
-    from mitsplat.audit import POLYGON_AREA, POLYGON_IOU, audit_dataset
+    from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, audit_dataset
 
     found = audit_dataset(dataset)
     for file, text in found.violations:
@@ -222,7 +222,7 @@ def report(
 
     It is one HTML file that needs no network: samples with their labels, statistics, audit, origin.
     """
-    from mitsplat.report import write_report
+    from mitsplat.audit.report import write_report
 
     page, found = write_report(dataset, out)
     typer.echo(f"report: {page} ({len(found.violations)} violations)")
@@ -247,10 +247,10 @@ def preview(
         raise InputError(f"--out must be in a folder that exists (got {out})")
     from PIL import Image
 
-    from mitsplat.frame import render_frame
-    from mitsplat.prospects import count_faults, image_faults, layout_faults, refuse
-    from mitsplat.scene import load_scene
-    from mitsplat.sheet import layer_sheet
+    from mitsplat.dataset.prospects import count_faults, image_faults, layout_faults, refuse
+    from mitsplat.frames.frame import render_frame
+    from mitsplat.frames.layer_sheet import layer_sheet
+    from mitsplat.scene.scene import load_scene
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
     refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
@@ -279,10 +279,10 @@ def settle(
         raise InputError(f"--out must be in a folder that exists (got {out})")
     from rich.console import Console
 
-    from mitsplat.prospects import count_faults, layout_faults, refuse
-    from mitsplat.rest import certificate_table, write_preview
-    from mitsplat.scene import load_scene
-    from mitsplat.settle import settle_layouts
+    from mitsplat.dataset.prospects import count_faults, layout_faults, refuse
+    from mitsplat.frames.settle_preview import certificate_table, write_preview
+    from mitsplat.physics.settle import settle_layouts
+    from mitsplat.scene.scene import load_scene
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed), allow_outside=allow_outside)
     wanted = loaded.spec.output.layouts if layouts is None else layouts
@@ -310,8 +310,8 @@ def export(
 
     It can be edited, and rendered by `mitsplat render`.
     """
-    from mitsplat.scene import load_scene
-    from mitsplat.xml_scene import export_xml
+    from mitsplat.frames.mitsuba_xml import export_xml
+    from mitsplat.scene.scene import load_scene
 
     export_xml(load_scene(scene, allow_outside=allow_outside), frame, out)
     typer.echo(f"scene: {out}")
@@ -321,7 +321,7 @@ def schema() -> None:
     """Print the JSON Schema of scene files, for editors."""
     import json
 
-    from mitsplat.scene import scene_json_schema
+    from mitsplat.scene.scene import scene_json_schema
 
     typer.echo(json.dumps(scene_json_schema(), indent=2))
 
@@ -331,7 +331,7 @@ def doctor() -> None:
 
     Python, Mitsuba, processor, LLVM, GPU, Warp, memory, disk and cache, and what to do about what is missing.
     """
-    from mitsplat.doctor import examine
+    from mitsplat.checks.doctor import examine
 
     _tell_findings(examine(), "FAIL")
 
@@ -345,7 +345,7 @@ def check(
     Units, up axis, needles, floaters, mesh against splats, mass, colliders, room, sight and light, and what to do about
     each. If there is anything, the exit status is 1.
     """
-    from mitsplat.preflight import check_path
+    from mitsplat.checks.preflight import check_path
 
     _tell_findings(check_path(path, allow_outside=allow_outside), "look")
 
@@ -369,7 +369,7 @@ def _overrides(
     *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
 ) -> dict[str, Any]:
     """The options that were given, by the scene file's keys."""
-    from mitsplat.spec import FORMATS
+    from mitsplat.scene.spec import FORMATS
 
     if seed is not None and seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from mitsplat import __version__
 from mitsplat.cache import cache_folder
+from mitsplat.version import __version__
 
 STATUS = 70
 """EX_SOFTWARE of sysexits.h: a fault of mitsplat, not of its input."""

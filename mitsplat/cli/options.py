@@ -13,8 +13,7 @@ import typer
 
 from mitsplat.cli import fault
 from mitsplat.errors import exit_status, sentence_of
-
-Progress = Callable[[int, int, str], None]
+from mitsplat.progress import Progress
 
 Seed = Annotated[int, typer.Option(help="Decides everything that is random.")]
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from mitsplat.assets import Asset
+from mitsplat.asset import Asset
 from mitsplat.mesh import convex_pieces
 from mitsplat.splats import Splats
 

@@ -1,0 +1,37 @@
+"""Compare a capture's cameras with published ones: ``python -m benchmarks.assets.cameras CAPTURE POSES``.
+
+POSES holds a 3x4 projection matrix per photo, ``<name of the photo>.txt``, in any frame and at any scale. These come
+from other people's reconstructions: agreement, not truth.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.metric_frame import fit_similarity
+
+
+def main(capture: Path, poses: Path) -> None:
+    found = Capture.load(capture)
+    published = {path.stem: np.loadtxt(path) for path in sorted(poses.glob("*.txt"))}
+    photos = [photo for photo in found.photos if Path(photo.name).stem in published]
+    matrices = np.array([published[Path(photo.name).stem] for photo in photos])
+    centres = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0]
+    _, residuals = fit_similarity(np.array([photo.camera.centre for photo in photos]), centres)
+    extent = np.ptp(centres, axis=0)
+    errors = 100 * np.linalg.norm(residuals, axis=1)
+    print(f"{len(photos)} of {len(published)} published photos registered, {len(found.rejected)} rejected")
+    for name, scale in (("longest edge", extent.max()), ("diagonal", np.linalg.norm(extent))):
+        values = errors / scale
+        print(
+            f"centres, % of the {name} of their box: rms {np.sqrt(np.mean(values**2)):.3f}, median "
+            f"{np.median(values):.3f}, largest {values.max():.3f} ({photos[int(values.argmax())].name})"
+        )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

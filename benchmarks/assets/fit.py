@@ -1,0 +1,165 @@
+"""Fit a capture here and with gsplat: held-out PSNR and SSIM, and time, in one table.
+
+    python -m benchmarks.assets.fit CAPTURE --variant cuda_ad_rgb --gsplat
+
+gsplat's side follows its ``examples/simple_trainer.py mcmc``: same photos, split, seeds, losses, rates and budget; its
+D-SSIM is computed by PyTorch's convolutions. gsplat takes pinhole cameras only: undistort a capture's photos first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.capture.capture import Capture
+from mitsplat.fit.initial_points import seed_points
+from mitsplat.fit.strategy_mcmc import seed_splats
+from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.fit.training_view import Sight
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--iterations", type=int, default=7000)
+    parser.add_argument("--gaussians", type=int, default=30_000)
+    parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--gsplat", action="store_true")
+    args = parser.parse_args()
+    mi.set_variant(args.variant)
+    capture = Capture.load(args.capture)
+    settings = FitSettings(
+        gaussians=args.gaussians,
+        iterations=args.iterations,
+        size=args.edge,
+        masks="off",
+        background="black",
+        coarse=0.0,
+        opacity_weight=0.01,
+        depth_weight=0.0,
+    )
+    print(f"{len(capture.photos)} photos, {args.gaussians} Gaussians, {args.iterations} iterations, {args.edge} px")
+    print("fit                  s      PSNR    SSIM   Gaussians")
+    with tempfile.TemporaryDirectory() as folder:
+        own = fit_capture(capture, folder, settings)
+    print(f"mitsplat {args.variant} {own.seconds:7.1f} {own.psnr:7.2f} {own.ssim:7.4f} {len(own.splats)}")
+    if args.gsplat:
+        seconds, psnr, ssim, count = fit_with_gsplat(capture, settings)
+        print(f"gsplat               {seconds:7.1f} {psnr:7.2f} {ssim:7.4f} {count}")
+
+
+def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, float, float, int]:
+    """Seconds, held-out PSNR [dB] and SSIM, and number of Gaussians."""
+    import torch
+    from gsplat import rasterization
+    from gsplat.strategy import MCMCStrategy
+
+    torch.manual_seed(settings.seed)
+    scale = min(1.0, settings.size / max(capture.photos[0].camera.width, capture.photos[0].camera.height))
+    sights = [Sight(photo, scale, masked=False) for photo in capture.training]
+    held_out = [Sight(photo, scale, masked=False) for photo in capture.held_out]
+    centres = np.array([sight.camera.centre for sight in sights])
+    extent = 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    rng = np.random.default_rng([settings.seed, 0])
+    cameras, seen = [sight.camera for sight in sights], [photo.seen for photo in capture.training]
+    points, colours = seed_points(capture.points, capture.colours, cameras, seen, None, rng, settings.gaussians)
+    start = seed_splats(points / extent, colours, settings.sh_degree)
+
+    def leaf(values: np.ndarray) -> torch.nn.Parameter:
+        return torch.nn.Parameter(torch.tensor(values, dtype=torch.float32, device="cuda"))
+
+    params = torch.nn.ParameterDict(
+        {
+            "means": leaf(start.means),
+            "scales": leaf(np.log(start.scales)),
+            "quats": leaf(start.quats[:, [3, 0, 1, 2]]),
+            "opacities": leaf(np.log(start.opacities / (1 - start.opacities))),
+            "sh0": leaf(start.sh[:, :1]),
+            "shN": leaf(start.sh[:, 1:]),
+        }
+    )
+    rates = {"means": settings.rate_means, "scales": settings.rate_scales, "quats": settings.rate_quats}
+    rates |= {"opacities": settings.rate_opacities, "sh0": settings.rate_sh, "shN": settings.rate_sh / 20}
+    optimisers = {k: torch.optim.Adam([{"params": params[k], "lr": r, "name": k}], eps=1e-15) for k, r in rates.items()}
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimisers["means"], 0.01 ** (1 / settings.iterations))
+    strategy = MCMCStrategy(
+        cap_max=settings.gaussians,
+        refine_start_iter=settings.iterations // 50,
+        refine_stop_iter=settings.iterations * 4 // 5,
+        refine_every=settings.refine_every,
+    )
+    strategy.check_sanity(params, optimisers)
+    state = strategy.initialize_state()
+
+    def tensors(sight: Sight) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        view = sight.camera.camera_from_world.copy()
+        view[:3, 3] /= extent
+        colour = sight.picture.astype(np.float32)
+        return tuple(
+            torch.tensor(v, dtype=torch.float32, device="cuda") for v in (view, sight.camera.intrinsics, colour)
+        )
+
+    def render(sight: Sight, degree: int) -> tuple[torch.Tensor, dict[str, object]]:
+        view, intrinsics, _ = data[id(sight)]
+        picture, _, info = rasterization(
+            params["means"],
+            params["quats"],
+            torch.exp(params["scales"]),
+            torch.sigmoid(params["opacities"]),
+            torch.cat([params["sh0"], params["shN"]], 1),
+            view[None],
+            intrinsics[None],
+            sight.camera.width,
+            sight.camera.height,
+            sh_degree=degree,
+            packed=False,
+        )
+        return picture[0], info
+
+    data = {id(sight): tensors(sight) for sight in (*sights, *held_out)}
+    taps = torch.exp(-0.5 * (torch.arange(-5, 6, device="cuda") / 1.5) ** 2)
+    window = torch.outer(taps / taps.sum(), taps / taps.sum()).expand(3, 1, 11, 11)
+
+    def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        a, b = a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None]
+        maps = torch.cat([a, b, a * a, b * b, a * b])
+        ma, mb, aa, bb, ab = torch.nn.functional.conv2d(maps, window, padding=5, groups=3)
+        top = (2 * ma * mb + 1e-4) * (2 * (ab - ma * mb) + 9e-4)
+        return (top / ((ma * ma + mb * mb + 1e-4) * (aa - ma * ma + bb - mb * mb + 9e-4))).mean()
+
+    torch.cuda.synchronize()
+    began = time.monotonic()
+    for step in range(settings.iterations):
+        epoch, turn = divmod(step, len(sights))
+        number = int(np.random.default_rng([settings.seed, 1, epoch]).permutation(len(sights))[turn])
+        sight = sights[number]
+        seen_now, info = render(sight, min(settings.sh_degree, 5 * step // settings.iterations))
+        truth = data[id(sight)][2]
+        loss = (1 - settings.ssim_share) * (seen_now - truth).abs().mean()
+        loss = loss + settings.ssim_share * (1 - ssim(seen_now, truth))
+        loss = loss + settings.opacity_weight * torch.sigmoid(params["opacities"]).mean()
+        loss = loss + settings.scale_weight * torch.exp(params["scales"]).mean()
+        loss.backward()
+        for optimiser in optimisers.values():
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        rate = schedule.get_last_lr()[0]
+        schedule.step()
+        strategy.step_post_backward(params, optimisers, state, step, info, lr=rate)
+    torch.cuda.synchronize()
+    seconds = time.monotonic() - began
+    with torch.no_grad():
+        pictures = [render(sight, settings.sh_degree)[0].cpu().numpy() for sight in held_out]
+    found = [sight.compare(picture, None) for sight, picture in zip(held_out, pictures, strict=True)]
+    mean = np.mean([[photo.psnr, photo.ssim] for photo in found], axis=0)
+    return seconds, float(mean[0]), float(mean[1]), len(params["means"])
+
+
+if __name__ == "__main__":
+    main()

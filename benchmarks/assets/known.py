@@ -1,0 +1,302 @@
+"""Photographs of a solid whose shape, colours, board and cameras are known, to an asset, against the truth.
+
+    python -m benchmarks.assets.known OUT [--views 60] [--width 1200] [--iterations 3000]
+
+The solid, a ball and a box with a pocket, stands on a ChArUco board and is path-traced with sensor noise; ``mitsplat
+asset`` makes an asset of the pictures, which is dropped into a scene and rendered. The exit status is 1 if a figure
+misses what is wanted. OUT keeps the stages of the asset for another run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.metric_frame import fit_similarity
+from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.capture.targets import Board
+from mitsplat.dataset.write import write_dataset
+from mitsplat.fit.trainer import FitSettings
+from mitsplat.mesh_distance import Surface
+from mitsplat.reconstruct.evaluation import iou
+from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
+from mitsplat.render.layers import ensure_variant
+from mitsplat.scene.scene import load_scene
+
+BOARD = Board(7, 5, 0.035)
+
+WANTED = {
+    "photos kept, %": 95.0,
+    "worst camera, % of its distance": 1.0,
+    "least IoU of a mask with the truth": 0.95,
+    "mean IoU of the masks with the truth": 0.97,
+    "scale error, %": 0.2,
+    "table normal, degrees": 0.1,
+    "Chamfer, % of the diagonal": 0.3,
+    "shift of mesh and splats, % of the diagonal": 0.2,
+    "held-out PSNR, dB": 32.0,
+    "instances in the rendered frame": 1,
+}
+LEAST = {
+    "photos kept, %",
+    "least IoU of a mask with the truth",
+    "mean IoU of the masks with the truth",
+    "held-out PSNR, dB",
+    "instances in the rendered frame",
+}
+"""Of these more is better."""
+
+
+def solid() -> trimesh.Trimesh:
+    """A ball and a box with a pocket in the ball, standing on z = 0 [m]."""
+    ball = trimesh.creation.icosphere(4, 0.045)
+    box = trimesh.creation.box((0.06, 0.04, 0.07), trimesh.transformations.translation_matrix((0.035, 0.0, 0.0)))
+    pocket = trimesh.creation.cylinder(
+        0.018, 0.04, transform=trimesh.transformations.translation_matrix((-0.01, 0, 0.045))
+    )
+    under = trimesh.creation.box((0.3, 0.3, 0.1), trimesh.transformations.translation_matrix((0, 0, -0.085)))
+    whole = trimesh.boolean.union([ball, box], engine="manifold")
+    mesh = trimesh.boolean.difference([whole, pocket, under], engine="manifold")
+    mesh.apply_translation((-0.01, 0.0, -mesh.bounds[0, 2]))
+    return mesh
+
+
+def cameras(count: int, width: int) -> list[Camera]:
+    """Three rings around the solid by turns, 4:3, with a field of view that holds it and most of the board."""
+    turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    heights, radii = np.resize([0.10, 0.20, 0.30], count), np.resize([0.34, 0.29, 0.20], count)
+    places = np.column_stack([radii * np.cos(turns), radii * np.sin(turns), heights])
+    return [Camera.look_at(place, (0, 0, 0.025), width=width, height=width * 3 // 4, fov_x=42) for place in places]
+
+
+def photograph(
+    scene: Mapping[str, Any], views: list[Camera], folder: Path, *, samples: int, noise: float = 0.01
+) -> dict[str, Camera]:
+    """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files."""
+    from mitsplat.plugins.device import ray_scene
+
+    ensure_variant()
+    folder.mkdir(parents=True, exist_ok=True)
+    loaded = ray_scene(scene)
+    rng = np.random.default_rng(0)
+    found = _named(views)
+    sensors = _Sensors()
+    for number, (name, camera) in enumerate(found.items()):
+        radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
+        # A path that grazes an edge may end in no number.
+        noisy = np.nan_to_num(np.clip(radiance, 0, 1)) ** (1 / 2.2) + rng.normal(0, noise, radiance.shape)
+        Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(folder / name)
+    return found
+
+
+def _named(views: list[Camera]) -> dict[str, Camera]:
+    """Cameras by the names of their photos."""
+    return {f"photo{number:02}.png": camera for number, camera in enumerate(views)}
+
+
+def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
+    """A board, z = 0 and its middle the origin, on a speckled table under a lamp and an even sky."""
+    ensure_variant()
+    drawn = board.draw(60).astype(np.float32) / 255
+    sheet = np.array([board.columns, board.rows]) * board.square / 2
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.8}},
+        "lamp": {
+            "type": "sphere",
+            "center": [0.4, -0.3, 0.9],
+            "radius": 0.15,
+            "light": {"type": "area", "radiance": {"type": "rgb", "value": 3.0}},
+        },
+        "board": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().scale([float(sheet[0]), float(sheet[1]), 1]),
+            "bsdf": paint(np.repeat(0.05 + 0.75 * drawn[..., None], 3, axis=2)),
+        },
+        "table": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -0.0005]).scale([0.5, 0.5, 1]),
+            "bsdf": paint(speckle(rng, 40, (0.5, 0.45, 0.4))),
+        },
+    }
+
+
+def speckle(rng: np.random.Generator, size: int, colour: tuple[float, float, float]) -> np.ndarray:
+    """A texture of random brightness, (size, size, 3)."""
+    return np.clip(np.array(colour) * rng.uniform(0.1, 1.3, (size, size, 1)), 0, 1).astype(np.float32)
+
+
+def paint(texture: np.ndarray) -> dict[str, Any]:
+    """A matt surface with this texture, its first row above."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
+    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
+
+
+class _Sensors:
+    """Mitsuba's own cameras: x left and y up, half a pixel as here. One that only moves needs no new kernels."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, int, float], Any] = {}
+
+    def like(self, camera: Camera) -> Any:
+        """The sensor of a camera, until the next call."""
+        key = camera.width, camera.height, camera.fx
+        if key not in self._made:
+            film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+            angle = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
+            self._made[key] = mi.load_dict({"type": "perspective", "fov": angle, "film": film})
+        parameters = mi.traverse(self._made[key])
+        parameters["to_world"] = mi.Transform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+        parameters.update()
+        return self._made[key]
+
+
+def _speckled(mesh: trimesh.Trimesh) -> Any:
+    """The solid with matt speckles of 3 and 10 mm on its vertices."""
+    from mitsplat.plugins.device import plain_mesh
+
+    fine = mesh.subdivide_to_size(0.0012)
+    fine.update_faces(fine.nondegenerate_faces())
+    rng = np.random.default_rng(3)
+    shade = np.zeros((len(fine.vertices), 3))
+    for size in (0.003, 0.01):
+        places = (fine.vertices - fine.bounds[0]) / size
+        grid = rng.random((*np.ceil(places.max(axis=0)).astype(int) + 2, 3))
+        shade += 0.5 * np.stack([map_coordinates(grid[..., c], places.T, order=1) for c in range(3)], axis=1)
+    properties = mi.Properties()
+    colour = {"type": "mesh_attribute", "name": "vertex_color"}
+    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": colour})
+    shape = plain_mesh(fine, properties)
+    shape.add_attribute("vertex_color", 3, np.ravel(np.clip(1.6 * shade - 0.3, 0.03, 0.9)).astype(np.float32))
+    return shape
+
+
+def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> dict[str, float]:
+    """What an asset and its capture are off."""
+    capture = Capture.load(asset / "capture")
+    found = np.array([photo.camera.centre for photo in capture.photos])
+    true = np.array([truth[photo.name].centre for photo in capture.photos])
+    matrix, residuals = fit_similarity(found, true)
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    pose = np.eye(4)
+    pose[:3, :3] = matrix[:3, :3] / scale
+    pose[:3, 3] = true.mean(axis=0) - pose[:3, :3] @ found.mean(axis=0)
+    made = trimesh.load_mesh(asset / "mesh.ply")
+    made.apply_transform(pose)
+    verdict = json.loads((asset / "verdict.json").read_text())
+    overlaps = mask_overlaps(capture, truth, mesh)
+    return {
+        "photos kept, %": 100 * len(capture.photos) / len(truth),
+        "worst camera, % of its distance": 100
+        * float((np.linalg.norm(residuals, axis=1) / np.linalg.norm(true, axis=1)).max()),
+        "least IoU of a mask with the truth": min(overlaps),
+        "mean IoU of the masks with the truth": float(np.mean(overlaps)),
+        "scale error, %": 100 * abs(scale - 1),
+        "table normal, degrees": float(np.degrees(np.arccos(np.clip(pose[2, 2], -1, 1)))),
+        "Chamfer, % of the diagonal": 100 * chamfer(made, mesh),
+        "shift of mesh and splats, % of the diagonal": 100 * float(verdict["offset"]),
+        "held-out PSNR, dB": float(verdict["psnr"]),
+    }
+
+
+def chamfer(one: trimesh.Trimesh, truth: trimesh.Trimesh, samples: int = 20_000) -> float:
+    """Mean distance between two surfaces, both ways, as a share of the diagonal of the true one."""
+    there = np.abs(Surface(truth).signed_distances(np.asarray(one.sample(samples, seed=1)))).mean()
+    back = np.abs(Surface(one).signed_distances(np.asarray(truth.sample(samples, seed=2)))).mean()
+    return float(there + back) / 2 / float(truth.scale)
+
+
+def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> list[float]:
+    """IoU of each photo's mask with the true silhouette."""
+    from mitsplat.plugins.device import plain_mesh, ray_scene
+
+    solid = ray_scene({"solid": plain_mesh(mesh, mi.Properties())})
+    depths = mi.load_dict({"type": "aov", "aovs": "depth:depth"})
+    overlaps, sensors = [], _Sensors()
+    for photo in capture.photos:
+        _, alpha = photo.picture()
+        true = np.array(mi.render(solid, integrator=depths, sensor=sensors.like(truth[photo.name]), spp=1))[..., -1] > 0
+        overlaps.append(0.0 if alpha is None else iou(alpha >= 0.5, true))
+    return overlaps
+
+
+def drop(asset: Path, out: Path) -> int:
+    """Instances in a frame of a scene that the asset was dropped into."""
+    scene = {
+        "name": "known",
+        "objects": [{"asset": str(asset.resolve())}],
+        "shapes": [{"name": "table", "box": {"size": [1, 1, 0.05], "position": [0, 0, -0.025]}}],
+        "region": {"min": [-0.12, -0.12, 0.05], "max": [0.12, 0.12, 0.25]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0.02], "radius": 0.4, "height": 0.3},
+        "output": {"width": 320, "height": 240, "layouts": 1, "views": 1, "formats": ["coco"]},
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "scene.yaml").write_text(json.dumps(scene))
+    path = write_dataset(load_scene(out / "scene.yaml", allow_outside=True), out / "frames", overwrite=True).path
+    record = json.loads((path / "manifest.jsonl").read_text().splitlines()[0])
+    return len(record["labels"]["instances"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--views", type=int, default=60)
+    parser.add_argument("--width", type=int, default=1200)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--gaussians", type=int, default=30_000)
+    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba's, such as cuda_ad_rgb")
+    args = parser.parse_args()
+    mi.set_variant(args.variant)
+    mesh, views, photos = solid(), cameras(args.views, args.width), args.out / "photos"
+    ensure_variant()
+    scene = table_scene(BOARD, np.random.default_rng(5)) | {"solid": _speckled(mesh)}
+    source = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    marker, made = args.out / "photos.json", json.dumps([args.views, args.width, args.samples, source])
+    if not (marker.exists() and marker.read_text() == made):
+        shutil.rmtree(photos, ignore_errors=True)
+        photograph(scene, views, photos, samples=args.samples)
+        marker.write_text(made)
+    truth = _named(views)
+    fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge)
+
+    def tell(done: int, total: int, text: str) -> None:
+        if done == total:
+            print(f"  {text}: {total}", file=sys.stderr)
+
+    asset = args.out / "asset"
+    job = AssetJob(name="known")
+    done = make_photo_asset(photos, asset, job, capture=CaptureSettings(board=BOARD), fit=fit, progress=tell)
+    found = compare(asset, truth, mesh)
+    found["instances in the rendered frame"] = drop(asset, args.out / "dropped")
+    print(
+        f"{done.verdict.photos} of {args.views} photos, {done.verdict.gaussians} Gaussians, {done.verdict.faces} faces"
+    )
+    missed = 0
+    for name, wanted in WANTED.items():
+        least = name in LEAST
+        met = found[name] >= wanted if least else found[name] <= wanted
+        missed += not met
+        print(f"{name:45} {found[name]:8.3f}  {'>=' if least else '<='} {wanted:g}{'' if met else '  missed'}")
+    sys.exit(missed > 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Whether structure from motion gives the same bytes in each run: ``python -m benchmarks.assets.sfm PHOTOS --runs 30``.
+
+Every run starts without the database of the one before. Load the machine meanwhile, or leave it alone: the SHA-256 of
+what COLMAP found, and the processor's time, are printed for each run. Status 1 if two differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import resource
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from mitsplat.capture.photos import find_photos, prepare_photos
+from mitsplat.capture.structure_from_motion import find_cameras
+
+PHOTOS = Path(__file__).resolve().parents[3] / "shared" / "data" / "photos" / "buddha"
+
+
+def main() -> None:
+    """Run, print, compare."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS)
+    parser.add_argument("--count", type=int, default=20, help="first photos to take")
+    parser.add_argument("--runs", type=int, default=30)
+    options = parser.parse_args()
+    found = set()
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        (folder / "given").mkdir()
+        for path in find_photos(options.photos)[: options.count]:
+            (folder / "given" / path.name).symlink_to(path.resolve())
+        photos, _ = prepare_photos(folder / "given", folder / "images", max_size=1600)
+        for run in range(options.runs):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            model = find_cameras(photos, folder / f"run{run}")
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            with np.load(folder / f"run{run}" / "model.npz", allow_pickle=False) as arrays:
+                digest = hashlib.sha256(b"".join(arrays[name].tobytes() for name in sorted(arrays))).hexdigest()
+            found.add(digest)
+            seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            print(
+                f"run {run}: {len(model.cameras)} of {len(photos)} cameras, {len(model.points)} points, "
+                f"{seconds:.1f} CPU s, {digest[:16]}",
+                flush=True,
+            )
+    print(f"{len(found)} different results of {options.runs} runs")
+    sys.exit(len(found) > 1)
+
+
+if __name__ == "__main__":
+    main()

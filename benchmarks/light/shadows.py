@@ -1,0 +1,481 @@
+"""Shadows against truth: baked splats under our light, beside photographs of the same meshes by Mitsuba's path tracer.
+
+    python -m benchmarks.light.shadows [--out FOLDER] [--scenes table bin ...] [--lights lamp sky ...]
+
+A scene's surroundings are baked under its lights without the objects, and every object alone under even light. The
+composite of both under ``shadow: none``, ``image`` and ``traced`` is compared with a path-traced photograph of
+surroundings and objects together. PSNR [dB] and FLIP (Andersson et al. 2020, where ``flip_evaluator`` is installed) are
+those of display-encoded pictures:
+
+* shadow: the surroundings where the objects take at least 3 % of the light, and 3 pixels around;
+* object: the pixels of the objects;
+* whole: all pixels.
+
+``capture`` replaces the splats by path-traced pictures of the surroundings and of each object alone, so that what
+remains is the error of the light. ``direct`` is that with the exact ratio of direct light: the best that shadow rays
+can do, without light that bounces off the objects. ``no bounce`` is ``capture traced`` without the light that objects
+get from their surroundings. Penumbrae are measured in the light ratio itself, against direct light that is path-traced
+on white meshes: the distance [px] between 20 and 80 % of every edge.
+
+What takes time (photographs and bakes) is kept in FOLDER and reused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mitsplat.arrays import BoolArray, Float64Array
+
+# isort: off
+from mitsplat.asset import Asset  # imports mitsplat, which must come before Dr.Jit
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from PIL import Image
+from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, maximum_filter, minimum_filter
+
+# isort: on
+from mitsplat.bake.bake import BakeSettings, bake_asset
+from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.path_tracing import trace_radiance
+from mitsplat.camera import Camera
+from mitsplat.colour import LUMINANCE, encode_srgb
+from mitsplat.frames.camera_response import light_image
+from mitsplat.plugins.proxies import Occluder, Proxies
+from mitsplat.render.layers import (
+    Layers,
+    ensure_variant,
+    make_integrator,
+    make_sensor,
+    make_splats_shape,
+    render_layers,
+)
+from mitsplat.scene.scene import AreaLight, EnvironmentLight, LightSpec, SpotLight
+from mitsplat.scene.spec import Composite
+from scenes.build import materials as m
+from scenes.build.parts import build_part
+
+ROOT = Path(__file__).resolve().parents[2]
+SKY = (0.97, 0.99, 1.0)
+
+LIGHTS: dict[str, tuple[LightSpec, ...]] = {
+    "softbox": (
+        AreaLight(position=(-0.35, -0.25, 0.75), target=(0, 0, 0), size=(0.3, 0.3), radiance=15.0),
+        EnvironmentLight(radiance=0.25, colour=SKY),
+    ),
+    "lamp": (
+        AreaLight(position=(0.45, 0.10, 0.65), target=(0, 0, 0), size=(0.06, 0.06), radiance=330.0),
+        EnvironmentLight(radiance=0.2, colour=SKY),
+    ),
+    "spot": (
+        SpotLight(position=(0.30, -0.35, 0.70), target=(0, 0, 0), cone=32.0, intensity=1.6),
+        AreaLight(position=(-0.5, 0.1, 0.6), target=(0, 0, 0), size=(0.2, 0.2), radiance=7.0),
+        EnvironmentLight(radiance=0.15, colour=SKY),
+    ),
+    "sky": (EnvironmentLight(radiance=0.9, colour=SKY),),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """An object: its true mesh in materials, its asset, and where it lies."""
+
+    name: str
+    mesh: trimesh.Scene
+    pose: Float64Array
+    asset: Callable[[Path], Asset]
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Surroundings and objects on them, seen by a camera."""
+
+    room: trimesh.Scene
+    things: Sequence[Thing]
+    camera: Camera
+    density: Mapping[str, float] = field(default_factory=dict)
+
+
+def pose(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Float64Array:
+    """Where a thing lies [m], turned about z after it was tilted about x [degrees]."""
+    matrix = trimesh.transformations.euler_matrix(np.radians(tilt), 0, np.radians(turn))
+    matrix[:3, 3] = x, y, z
+    return np.asarray(matrix)
+
+
+def worn(mesh: trimesh.Trimesh, image: m.Pixels, *, roughness: float = 0.7, metallic: float = 0.0) -> trimesh.Trimesh:
+    return m.wear(mesh, image, m.box_uv(mesh, 0.2), roughness=roughness, metallic=metallic)
+
+
+def block(low: Sequence[float], high: Sequence[float]) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[low, high])
+
+
+def simple(name: str, mesh: trimesh.Trimesh, where: Float64Array) -> Thing:
+    """A thing of one matt or glossy material, baked small."""
+    scene = trimesh.Scene({name: mesh})
+
+    def bake(folder: Path) -> Asset:
+        return baked(scene, folder / name, "uniform", 5000, kind="object")
+
+    return Thing(name, scene, where, bake)
+
+
+def shipped(name: str, where: Float64Array) -> Thing:
+    """A part of the shipped scene, with the asset that was baked from it."""
+    return Thing(name, build_part(name, 0)[0], where, lambda _: Asset.load(ROOT / "scenes/assets" / name))
+
+
+def table_setup() -> Setup:
+    """A table with a block whose shadow is captured, and coloured solids in and beside that shadow."""
+    rng = np.random.default_rng(1)
+    room = {
+        "top": worn(block((-0.5, -0.4, -0.04), (0.5, 0.4, 0)), m.concrete(rng, 256)),
+        "block": worn(block((-0.16, 0.02, -0.001), (-0.08, 0.10, 0.10)), m.cast((190, 150, 60), rng, size=64)),
+    }
+    solids = {
+        "cube": (trimesh.creation.box((0.05, 0.05, 0.05)), (190, 60, 50), pose(-0.01, 0.03, 0.025, 25)),
+        "ball": (trimesh.creation.icosphere(4, 0.03), (220, 218, 210), pose(0.06, -0.05, 0.03)),
+        "post": (trimesh.creation.cylinder(0.018, 0.09, sections=48), (60, 110, 180), pose(0.12, 0.06, 0.045)),
+        "plank": (trimesh.creation.box((0.10, 0.02, 0.008)), (120, 170, 90), pose(-0.07, -0.05, 0.004, -35)),
+    }
+    return Setup(trimesh.Scene(room), coloured(solids), view((0.05, -0.42, 0.30)))
+
+
+def corner_setup() -> Setup:
+    """Two walls, one of them red, that light what stands near them, and a shelf above."""
+    rng = np.random.default_rng(2)
+    room = {
+        "floor": worn(block((-0.2, -0.4, -0.04), (0.5, 0.2, 0)), m.cast((205, 200, 190), rng)),
+        "red": worn(block((-0.24, -0.4, -0.04), (-0.2, 0.2, 0.25)), m.cast((190, 40, 35), rng)),
+        "back": worn(block((-0.24, 0.16, -0.04), (0.5, 0.2, 0.25)), m.cast((200, 200, 205), rng)),
+        "shelf": worn(block((0.02, 0.06, 0.12), (0.5, 0.165, 0.13)), m.cast((150, 110, 70), rng)),
+    }
+    solids = {
+        "carton": (trimesh.creation.box((0.06, 0.08, 0.09)), (200, 170, 120), pose(-0.14, 0.03, 0.045, 12)),
+        "egg": (trimesh.creation.icosphere(4, 0.028), (235, 232, 225), pose(-0.05, -0.03, 0.028)),
+        "can": (trimesh.creation.cylinder(0.025, 0.07, sections=64), (70, 140, 80), pose(0.09, 0.08, 0.035)),
+        "slab": (trimesh.creation.box((0.09, 0.05, 0.012)), (60, 60, 70), pose(0.03, -0.10, 0.006, 20)),
+    }
+    return Setup(trimesh.Scene(room), coloured(solids), view((0.20, -0.42, 0.30), (-0.03, 0, 0.02)))
+
+
+def bin_setup() -> Setup:
+    """A box with walls that shade its inside, and solids that lean on each other in it."""
+    rng = np.random.default_rng(3)
+    outer, inner = block((-0.15, -0.11, 0), (0.15, 0.11, 0.09)), block((-0.14, -0.10, 0.01), (0.14, 0.10, 0.2))
+    room = {
+        "bench": worn(block((-0.3, -0.25, -0.04), (0.3, 0.25, -0.002)), m.cast((190, 150, 105), rng)),
+        "bin": worn(trimesh.boolean.difference([outer, inner], engine="manifold"), m.cast((60, 100, 170), rng)),
+    }
+    solids = {
+        "brick": (trimesh.creation.box((0.08, 0.04, 0.03)), (180, 80, 60), pose(-0.06, -0.03, 0.025, 15)),
+        "lid": (trimesh.creation.box((0.08, 0.06, 0.006)), (225, 222, 210), pose(-0.03, -0.04, 0.047, 40, 9)),
+        "marble": (trimesh.creation.icosphere(4, 0.022), (90, 170, 110), pose(0.06, 0.02, 0.032)),
+        "roll": (trimesh.creation.cylinder(0.02, 0.05, sections=64), (210, 180, 60), pose(0.09, -0.05, 0.03, 30, 90)),
+    }
+    return Setup(trimesh.Scene(room), coloured(solids), view((0.0, -0.36, 0.38)), {"bench": 0.1})
+
+
+def parts_setup() -> Setup:
+    """The shipped metal and plastic parts on a grey mat."""
+    rng = np.random.default_rng(4)
+    room = {"mat": worn(block((-0.4, -0.3, -0.03), (0.4, 0.3, 0)), m.cast((120, 122, 120), rng, size=256))}
+    lying = {
+        "hex_nut_m20": (-0.07, 0.01, 0, 0),
+        "hex_bolt": (0.0, -0.045, 20, 90),
+        "l_bracket": (0.045, 0.03, -30, 0),
+        "relay_box": (-0.02, 0.045, 10, 0),
+        "bearing_6204": (0.075, -0.03, 0, 0),
+        "cable_clip": (-0.06, -0.04, 60, 0),
+    }
+    things = []
+    for name, (x, y, turn, tilt) in lying.items():
+        mesh = build_part(name, 0)[0]
+        turned = mesh.copy().apply_transform(pose(0, 0, 0, turn, tilt))
+        things.append(shipped(name, pose(x, y, -float(turned.bounds[0, 2]), turn, tilt)))
+    return Setup(trimesh.Scene(room), things, view((0.03, -0.22, 0.20), fov_x=46))
+
+
+SETUPS = {"table": table_setup, "corner": corner_setup, "bin": bin_setup, "parts": parts_setup}
+
+
+def coloured(solids: Mapping[str, tuple[trimesh.Trimesh, m.Colour, Float64Array]]) -> list[Thing]:
+    rng = np.random.default_rng(5)
+    return [
+        simple(name, worn(mesh, m.cast(c, rng, size=64), roughness=0.6), p) for name, (mesh, c, p) in solids.items()
+    ]
+
+
+def view(eye: Sequence[float], target: Sequence[float] = (0, 0, 0.01), *, fov_x: float = 40.0) -> Camera:
+    return Camera.look_at(eye, target, width=320, height=200, fov_x=fov_x)
+
+
+def baked(
+    scene: trimesh.Scene,
+    folder: Path,
+    light: str | Sequence[LightSpec],
+    gaussians: int,
+    *,
+    kind: Any,
+    density: Mapping[str, float] | None = None,
+) -> Asset:
+    """The asset in ``folder``, baked if it is not there yet."""
+    if not (folder / "asset.yaml").exists():
+        settings = BakeSettings(
+            gaussians=gaussians, sh_degree=1, directions=16, fit_steps=0, verify_views=0, density=density
+        )
+        mesh = trimesh.util.concatenate([part.mesh for part in read_parts(scene)])
+        pieces = [trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull]  # for physics, which is not used here
+        result = bake_asset(scene, name=folder.name, kind=kind, light=light, settings=settings, pieces=pieces)
+        result.asset.save(folder)
+    return Asset.load(folder)
+
+
+class Photographer:
+    """Path-traced linear pictures, kept in a folder."""
+
+    def __init__(self, camera: Camera, folder: Path, samples: int) -> None:
+        self.camera, self.folder, self.samples = camera, folder, samples
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def take(
+        self, name: str, parts: Sequence[Part], lights: dict[str, Any], *, bounces: int = 6, clay: bool = False
+    ) -> tuple[Float64Array, Float64Array]:
+        """Radiance (H, W, 3) averaged over each pixel, and coverage (H, W)."""
+        file = self.folder / f"{name}_{self.samples}.npz"
+        if not file.exists():
+            scene = mitsuba_scene(parts, lights, clay=clay)
+            side, camera = 3, self.camera
+            fine = camera.resized(camera.width * side, camera.height * side)
+            x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
+            slopes = fine.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+            rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            origins = np.broadcast_to(camera.centre, rays.shape)
+            radiance, hit = trace_radiance(scene, origins, rays, samples=self.samples // 9, bounces=bounces, seed=1)
+            by_pixel = (camera.height, side, camera.width, side)
+            np.savez(
+                file,
+                radiance=np.where(hit[:, None], radiance, 0).reshape(*by_pixel, 3).mean(axis=(1, 3)).astype(np.float32),
+                cover=hit.reshape(by_pixel).mean(axis=(1, 3)).astype(np.float32),
+            )
+        stored = np.load(file)
+        return stored["radiance"].astype(np.float64), stored["cover"].astype(np.float64)
+
+
+def placed(thing: Thing) -> tuple[Part, ...]:
+    scene = thing.mesh.copy()
+    scene.apply_transform(thing.pose)
+    return tuple(replace(part, name=f"{thing.name} {part.name}") for part in read_parts(scene))
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is path-traced of one setup under one light, all at H x W."""
+
+    photo: Float64Array
+    empty: Float64Array
+    alone: Float64Array
+    ratio: Float64Array
+    objects: BoolArray
+    shadow: BoolArray
+    edges: BoolArray
+
+
+def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> Truth:
+    shots = Photographer(setup.camera, out / name, samples)
+    lights = bake_lights(LIGHTS[light])
+    room, things = read_parts(setup.room), [placed(thing) for thing in setup.things]
+    everything = [*room, *(part for parts in things for part in parts)]
+    photo, _ = shots.take(f"{light}_photo", everything, lights)
+    empty, _ = shots.take(f"{light}_empty", room, lights)
+    alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup, room, things)
+    for number, (thing, parts) in enumerate(zip(setup.things, things, strict=True), 1):
+        captured, own = shots.take(f"alone_{thing.name}", parts, bake_lights("uniform"))
+        alone = np.where((seen == number)[..., None], captured / np.maximum(own, 1e-6)[..., None], alone)
+        cover = np.maximum(own, cover)
+    direct, _ = shots.take(f"{light}_direct", everything, lights, bounces=1, clay=True)
+    bare, _ = shots.take(f"{light}_bare", room, lights, bounces=1, clay=True)
+    ratio = np.where(bare > 1e-4, direct / np.maximum(bare, 1e-4), 1.0)
+    surroundings = cover == 0
+    objects = (cover > 0.999) & (seen > 0)
+    darker = surroundings & (photo @ LUMINANCE < 0.97 * (empty @ LUMINANCE)) & (bare @ LUMINANCE > 1e-3)
+    # Speckles of noise are no shadow.
+    darker = gaussian_filter(darker.astype(float), 1.5) > 0.5
+    shadow = binary_dilation(darker, iterations=3) & surroundings
+    return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
+
+
+def nearest_object(setup: Setup, room: Sequence[Part], things: Sequence[Sequence[Part]]) -> npt.NDArray[np.uint32]:
+    """Number of the object that the middle of each pixel shows (H, W), 0 for the surroundings."""
+    occluders = [Occluder(part.mesh, 0, dynamic=False) for part in room]
+    occluders += [Occluder(part.mesh, i, dynamic=True) for i, parts in enumerate(things, 1) for part in parts]
+    hit, _ = Proxies(occluders).nearest(make_sensor(setup.camera).view().rays())
+    return np.array(hit.instance).reshape(setup.camera.height, setup.camera.width)
+
+
+def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth) -> dict[str, Float64Array]:
+    """Linear pictures to compare with the photograph, by name.
+
+    ``relative`` are layers whose light is 1 at an open place, which is what the image-space chain works on.
+    """
+    captured = np.where(truth.objects[..., None], truth.alone, truth.empty).astype(np.float32)
+    opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
+    exact = replace(layers, **opaque)
+    ratio = np.where(truth.objects[..., None], layers.light, truth.ratio).astype(np.float32)
+    pictures = {"none": light_image(layers, Composite(shadow="none"))}
+    pictures |= {"image": light_image(relative, Composite(shadow="image"))}
+    pictures |= {"traced": light_image(layers, Composite())}
+    pictures |= {"capture image": light_image(replace(relative, **opaque), Composite(shadow="image"))}
+    pictures |= {"no bounce": lit(replace(unbounced, **opaque))}
+    pictures |= {"capture traced": lit(exact)}
+    pictures["direct"] = lit(replace(exact, light=ratio))
+    return {name: np.asarray(picture, dtype=np.float64) for name, picture in pictures.items()}
+
+
+def lit(layers: Layers) -> Float64Array:
+    """The linear picture of opaque layers that were changed after they were rendered."""
+    return np.maximum(layers.captured * layers.light + layers.highlight, 0)
+
+
+def psnr(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float:
+    error = np.clip(encode_srgb(picture), 0, 1) - np.clip(encode_srgb(photo), 0, 1)
+    return float(-10 * np.log10(np.mean(error[region] ** 2)))
+
+
+def flip(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float:
+    """Mean FLIP difference in a region; NaN where its library is not installed."""
+    try:
+        from flip_evaluator import evaluate
+    except ImportError:
+        return float("nan")
+    shown = [np.clip(encode_srgb(p), 0, 1).astype(np.float32) for p in (photo, picture)]
+    errors, _, _ = evaluate(*shown, "LDR", applyMagma=False)
+    return float(errors[region].mean())
+
+
+def penumbra_widths(ratios: Sequence[Float64Array], on_room: BoolArray, *, reach: int = 14) -> Float64Array:
+    """Distances [px] between 20 and 80 % of the edges of the first ratio, in all of them (edges, ratios)."""
+    truth = gaussian_filter(ratios[0], 1.0)
+    low, high = minimum_filter(truth, 2 * reach + 1), maximum_filter(truth, 2 * reach + 1)
+    slope = np.stack(np.gradient(gaussian_filter(ratios[0], 2.0)), axis=-1)
+    steep = np.linalg.norm(slope, axis=-1)
+    middle = (high - low > 0.25) & (np.abs(truth - 0.5 * (high + low)) < 0.06 * (high - low)) & (steep > 0.01)
+    centres = np.argwhere(middle & on_room)
+    steps = np.arange(-reach, reach + 0.25, 0.25)
+    rows = []
+    for centre in centres:
+        line = (centre + steps[:, None] * slope[tuple(centre)] / steep[tuple(centre)]).T
+        if map_coordinates(on_room.astype(float), line, order=1).min() < 1:
+            continue
+        widths = [_rise(map_coordinates(ratio, line, order=1), steps) for ratio in ratios]
+        if np.isfinite(widths[0]):
+            rows.append(widths)
+    return np.array(rows).reshape(-1, len(ratios))
+
+
+def _rise(profile: Float64Array, steps: Float64Array) -> float:
+    low, high = np.median(profile[:8]), np.median(profile[-8:])
+    level = (profile - low) / (high - low) if high > low + 0.05 else np.full_like(profile, np.nan)
+    above = np.flatnonzero(level > 0.8)
+    below = np.flatnonzero(level[: above[0]] < 0.2) if len(above) else above
+    return float(steps[above[0]] - steps[below[-1]]) if len(below) else np.nan
+
+
+def save_sheet(path: Path, pictures: Sequence[Float64Array], scale: int = 2) -> None:
+    """Pictures side by side, three to a row, magnified."""
+    rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
+    rows = [np.pad(row, ((0, 0), (0, rows[0].shape[1] - row.shape[1]), (0, 0))) for row in rows]
+    sheet = np.rint(255 * np.clip(encode_srgb(np.concatenate(rows)), 0, 1)).astype(np.uint8)
+    Image.fromarray(sheet).resize((scale * sheet.shape[1], scale * sheet.shape[0]), Image.Resampling.NEAREST).save(path)
+
+
+def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
+    """Figures of one setup under one light, and the pictures side by side in ``out``."""
+    setup = SETUPS[name]()
+    truth = take_truth(setup, name, light, out, samples)
+    room = baked(setup.room, out / name / light, LIGHTS[light], 20000, kind="environment", density=setup.density)
+    shapes = {"room": shape_of(room, np.eye(4), 0)}
+    for number, thing in enumerate(setup.things, 1):
+        shapes[f"thing_{number}"] = shape_of(thing.asset(out / name), thing.pose, number)
+    scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(LIGHTS[light])})
+    layers, unbounced, relative = (
+        render_layers(make_integrator(**how), scene, setup.camera)
+        for how in ({"white": room.white}, {"white": room.white, "bounce": False}, {"bounce": False})
+    )
+    pictures = composites(layers, unbounced, relative, truth)
+    ratios = [truth.ratio @ LUMINANCE, layers.light @ LUMINANCE]
+    ratios.append(pictures["capture image"] @ LUMINANCE / np.maximum(truth.empty @ LUMINANCE, 1e-6))
+    widths = penumbra_widths(ratios, truth.edges)
+    regions = {"shadow": truth.shadow, "object": truth.objects, "whole": np.ones_like(truth.shadow)}
+    result: dict[str, Any] = {
+        f"{region} {key}": psnr(picture, truth.photo, mask)
+        for key, picture in pictures.items()
+        for region, mask in regions.items()
+    }
+    result |= {f"flip {key}": flip(picture, truth.photo, truth.shadow) for key, picture in pictures.items()}
+    bright = [np.mean(p[truth.objects] @ LUMINANCE) for p in (pictures["capture traced"], truth.photo)]
+    result["object brightness"] = bright[0] / bright[1]
+    error = (layers.light - truth.ratio)[truth.edges & truth.shadow]
+    result["ratio rms"] = float(np.sqrt(np.mean(error**2)))
+    result["edges"], result["width"] = len(widths), float(np.median(widths[:, 0])) if len(widths) else np.nan
+    for column, key in ((1, "traced"), (2, "image")):
+        error = np.abs(widths[:, column] - widths[:, 0]) / np.maximum(widths[:, 0], 0.5)
+        result[f"width error {key}"] = float(np.nanmedian(error)) if len(widths) else np.nan
+    shown = [truth.photo, pictures["none"], pictures["image"], pictures["traced"]]
+    save_sheet(out / f"{name}_{light}.png", [*shown, pictures["capture traced"], layers.light.astype(np.float64)])
+    return result
+
+
+def shape_of(asset: Asset, where: Float64Array, instance: int) -> Any:
+    return make_splats_shape(
+        asset.splats,
+        where,
+        asset.mesh,
+        instance=instance,
+        capture_light=asset.capture_light,
+        roughness=float(asset.roughness),
+        specular=float(asset.specular) if instance else 0.0,
+    )
+
+
+COLUMNS = ("none", "image", "traced", "capture image", "no bounce", "capture traced", "direct")
+
+
+def main() -> None:
+    """Parse the command line and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "shadows")
+    parser.add_argument("--scenes", nargs="*", choices=SETUPS, default=list(SETUPS))
+    parser.add_argument("--lights", nargs="*", choices=LIGHTS, default=list(LIGHTS))
+    parser.add_argument("--samples", type=int, default=72, help="paths per pixel of a photograph")
+    options = parser.parse_args()
+    ensure_variant()
+    results = {}
+    for name in options.scenes:
+        for light in options.lights:
+            start = time.perf_counter()
+            results[name, light] = compare(name, light, options.out, options.samples)
+            print(f"{name} {light}: {time.perf_counter() - start:.0f} s", flush=True)
+    for quantity in ("shadow", "flip", "object", "whole"):
+        print(f"\n{quantity:16s}" + "".join(f"{column:>16s}" for column in COLUMNS))
+        rows = {key: [result[f"{quantity} {column}"] for column in COLUMNS] for key, result in results.items()}
+        rows["mean", ""] = np.mean(list(rows.values()), axis=0)
+        for key, row in rows.items():
+            print(f"{' '.join(key):16s}" + "".join(f"{v:16.3f}" if quantity == "flip" else f"{v:16.1f}" for v in row))
+    others = ("ratio rms", "object brightness", "edges", "width", "width error traced", "width error image")
+    print("\n" + " " * 16 + "".join(f"{column:>20s}" for column in others))
+    for key, result in results.items():
+        print(f"{' '.join(key):16s}" + "".join(f"{result[column]:20.3f}" for column in others))
+
+
+if __name__ == "__main__":
+    main()

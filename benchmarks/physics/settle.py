@@ -1,0 +1,302 @@
+"""Settling: ``python -m benchmarks.physics.settle rate | faces | thin | bin | rest | worlds | share [--count N]``.
+
+rate     layouts per minute of ten and of thirty objects, with both steppers, in one process and in two
+faces    faces that a box of 1 : 1 : 0.3 comes to rest on, with both steppers, compared by a chi-squared test
+thin     random drops of a screw, a torus, a mug and a concave bracket, certified
+bin      forty objects poured into a bin
+rest     ten objects, seed after seed: time to rest, and what moves in the five seconds after
+worlds   time of several layouts in one simulation, per layout, on ``--device cpu`` or ``cuda:0``
+share    what settling adds to the images of the shipped workcell at 1280x720 with ten views of each layout
+
+Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless said otherwise.
+What is made once (convex pieces, compiled kernels) is made before the clock starts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from ruamel.yaml import YAML
+from scipy.stats import chi2_contingency
+from trimesh.creation import annulus, box, cylinder, torus
+
+from mitsplat.asset import Asset
+from mitsplat.errors import InputError
+from mitsplat.mesh import convex_pieces
+from mitsplat.physics.settle import settle_layout, settle_layouts, warp_settings
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.splats import Splats
+
+STEPPERS = ("warp", "mujoco")
+WORKCELL = Path(__file__).resolve().parents[2] / "scenes/workcell.yaml"
+
+
+def at(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
+    return mesh.apply_translation(offset)
+
+
+def parts() -> dict[str, trimesh.Trimesh]:
+    hexagon = cylinder(radius=0.00575, height=0.005, sections=6)
+    plates = trimesh.boolean.union([box((0.06, 0.04, 0.004)), at(box((0.004, 0.04, 0.05)), -0.028, 0, 0.023)])
+    return {
+        "nut": trimesh.boolean.difference([hexagon, cylinder(radius=0.003, height=0.02, sections=32)]),
+        "bolt": trimesh.boolean.union([hexagon, at(cylinder(radius=0.003, height=0.026, sections=32), 0, 0, 0.0145)]),
+        "washer": annulus(r_min=0.0032, r_max=0.006, height=0.0015, sections=48),
+        "bracket": trimesh.boolean.difference([plates, at(cylinder(radius=0.004, height=0.02), 0.015, 0, 0)]),
+        "plate": box((0.15, 0.06, 0.012)),
+    }
+
+
+def thin_parts() -> dict[str, trimesh.Trimesh]:
+    head, shaft = cylinder(radius=0.003, height=0.002, sections=24), cylinder(radius=0.0012, height=0.032, sections=16)
+    outside, inside = (
+        cylinder(radius=0.03, height=0.07, sections=24),
+        at(cylinder(radius=0.027, height=0.07), 0, 0, 0.004),
+    )
+    handle = torus(0.02, 0.004, major_sections=16, minor_sections=8)
+    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    mug = trimesh.boolean.difference([trimesh.boolean.union([outside, at(handle, 0.034, 0, 0)]), inside])
+    return {
+        "screw": trimesh.boolean.union([head, at(shaft, 0, 0, 0.0165)]),
+        "torus": torus(0.025, 0.006, major_sections=24, minor_sections=12),
+        "mug": mug,
+        "bracket": parts()["bracket"],
+    }
+
+
+def make_scene(meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, **changes: Any) -> Scene:
+    """A scene of ``count`` of each mesh on a table."""
+    with tempfile.TemporaryDirectory() as name:
+        return load_scene(write_scene(Path(name), meshes, count, stepper, **changes))
+
+
+def write_scene(folder: Path, meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, **changes: Any) -> Path:
+    point = Splats(
+        means=np.zeros((1, 3), np.float32),
+        quats=np.float32([[0, 0, 0, 1]]),
+        scales=np.full((1, 3), 1e-3, np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+    )
+    for name, mesh in meshes.items():
+        Asset(name, name, point, mesh=mesh, pieces=convex_pieces(mesh), density=3000.0).save(folder / name)
+    scene = {
+        "name": "settle",
+        "shapes": [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}, "visible": True}],
+        "objects": [{"asset": name, "count": count} for name in meshes],
+        "region": {"min": [-0.25, -0.2, 0.01], "max": [0.25, 0.2, 0.2 if count * len(meshes) <= 10 else 0.45]},
+        "enclosure": {},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 1, "height": 1},
+        "lights": [{"kind": "point", "position": [0, 0, 1]}],
+        **changes,
+    }
+    scene["settle"] = {"stepper": stepper, **scene.get("settle", {})}
+    path = folder / "scene.yaml"
+    YAML(typ="safe").dump(scene, path)
+    return path
+
+
+def try_settle(scene: Scene, index: int) -> Layout | None:
+    try:
+        return settle_layout(scene, index, cached=False)
+    except InputError as error:
+        print(f"  given up: {error}")
+        return None
+
+
+def show(name: str, layouts: list[Layout], given_up: int, seconds: float) -> None:
+    found = [layout.certificate for layout in layouts]
+    times = [certificate.time_to_rest for certificate in found]
+    refused = Counter(reason.split(" by ")[0] for certificate in found for reason in certificate.refused)
+    print(
+        f"{name}: {len(found)} layouts, {given_up} given up, {sum(c.attempts for c in found)} draws; "
+        f"rest {np.median(times):.2f} s (median), {max(times):.2f} (slowest); deepest "
+        f"{max(c.collider_penetration for c in found) * 1e3:.2f} mm in colliders, "
+        f"{max(c.pair_penetration for c in found) * 1e3:.2f} in objects; "
+        f"gap {max(c.support_gap for c in found) * 1e3:.2f} mm; motion in 1 s "
+        f"{max(c.surface_motion for c in found) * 1e3:.2f} mm; {seconds / (len(found) + given_up):.2f} CPU s a layout"
+        + (f"; refused {dict(refused)}" if refused else ""),
+        flush=True,
+    )
+
+
+def settle_all(name: str, scene: Scene, count: int) -> list[Layout]:
+    settle_layout(scene, count, cached=False)  # pieces, kernels
+    start, wall = time.process_time(), time.perf_counter()
+    layouts = [try_settle(scene, index) for index in range(count)]
+    seconds, wall = time.process_time() - start, time.perf_counter() - wall
+    held = [layout for layout in layouts if layout is not None]
+    show(name, held, count - len(held), seconds)
+    print(f"  {60 * count / wall:.1f} layouts a minute of wall time in one process", flush=True)
+    return held
+
+
+def measure_rate(count: int) -> None:
+    for objects in (10, 30):
+        for stepper in STEPPERS:
+            scene = make_scene(parts(), objects // 5, stepper, settle={"attempts": 20})
+            settle_all(f"{objects} objects, {stepper}", scene, count)
+            layouts = settle_layouts(scene, range(count + 2), workers=2, cached=False)
+            finished = [time.perf_counter() for _ in layouts]
+            # Each process makes its simulation for the first layout that it settles.
+            rate = 60 * count / (finished[-1] - finished[1])
+            print(f"  {rate:.1f} layouts a minute of wall time in two processes", flush=True)
+
+
+def measure_faces(count: int) -> None:
+    """Resting faces: how often a box lies on each pair of faces; solid angles are what an overdamped box would do."""
+    sides = np.array([0.03, 0.03, 0.009])
+    rows = []
+    for stepper in STEPPERS:
+        scene = make_scene({"box": box(sides)}, 25, stepper, settle={"arrangement": "scatter"})
+        up = []
+        for index in range(-(-count // 25)):
+            layout = try_settle(scene, index)
+            up += [] if layout is None else [one.world_from_object[2, :3] for one in layout.instances]
+        axis = np.abs(up).argmax(axis=1)
+        sign = np.sign(np.take_along_axis(np.array(up), axis[:, None], axis=1))[:, 0]
+        off = np.degrees(np.arccos(np.minimum(1, np.abs(up).max(axis=1))))
+        rows.append(np.bincount(2 * axis + (sign > 0), minlength=6))
+        print(f"{stepper}: {len(up)} boxes, on -x +x -y +y -z +z: {rows[-1].tolist()}, on no face: {(off > 1).sum()}")
+    a, b, d = sides / 2
+    corner = np.arcsin(a * b / np.sqrt((a * a + d * d) * (b * b + d * d)))
+    print(f"large faces by solid angle: {2 * 4 * corner / (4 * np.pi):.3f}")
+    pairs = np.array(rows).reshape(2, 3, 2).sum(axis=2)
+    print(f"large faces found: {pairs[:, 2] / pairs.sum(axis=1)}")
+    table = np.stack([pairs[:, 2], pairs[:, :2].sum(axis=1)])
+    print(f"warp against mujoco: p = {chi2_contingency(table).pvalue:.3f}")
+
+
+def measure_thin(count: int) -> None:
+    for name, mesh in thin_parts().items():
+        for stepper in STEPPERS:
+            scene = make_scene({name: mesh}, 4, stepper, settle={"attempts": 8})
+            settle_all(f"4 x {name}, {stepper}", scene, count)
+
+
+def measure_bin(count: int) -> None:
+    meshes = parts()
+    del meshes["plate"]  # longer than the bin
+    tray = {"name": "bin", "bin": {"size": [0.24, 0.18, 0.1], "position": [0, 0, 0.004]}}
+    table = {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}
+    region = {"min": [-0.1, -0.07, 0.01], "max": [0.1, 0.07, 0.12]}
+    for stepper in STEPPERS:
+        scene = make_scene(
+            meshes, 10, stepper, shapes=[table, tray], region=region, enclosure=None, settle={"arrangement": "pile"}
+        )
+        settle_all(f"40 objects in a bin, {stepper}", scene, count)
+
+
+def measure_rest(count: int) -> None:
+    """Drop ten objects with each of some seeds once, without a second draw; then wait for five seconds more."""
+    from mitsplat.physics.drop import drop_of
+    from mitsplat.physics.worlds import _surface_motion, run_to_rest
+
+    for stepper in STEPPERS:
+        drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)
+        times, moved, total = [], 0, 0
+        for seed in range(count):
+            assets, _ = drop._draw_objects(0)
+            world = drop._world(assets, drop._draw_frictions(0), 1.0)
+            world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
+            outcome = run_to_rest(world, max_time=6.0, bounds=drop._bounds)
+            if outcome.refused:
+                print(f"  seed {seed}: {outcome.refused}")
+                continue
+            times.append(outcome.time)
+            end = world.time + 5.0
+            while world.time < end:
+                world.advance()
+            for body, before, after in zip(world.bodies, outcome.poses, world.poses, strict=True):
+                total += 1
+                moved += _surface_motion([body], before[None], after[None]) > 5e-3
+        print(
+            f"{stepper}: {len(times)} of {count} at rest in 6 s, median {np.median(times):.2f} s; "
+            f"{moved} of {total} objects moved by more than 5 mm in the next 5 s",
+            flush=True,
+        )
+
+
+def measure_worlds(count: int, device: str) -> None:
+    """Layouts of ten objects in one simulation of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device."""
+    from benchmarks.physics.worlds import time_worlds
+    from mitsplat.physics.drop import drop_of
+
+    scene = make_scene(parts(), 2, "warp")
+    drop = drop_of(scene, lambda text: None)
+    assets, _ = drop._draw_objects(0)
+    starts = [drop.draw_poses(assets, np.random.default_rng(world)) for world in range(count)]
+    bodies = [drop._objects[asset].body for asset in assets]
+    time_worlds(bodies, drop._colliders, starts, drop._bounds, timestep=scene.spec.settle.timestep, device=device)
+
+
+def measure_share(count: int) -> None:
+    """CPU seconds of settling and of rendering, layout by layout, so that other work on the machine slows both."""
+    from mitsplat.frames.frame import render_frame
+
+    scenes = {
+        stepper: load_scene(
+            WORKCELL, overrides={"output.layouts": count + 1, "output.views": 10, "settle.stepper": stepper}
+        )
+        for stepper in STEPPERS
+    }
+    spent: dict[str, list[float]] = {name: [] for name in (*STEPPERS, "rendering")}
+
+    def timed(name: str, work: Callable[[], Any]) -> Any:
+        start = time.process_time()
+        result = work()
+        spent[name].append(time.process_time() - start)
+        return result
+
+    # Stepper by stepper, because what the layouts of a scene share is kept for one scene.
+    for stepper, scene in scenes.items():
+        for index in range(count + 1):
+            layout = timed(stepper, partial(settle_layout, scene, index, cached=False))
+            timed("rendering", partial(render_frame, scene, 10 * index, layout=layout))
+    # The first one makes what all share: parts and compiled kernels.
+    image = np.mean(spent["rendering"][1:])
+    for stepper in STEPPERS:
+        layout_seconds = np.mean(spent[stepper][1:])
+        print(
+            f"{stepper}: {layout_seconds:.2f} CPU s a layout, {spent[stepper][0]:.2f} the first; rendering {image:.2f} "
+            f"CPU s an image: settling adds {layout_seconds / 10 / image:.1%} to one at ten views of a layout",
+            flush=True,
+        )
+
+
+MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
+    "rate": (measure_rate, 10),
+    "faces": (measure_faces, 500),
+    "thin": (measure_thin, 50),
+    "bin": (measure_bin, 3),
+    "rest": (measure_rest, 20),
+    "share": (measure_share, 6),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("measure", choices=[*MEASURES, "worlds"])
+    parser.add_argument("--count", type=int)
+    parser.add_argument("--device", default="cpu", help="of worlds: cpu, or cuda:0")
+    arguments = parser.parse_args()
+    with warp_settings():
+        if arguments.measure == "worlds":
+            measure_worlds(arguments.count or (8 if arguments.device == "cpu" else 256), arguments.device)
+        else:
+            measure, count = MEASURES[arguments.measure]
+            measure(arguments.count or count)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""Several layouts in one simulation (Newton's worlds), timed, for ``python -m benchmarks.physics.settle worlds``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from mitsplat.arrays import Float64Array
+from mitsplat.physics import worlds as physics
+from mitsplat.physics.friction import PairFrictionSolver
+from mitsplat.physics.worlds import Body, Collider, World, run_to_rest
+
+WORLDS = 1, 8, 64, 256
+DURATION = 2.5  # simulated, for coming to rest and the second after that [s]
+
+
+def time_worlds(
+    bodies: Sequence[Body],
+    colliders: Sequence[Collider],
+    starts: Sequence[Float64Array],
+    bounds: tuple[Float64Array, Float64Array],
+    *,
+    timestep: float,
+    device: str,
+) -> None:
+    """Print what 1, 8, 64 and 256 worlds cost on a Warp device, as many as there are poses to start from."""
+    for worlds in [worlds for worlds in WORLDS if worlds < len(starts)] + [len(starts)]:
+        batch = Batch(bodies, colliders, starts[:worlds], timestep=timestep, device=device)
+        wall, cpu = time.perf_counter(), time.process_time()
+        frames = batch.run()
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        rested = sum(has_rested(bodies, world, batch.interval, bounds) for world in frames.swapaxes(0, 1))
+        per_world = 1e3 / DURATION / worlds
+        print(
+            f"{worlds} worlds of {len(bodies)} objects on {device}: {wall * per_world:.1f} ms of wall time and "
+            f"{cpu * per_world:.1f} of CPU time per simulated second and world; {rested} at rest for a second after "
+            f"{DURATION:g} s: {60 * rested / wall:.1f} layouts a minute",
+            flush=True,
+        )
+
+
+class Batch:
+    """The steps of :class:`mitsplat.physics.worlds.WarpWorld` in several worlds at once, roll friction kept."""
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        colliders: Sequence[Collider],
+        starts: Sequence[Float64Array],
+        *,
+        timestep: float,
+        device: str,
+    ) -> None:
+        one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP)
+        contacts = 2 * physics.max_contacts(len(bodies), one.shape_count)  # nothing is drawn again here
+        builder = newton.ModelBuilder(gravity=physics._GRAVITY)
+        SolverMuJoCo.register_custom_attributes(builder)
+        builder.replicate(one, len(starts))
+        model = builder.finalize(device=device)
+        self._solver = PairFrictionSolver(
+            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics._SOLVER_OPTIONS
+        )
+        self._solver.mjw_model.opt.warn_overflow = 0
+        self._pipeline = newton.CollisionPipeline(
+            model, broad_phase="sap", rigid_contact_max=len(starts) * contacts + 1
+        )
+        self._contacts, self._control = self._pipeline.contacts(), model.control()
+        self._states, self._timestep = (model.state(), model.state()), timestep
+        overflow = {SolverMuJoCo.ObservableKind.OVERFLOW}
+        self._observables = [self._solver.observables(overflow) for _ in range(physics._STEPS)]
+        self.interval = physics._STEPS * timestep
+        self._record()
+        with wp.ScopedCapture(device=device) as capture:
+            self._record()
+        self._graph = capture.graph
+        self._shape = len(starts), len(builder.body_mass) // len(starts), 7
+        coordinates = np.concatenate([physics._coordinates(bodies, poses) for poses in starts])
+        state = self._states[0]
+        self._solver.reset(state)
+        physics._assign(state.joint_q, coordinates.ravel())
+        physics._assign(state.body_q, coordinates)
+        physics._assign(state.joint_qd, np.zeros(6 * len(coordinates)))
+        physics._assign(state.body_qd, np.zeros((len(coordinates), 6)))
+
+    def _record(self) -> None:
+        here, there = self._states
+        for observables in self._observables:
+            self._pipeline.collide(here, self._contacts)
+            self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
+            here, there = there, here
+
+    def run(self) -> Float64Array:
+        """Positions and xyzw quaternions after each launch of the graph, shape (frames, worlds, bodies, 7)."""
+        frames = []
+        for _ in range(round(DURATION / self.interval)):
+            wp.capture_launch(self._graph)
+            frames.append(self._states[0].body_q.numpy().astype(np.float64).reshape(self._shape))
+            if any(observed.overflow.numpy().any() for observed in self._observables):
+                raise RuntimeError("contact buffer overflow")
+        return np.stack(frames)
+
+
+def has_rested(
+    bodies: Sequence[Body], frames: Float64Array, interval: float, bounds: tuple[Float64Array, Float64Array]
+) -> bool:
+    """Whether the bodies of one world were at rest for a second, by the rule of :func:`physics.run_to_rest`."""
+
+    class Recorded(World):
+        """What was simulated before, frame by frame."""
+
+        def __init__(self) -> None:
+            super().__init__(bodies, timestep=interval / physics._STEPS)
+            self._frames = iter(frames[:, : len(bodies)])
+            self._frame = next(self._frames)
+
+        @property
+        def velocities(self) -> Float64Array:
+            return np.zeros((len(bodies), 2, 3))
+
+        def _reset(self, coordinates: Float64Array) -> None:
+            raise NotImplementedError
+
+        def _set_velocities(self, velocities: Float64Array) -> None:
+            raise NotImplementedError
+
+        def _advance(self) -> None:
+            self._frame = next(self._frames)
+
+        def _let_roll(self, rolls: bool) -> None:
+            pass
+
+        def _coordinates(self) -> Float64Array:
+            return self._frame
+
+    try:
+        return not run_to_rest(Recorded(), max_time=DURATION, bounds=bounds).refused
+    except StopIteration:
+        return False

@@ -1,0 +1,133 @@
+"""The renderer on a GPU, stage by stage, beside gsplat and Mitsuba's own splat path on the same splats.
+
+    python -m benchmarks.render.cuda [--captures FOLDER] [--no-volprim]
+
+gsplat and PyTorch are used when they are installed. Times are medians of synchronised repeats.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+# isort: off
+from benchmarks.render.captures import CAMERA, CAPTURES, crowd  # imports mitsplat, which must come before Dr.Jit
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# isort: on
+from mitsplat.colour import encode_srgb
+from mitsplat.frames.volprim import render_volprim, volprim_scene
+from mitsplat.quality import resolve_quality
+from mitsplat.render.layers import make_sensor, render_splats
+from mitsplat.splats import Splats
+
+
+def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int = 30) -> float:
+    """Median time of a synchronised call [ms], after three calls that warm up."""
+    times = []
+    for i in range(repeats + 3):
+        sync()
+        start = time.perf_counter()
+        run()
+        sync()
+        if i >= 3:
+            times.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(times)
+
+
+def time_ours(splats: Splats) -> None:
+    """Print the time of binning and march, per preset."""
+    from mitsplat.plugins.gaussian import upload_cloud
+    from mitsplat.plugins.march import march
+    from mitsplat.plugins.project import Placement, merge_clouds
+    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.plugins.tiles import TileLists, bin_gaussians
+
+    clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
+    camera = view_of(make_sensor(CAMERA))
+    placements = [Placement(0, np.eye(4), 1)]
+    for name in ("fast", "balanced"):
+        quality = resolve_quality(name)
+        view = camera.sampled(quality.samples)
+
+        def run_bin(view=view, quality=quality) -> TileLists:
+            return bin_gaussians(clouds, placements, view, quality)
+
+        lists = run_bin()
+
+        def run_march(lists=lists, view=view, quality=quality) -> None:
+            image = march(lists, view, quality)
+            dr.eval(image.rgb, image.alpha)
+
+        def run_all(run_bin=run_bin, run_march=run_march) -> None:
+            run_march(run_bin())
+
+        binning = median_ms(run_bin, dr.sync_thread)
+        marching, whole = median_ms(run_march, dr.sync_thread), median_ms(run_all, dr.sync_thread)
+        print(f"mitsplat {name}: whole {whole:.2f} ms (project, bin, sort {binning:.2f}, march {marching:.2f}), "
+              f"{lists.visible} visible, {lists.pairs} pairs")  # fmt: skip
+    kernels = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        run_all()
+        kernels = dr.kernel_history()
+    print(f"  of which inside kernels: {sum(k['execution_time'] for k in kernels):.2f} ms in {len(kernels)} launches")
+
+
+def time_gsplat(splats: Splats) -> np.ndarray:
+    """Print the time of gsplat's forward pass; returns its display-encoded image."""
+    import torch
+    from gsplat import rasterization
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.tensor(np.asarray(values, dtype=np.float32), device="cuda")
+
+    data = tensor(splats.means), tensor(splats.quats[:, [3, 0, 1, 2]]), tensor(splats.scales), tensor(splats.opacities)
+    view, intrinsics = tensor(CAMERA.camera_from_world)[None], tensor(CAMERA.intrinsics)[None]
+    degree = splats.sh_degree
+
+    def run() -> torch.Tensor:
+        with torch.no_grad():
+            image, _, _ = rasterization(
+                *data, tensor_sh, view, intrinsics, CAMERA.width, CAMERA.height, sh_degree=degree, packed=False
+            )
+        return image
+
+    tensor_sh = tensor(splats.sh)
+    print(f"gsplat forward: {median_ms(run, torch.cuda.synchronize):.2f} ms")
+    return run()[0].cpu().numpy()
+
+
+def main() -> None:
+    """Parse the command line and print the comparison."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--captures", type=Path, default=CAPTURES)
+    parser.add_argument("--no-volprim", action="store_true")
+    options = parser.parse_args()
+    mi.set_variant("cuda_ad_rgb")
+    splats, name = crowd(options.captures)
+    print(f"{name}, {CAMERA.width}x{CAMERA.height}")
+    time_ours(splats)
+    if not options.no_volprim:
+        scene = volprim_scene(splats, CAMERA)
+        print(f"ellipsoids + volprim_rf_basic: {median_ms(lambda: render_volprim(scene), dr.sync_thread, 3):.0f} ms")
+    try:
+        import gsplat  # noqa: F401
+    except ImportError:
+        print("gsplat is not installed")
+        return
+    theirs = time_gsplat(splats)
+    layers = render_splats(splats, CAMERA)
+    ours = encode_srgb(layers.rgb)
+    error = np.mean((np.clip(theirs, 0, 1) - np.clip(ours, 0, 1)) ** 2)
+    print(f"difference of the two images: {-10 * np.log10(error):.1f} dB (alpha is not composited alike)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""How the time of the splat renderer grows, how far its march is from the machine's peak, and Mitsuba's own path.
+
+    python -m benchmarks.render.splats [--volprim]
+
+Seconds are processor seconds of all threads, which other load on the machine changes little; the fastest of two.
+The peak is that of fused multiply-adds in a loop without memory, which the same compiler made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+# isort: off
+from benchmarks.render.captures import CAMERA, crowd, synthetic  # imports mitsplat, which must come before Dr.Jit
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# isort: on
+from mitsplat.camera import Camera
+from mitsplat.frames.volprim import render_volprim, volprim_scene
+from mitsplat.quality import PRESETS, Quality
+from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.splats import Splats
+
+FMA_PER_EVALUATION = 20
+"""Fused multiply-adds, or operations that cost as much, of one Gaussian on one ray: response, blending, ids."""
+
+
+def fastest(run: Callable[[], object], repeats: int = 2) -> float:
+    """Processor seconds of the fastest of ``repeats`` calls, after one that warms up."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.process_time()
+        run()
+        dr.sync_thread()
+        times.append(time.process_time() - start)
+    return min(times[1:])
+
+
+def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, float, int]:
+    """Seconds of projecting, binning and sorting, seconds of the march, and pairs of a Gaussian and a tile."""
+    from mitsplat.plugins.gaussian import upload_cloud
+    from mitsplat.plugins.march import march
+    from mitsplat.plugins.project import Placement, merge_clouds
+    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.plugins.tiles import bin_gaussians
+
+    clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
+    view = view_of(make_sensor(camera)).sampled(quality.samples)
+    placements = [Placement(0, np.eye(4), 1)]
+    lists = bin_gaussians(clouds, placements, view, quality)
+
+    def run_march() -> None:
+        image = march(lists, view, quality)
+        dr.eval(image.rgb, image.alpha)
+
+    return fastest(lambda: bin_gaussians(clouds, placements, view, quality)), fastest(run_march), lists.pairs
+
+
+def fma_peak() -> float:
+    """Fused multiply-adds per processor second."""
+    lanes, steps, chains = 1 << 16, 4096, 12
+
+    def run() -> None:
+        values = [mi.Float(dr.arange(mi.Float, lanes) * (k + 1)) for k in range(chains)]
+        factor = dr.opaque(mi.Float, 0.999)
+
+        def body(i: Any, values: list[Any]) -> tuple[Any, list[Any]]:
+            return i + 1, [dr.fma(v, factor, factor) for v in values]
+
+        _, values = dr.while_loop((mi.UInt32(0), values), lambda i, values: i < steps, body)
+        dr.eval(values)
+
+    return lanes * steps * chains / fastest(run)
+
+
+def print_growth() -> None:
+    """One line per number of Gaussians, per image size and per overlap."""
+    print(f"{'':44s}{'bin':>8s}{'march':>8s}{'pairs':>8s}")
+
+    def show(label: str, splats: Splats, camera: Camera, quality: Quality) -> None:
+        binning, marching, pairs = stages(splats, camera, quality)
+        print(f"{label:44s}{binning:8.3f}{marching:8.3f}{pairs / 1e6:7.1f}M")
+
+    fast, balanced = PRESETS["fast"], PRESETS["balanced"]
+    for count in (10_000, 100_000, 1_000_000, 5_000_000):
+        splats = synthetic(count)
+        show(f"fast, {count} Gaussians, 1280x720", splats, CAMERA, fast)
+        if count <= 1_000_000:
+            show(f"balanced, {count} Gaussians, 1280x720", splats, CAMERA, balanced)
+    splats = synthetic(200_000)
+    for width, height in ((320, 180), (640, 360), (1280, 720), (2560, 1440)):
+        show(f"fast, 200000 Gaussians, {width}x{height}", splats, CAMERA.resized(width, height), fast)
+    for factor in (0.5, 1.0, 2.0):
+        wider = replace(splats, scales=splats.scales * factor)
+        show(f"fast, 200000 Gaussians, {factor:g} times as wide", wider, CAMERA, fast)
+
+
+def print_peak() -> None:
+    """Evaluations per second of a march that no ray leaves early, against the peak of fused multiply-adds."""
+    from mitsplat.plugins.rays import TILE
+
+    splats = synthetic(200_000)
+    endless = replace(PRESETS["fast"], transmittance_min=0.0)
+    _, seconds, pairs = stages(
+        replace(splats, opacities=splats.opacities * 0.02), CAMERA, replace(endless, alpha_min=1e-5)
+    )
+    rate, peak = pairs * TILE * TILE / seconds, fma_peak()
+    print(
+        f"march: {rate / 1e9:.2f} G evaluations per processor second; at {FMA_PER_EVALUATION} multiply-adds each "
+        f"{rate * FMA_PER_EVALUATION / peak:.0%} of the peak of {peak / 1e9:.0f} G"
+    )
+
+
+def print_volprim() -> None:
+    """Whole images of the captures, beside Mitsuba's ellipsoids + volprim_rf_basic."""
+    splats, name = crowd()
+    scene = volprim_scene(splats, CAMERA)
+    theirs = fastest(lambda: render_volprim(scene), repeats=1)
+    print(f"{name}, {CAMERA.width}x{CAMERA.height}: ellipsoids + volprim_rf_basic {theirs:.1f} s")
+    for preset in PRESETS:
+        ours = fastest(lambda preset=preset: render_splats(splats, CAMERA, quality=preset))  # type: ignore[misc]
+        print(f"  render_splats {preset:10s}{ours:7.2f} s, ratio {theirs / ours:.0f}")
+
+
+def main() -> None:
+    """Parse the command line and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--volprim", action="store_true", help="only the comparison with Mitsuba's own path")
+    options = parser.parse_args()
+    ensure_variant()
+    print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
+    if options.volprim:
+        print_volprim()
+        return
+    print_growth()
+    print_peak()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Images per second against workers and size of the scene, memory over many frames, and what 10^6 images cost.
+
+    python -m benchmarks.scale.growth workers [--scene FILE] [--workers 1 2 3] [--frames 12] [--size 320x180]
+    python -m benchmarks.scale.growth scene [--frames 6] [--size 320x180]
+    python -m benchmarks.scale.growth memory [--frames 2000] [--views 50]
+    python -m benchmarks.scale.growth project --seconds 1.55 --bytes 2.5e5 [--settle 3] [--views 12]
+
+``workers`` also compares the manifests' SHA-256. ``project`` prints a table from figures that the others measured; its
+model is in ``docs/reliability.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.scale.faults import SCENE
+from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.dataset.write import write_dataset
+from mitsplat.engine.ray import Cluster
+from mitsplat.scene.scene import load_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+WORKCELL = ROOT / "scenes/workcell.yaml"
+FSYNCED = 2e-3
+"""Assumed time in which one process appends and fsyncs the two lines of a frame [s]."""
+
+
+def overrides(size: str, **further: object) -> dict[str, object]:
+    width, _, height = size.partition("x")
+    return {"output.width": int(width), "output.height": int(height), **further}
+
+
+def manifest_hash(folder: Path) -> str:
+    return hashlib.sha256((folder / "manifest.jsonl").read_bytes()).hexdigest()
+
+
+class Clock:
+    """Hears of finished frames, and gives the speed after every worker's first."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self.times: list[float] = []
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        """Hear of progress."""
+        if text.startswith("frame "):
+            self.times.append(time.monotonic())
+
+    @property
+    def speed(self) -> float:
+        """Images per second, nan where there are too few."""
+        kept = self.times[2 * self.workers - 1 :]
+        return (len(kept) - 1) / (kept[-1] - kept[0]) if len(kept) > 1 else float("nan")
+
+
+def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> None:
+    """Local workers, Ray and shards: speed, and whether the bytes are the same."""
+    changes = overrides(size, **{"output.formats": ["yolo", "coco"]})
+    scene = load_scene(path, overrides=changes, allow_outside=True)
+    print(f"{len(scene.assets)} assets, {size}, {frames} frames; load before: {os.getloadavg()[0]:.1f}")
+    found = set()
+    with tempfile.TemporaryDirectory() as folder:
+        for count in counts:
+            out, clock = Path(folder) / f"local{count}", Clock(count)
+            write_dataset(scene, out, frames=frames, workers=count, progress=clock)
+            found.add(manifest_hash(out))
+            print(f"{count} local workers: {clock.speed:.2f} images/s; manifest {manifest_hash(out)[:16]}", flush=True)
+        shards = [Path(folder) / f"shard{number}" for number in (1, 2)]
+        for number, shard in enumerate(shards, start=1):
+            write_dataset(scene, shard, frames=frames, shard=Shard(number, 2))
+        merge_shards(shards, Path(folder) / "merged")
+        found.add(manifest_hash(Path(folder) / "merged"))
+        print(f"2 shards merged: manifest {manifest_hash(Path(folder) / 'merged')[:16]}", flush=True)
+        try:
+            import ray  # noqa: F401
+        except ImportError:
+            print("Ray is not installed")
+        else:
+            out, clock = Path(folder) / "ray", Clock(1)
+            write_dataset(scene, out, frames=frames, workers=None, cluster=Cluster(), progress=clock)
+            found.add(manifest_hash(out))
+            print(f"Ray, CPU=2 a worker: {clock.speed:.2f} images/s; manifest {manifest_hash(out)[:16]}")
+    print(f"different manifests: {len(found)}; load after: {os.getloadavg()[0]:.1f}")
+
+
+def measure_scene(frames: int, size: str) -> None:
+    """One process, with more and more objects."""
+    print("objects  Gaussians  images/s (median)")
+    for count in (1, 4, 8, 16):
+        text = SCENE.replace("count: [2, 3]", f"count: [{count}, {count}]").replace(
+            "64, height: 48", size.replace("x", ", height: ")
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "scene.yaml"
+            path.write_text(text)
+            scene, times = load_scene(path, allow_outside=True), Clock(1)
+            write_dataset(scene, Path(folder) / "out", frames=frames, progress=times)
+        gaps = np.diff(times.times)[1:]
+        print(f"{count:7d}  {count * len(scene.assets[0].splats):9d}  {1 / statistics.median(gaps):.2f}", flush=True)
+
+
+def measure_memory(frames: int, views: int) -> None:
+    """Resident memory of one process over many small frames, and its slope by least squares after a quarter of them."""
+    layouts = -(-frames // views)
+    text = SCENE.replace("layouts: 3, views: 5", f"layouts: {layouts}, views: {views}").replace(
+        "yolo, coco, exr", "yolo"
+    )
+    page = os.sysconf("SC_PAGE_SIZE") / 2**20
+    rows: list[tuple[int, float]] = []
+
+    def hear(done: int, total: int, said: str) -> None:
+        if said.startswith("frame ") and done % 10 == 0:
+            rows.append((done, int(Path("/proc/self/statm").read_text().split()[1]) * page))
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.yaml"
+        path.write_text(text)
+        write_dataset(load_scene(path, allow_outside=True), Path(folder) / "out", frames=frames, progress=hear)
+    kept = np.array(rows[len(rows) // 4 :])
+    slope = float(np.polyfit(kept[:, 0], kept[:, 1], 1)[0])
+    print(
+        f"{frames} frames of 64x48, {layouts} layouts: {1024 * slope:.1f} KiB a frame, from frame {kept[0, 0]:.0f} on"
+    )
+    print("MiB at frame:")
+    print(json.dumps([(done, round(size)) for done, size in rows[:: max(1, len(rows) // 20)]]))
+
+
+def project(seconds: float, size: float, settle: float, views: int) -> None:
+    """The cost of 10^6 images by number of workers, and where more of them no longer help."""
+    images = 1e6
+    each = seconds + settle / views
+    limit = 1 / FSYNCED
+    print(f"a frame takes a worker {each:.2f} s ({settle:g} s of settling over {views} views) and {size / 1e6:.2f} MB")
+    print("workers  images/s    days  worker-hours   TB")
+    for workers in (1, 2, 10, 100, 300, 1000, 3000):
+        speed = min(workers / each, limit)
+        mark = " saturated" if speed == limit else ""
+        hours = workers * images / speed / 3600
+        days, stored = images / speed / 86400, images * size / 1e12
+        print(f"{workers:7d}  {speed:8.2f}  {days:6.2f}  {hours:12.0f}  {stored:.2f}{mark}")
+    print(f"one writer saturates at {limit:.0f} images/s, {limit * each:.0f} workers; shards have a writer each")
+
+
+def main() -> None:
+    """Run one measurement."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("workers", "scene", "memory", "project"))
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--scene", type=Path, default=WORKCELL)
+    parser.add_argument("--size", default="320x180")
+    parser.add_argument("--seconds", type=float, default=1.55)
+    parser.add_argument("--bytes", type=float, default=2.5e5)
+    parser.add_argument("--settle", type=float, default=3.0)
+    parser.add_argument("--views", type=int)
+    options = parser.parse_args()
+    if options.what == "workers":
+        measure_workers(options.scene, options.workers, options.frames or 12, options.size)
+    elif options.what == "scene":
+        measure_scene(options.frames or 6, options.size)
+    elif options.what == "memory":
+        measure_memory(options.frames or 2000, options.views or 50)
+    else:
+        project(options.seconds, options.bytes, options.settle, options.views or 12)
+
+
+if __name__ == "__main__":
+    main()

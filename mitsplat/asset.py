@@ -1,0 +1,399 @@
+"""Assets on disk: one object or one environment, as splats with an aligned proxy mesh.
+
+A folder holds ``asset.yaml`` (:class:`AssetSpec` lists its keys) and the files that it names::
+
+    name: hammer
+    class: hammer
+    splats: hammer.splat    # any format of mitsplat.splat_files
+    mesh: hull              # or a mesh file in the same units and axes
+    up: -y                  # axis of the files that points up
+    size: 0.2               # longest extent [m]; or units: metres per file unit
+    mass: 0.5
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from ruamel.yaml import YAML
+from scipy.spatial import QhullError
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.errors import InputError
+from mitsplat.files import file_inside
+from mitsplat.splats import Splats
+from mitsplat.yaml_input import FieldError, key_place, load_yaml
+
+Positive = Annotated[float, Field(gt=0)]
+
+ASSET_FILE = "asset.yaml"
+_Z_UP_FROM = {
+    "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+}
+"""The smallest rotation that takes each axis to +z."""
+
+_SPZ_UNITS = 1e-3
+"""Metres per unit of ``.spz`` assets: the format holds no scale below 4.5e-5 units, a coarse 45 um in metres."""
+
+_MESH_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, RuntimeError),
+    *(MemoryError, EOFError, ImportError, NameError, struct.error),
+)
+"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish,
+NameError where a branch that rubbish does not take sets a variable."""
+
+_OPAQUE = 0.5
+_OFF_BY = 0.05
+"""Share of an asset's size by which its splats, mesh and pieces may differ unnoticed."""
+
+
+class AssetSpec(BaseModel):
+    """Keys of ``asset.yaml``. Files are inside its folder and share units and axes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+    name: str = Field(min_length=1, description="Name of the asset.")
+    class_name: str | None = Field(None, alias="class", min_length=1, description="Class to learn; else the name.")
+    kind: Literal["object", "environment"] = "object"
+    splats: str = Field(description="Splat file.")
+    mesh: str | None = Field(None, description="Mesh file, or 'hull': the convex hull of the opaque splats.")
+    pieces: str | None = Field(None, description="Mesh file whose connected parts are convex pieces of the mesh.")
+    units: Positive | Literal["unknown"] | None = Field(
+        None, description="Metres per unit of the files, 1 if neither this nor size is given; or unknown."
+    )
+    size: Positive | None = Field(None, description="Longest extent [m], instead of units.")
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field("z", description="Axis of the files that points up.")
+    density: Positive | None = Field(None, description="[kg/m^3]; 1000 if neither this nor mass is given.")
+    mass: Positive | None = Field(None, description="[kg], instead of density.")
+    friction: float = Field(0.5, ge=0, description="Coulomb friction coefficient.")
+    roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of the highlight.")
+    specular: float = Field(0.04, ge=0, le=1, description="Specular reflectance at normal incidence.")
+    capture_light: Literal["uniform", "scene"] = "uniform"
+    keypoints: dict[str, tuple[float, float, float]] | None = Field(
+        None, description="Named points in the units and axes of the files, for pose labels."
+    )
+    white: Positive | None = Field(
+        None, description="Irradiance under which a white surface has the colour 1 in the splats [W/m^2]; if known."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> AssetSpec:
+        if isinstance(self.units, float) and self.size is not None:
+            raise FieldError("size", "must not be given together with units")
+        if self.mass is not None and self.density is not None:
+            raise FieldError("mass", "must not be given together with density")
+        if self.kind == "object" and self.mesh is None:
+            raise FieldError("mesh", "an object needs a mesh: a file, or 'hull' for the convex hull of its splats")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """One object or one environment in metres, z up.
+
+    Attributes:
+        name: Name of the asset; several of a scene may have one.
+        class_name: Class that detectors learn.
+        splats: Appearance, in the asset's frame.
+        mesh: Proxy surface in the same frame, or None (an environment may lack one).
+        pieces: Convex pieces of the mesh for physics; empty until made.
+        kind: Whether physics moves it (``object``) or not (``environment``).
+        density: Mass density [kg/m^3]; ignored where ``mass`` is given.
+        mass: Mass [kg] or None.
+        friction: Coulomb friction coefficient.
+        roughness: GGX roughness of the highlight in (0, 1].
+        specular: Specular reflectance at normal incidence in [0, 1]; 0 turns the highlight off.
+        capture_light: Light under which the colours were captured: ``uniform`` (a light tent, a turntable in the
+            shade) is relit by the scene's lights, ``scene`` (already lit as it will be shown) is only shadowed.
+        keypoints: Named points in the asset's frame [m], for pose labels.
+        white: Irradiance [W/m^2] of the scene's lights under which a white surface has the colour 1 in an environment's
+            splats: pi where it was baked. None where the exposure is unknown, as in photographs.
+        units: Whether lengths are metres; if not, the size is arbitrary and a scene must give one.
+        folder: Where it was read from, or None.
+    """
+
+    name: str
+    class_name: str
+    splats: Splats
+    mesh: trimesh.Trimesh | None = None
+    pieces: tuple[trimesh.Trimesh, ...] = ()
+    kind: Literal["object", "environment"] = "object"
+    density: float = 1000.0
+    mass: float | None = None
+    friction: float = 0.5
+    roughness: float = 0.4
+    specular: float = 0.04
+    capture_light: Literal["uniform", "scene"] = "uniform"
+    keypoints: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    white: float | None = None
+    units: Literal["metre", "unknown"] = "metre"
+    folder: Path | None = field(default=None, repr=False)
+
+    @classmethod
+    def load(cls, folder: str | PathLike[str]) -> Asset:
+        """Read an asset folder, converted to metres and z up.
+
+        Raises:
+            InputError: If ``asset.yaml`` or a file that it names is missing or breaks a rule.
+        """
+        folder = Path(folder)
+        spec = read_spec(folder)
+        splats = Splats.load(_named_file(folder, "splats", spec.splats))
+        if spec.mesh is None:
+            mesh = None
+        elif spec.mesh == "hull":
+            mesh = _hull(opaque_core(splats), key_place(folder / ASSET_FILE, ("mesh",)))
+        else:
+            mesh = read_mesh(_named_file(folder, "mesh", spec.mesh))
+        asset = cls(
+            name=spec.name,
+            class_name=spec.class_name or spec.name,
+            splats=splats,
+            mesh=mesh,
+            pieces=() if spec.pieces is None else _read_pieces(_named_file(folder, "pieces", spec.pieces)),
+            kind=spec.kind,
+            density=1000.0 if spec.density is None else spec.density,
+            mass=spec.mass,
+            friction=spec.friction,
+            roughness=spec.roughness,
+            specular=spec.specular,
+            capture_light=spec.capture_light,
+            keypoints=spec.keypoints or {},
+            white=spec.white,
+            units="unknown" if spec.units == "unknown" and spec.size is None else "metre",
+            folder=folder,
+        )
+        metres_from_file = np.eye(4)
+        metres_from_file[:3, :3] = np.multiply(_Z_UP_FROM[spec.up], _metres_per_unit(spec, asset))
+        return asset if np.array_equal(metres_from_file, np.eye(4)) else asset.transformed(metres_from_file)
+
+    def save(self, folder: str | PathLike[str], *, splats: str = "splats.ply") -> None:
+        """Write the asset as a folder: ``asset.yaml``, splats, ``mesh.ply`` and ``pieces.ply`` (shapes only, float32).
+
+        Args:
+            folder: Made if need be; files of these names in it are replaced.
+            splats: Name of the splat file; its suffix is the format (``.ply``, ``.splat`` or ``.spz``).
+
+        Raises:
+            InputError: If a value breaks a rule of :class:`AssetSpec` or the folder cannot be written.
+        """
+        folder = Path(folder)
+        units = _SPZ_UNITS if splats.lower().endswith(".spz") and self.units == "metre" else 1.0
+        stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
+        try:
+            spec = AssetSpec(
+                name=self.name,
+                class_name=self.class_name,
+                kind=self.kind,
+                splats=splats,
+                mesh=None if self.mesh is None else "mesh.ply",
+                pieces="pieces.ply" if self.pieces else None,
+                units=units if self.units == "metre" else "unknown",
+                density=self.density if self.mass is None else None,
+                mass=self.mass,
+                friction=self.friction,
+                roughness=self.roughness,
+                specular=self.specular,
+                capture_light=self.capture_light,
+                keypoints=dict(stored.keypoints) or None,
+                white=self.white,
+            )
+        except ValidationError as error:
+            first = error.errors()[0]
+            rule = ": ".join([*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")])
+            raise InputError(f"asset {self.name!r} cannot be saved: {rule}") from error
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / ASSET_FILE).unlink(missing_ok=True)  # an earlier asset's is not of what is written now
+            stored.splats.save(folder / splats)
+            if stored.mesh is not None:
+                _joined([stored.mesh]).export(folder / "mesh.ply")
+            if stored.pieces:
+                _joined(stored.pieces).export(folder / "pieces.ply")
+            # Last, so that an interrupted save is not mistaken for an asset.
+            YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), folder / ASSET_FILE)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+
+    def transformed(self, matrix: npt.ArrayLike) -> Asset:
+        """The asset's splats, mesh and pieces after a similarity transform (4, 4); mass and density stay.
+
+        Raises:
+            ValueError: If the matrix shears, mirrors or scales unevenly.
+        """
+        matrix = np.asarray(matrix, dtype=np.float64)
+        return replace(
+            self,
+            splats=self.splats.transformed(matrix),
+            mesh=None if self.mesh is None else self.mesh.copy().apply_transform(matrix),
+            pieces=tuple(piece.copy().apply_transform(matrix) for piece in self.pieces),
+            keypoints=dict(
+                zip(
+                    self.keypoints,
+                    map(tuple, (self.keypoint_array @ matrix[:3, :3].T + matrix[:3, 3]).tolist()),
+                    strict=True,
+                )
+            ),
+        )
+
+    @property
+    def keypoint_array(self) -> Float64Array:
+        """The keypoints' positions in their order [m], shape (K, 3)."""
+        return np.array(list(self.keypoints.values()), dtype=np.float64).reshape(-1, 3)
+
+    def scaled(self, factor: float) -> Asset:
+        """The asset made larger about its origin, of the same density: a given mass grows with the volume.
+
+        Raises:
+            ValueError: If ``factor`` is not finite and > 0.
+        """
+        if not 0 < factor < np.inf:
+            raise ValueError(f"scale factor must be finite and > 0 (got {factor})")
+        larger = self.transformed(np.diag([factor, factor, factor, 1.0]))
+        return larger if self.mass is None else replace(larger, mass=self.mass * factor**3)
+
+    def factor_to(self, size: float) -> float:
+        """What to scale by for a longest extent [m] of the mesh, or of the opaque splats where there is none.
+
+        Raises:
+            InputError: If it has no extent.
+        """
+        points = opaque_core(self.splats) if self.mesh is None else self.mesh.vertices
+        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+        if not extent > 0:
+            raise InputError(
+                f"{self.folder}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent (got 0)"
+            )
+        return size / extent
+
+    def resized(self, size: float) -> Asset:
+        """An asset of unknown units in metres, by its longest extent [m]; a given mass stays.
+
+        Raises:
+            InputError: If it is in metres already, or has no extent.
+        """
+        if self.units == "metre":
+            raise InputError(f"asset {self.name!r} is in metres: it takes a scale, not a size")
+        factor = self.factor_to(size)
+        return replace(self.transformed(np.diag([factor, factor, factor, 1.0])), units="metre")
+
+    def check(self) -> tuple[str, ...]:
+        """What is questionable about the asset, a sentence each; nothing of it prevents its use."""
+        if self.mesh is None:
+            return ()
+        findings = []
+        if not self.mesh.is_watertight:
+            findings.append("the mesh is not watertight: mass and inertia come from its convex pieces")
+        size = float(self.mesh.extents.max())
+        bounds = {"pieces": [piece.bounds for piece in self.pieces]}
+        core = opaque_core(self.splats)
+        bounds["splats"] = [np.stack([core.min(axis=0), core.max(axis=0)])] if len(core) else []
+        for what, boxes in bounds.items():
+            if boxes:
+                joint = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+                offset = float(np.abs(joint - self.mesh.bounds).max())
+                if offset > _OFF_BY * size:
+                    findings.append(f"the bounds of {what} and mesh differ by {offset:.3g} m on {size:.3g} m")
+        return tuple(findings)
+
+
+def read_spec(folder: str | PathLike[str]) -> AssetSpec:
+    """What an asset folder's ``asset.yaml`` says.
+
+    Raises:
+        InputError: If it is missing or breaks a rule.
+    """
+    return load_yaml(Path(folder) / ASSET_FILE, AssetSpec)
+
+
+def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
+    """Read any mesh file that trimesh knows; several parts become one mesh.
+
+    Args:
+        path: The file.
+        merge: Whether vertices at the same place become one, without which an STL is never watertight.
+
+    Raises:
+        InputError: If the file is missing or damaged, or has no triangles or a vertex that is not finite.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(path, process=merge)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except _MESH_ERRORS as error:
+        raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: a mesh must have triangles (got none)")
+    if not np.isfinite(mesh.vertices).all():
+        row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
+        raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
+    return mesh
+
+
+def _named_file(folder: Path, key: str, name: str) -> Path:
+    """A file that ``asset.yaml`` names, see :func:`mitsplat.files.file_inside`."""
+    try:
+        return file_inside(folder, name)
+    except InputError as error:
+        raise InputError(f"{key_place(folder / ASSET_FILE, (key,))}: {error}") from error
+
+
+def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:
+    """Scale of an asset that is still in the units of its files."""
+    if spec.size is not None:
+        return asset.factor_to(spec.size)
+    return spec.units if isinstance(spec.units, float) else 1.0
+
+
+def opaque_core(splats: Splats) -> Float32Array:
+    """Centres (M, 3) of opaque Gaussians, less the floaters: those far outside the bulk of 98 % along an axis."""
+    centres = splats.means[splats.opacities > _OPAQUE]
+    if not len(centres):
+        return centres
+    low, high = np.percentile(centres, (1, 99), axis=0)
+    margin = 0.25 * (high - low)
+    inside = ((centres >= low - margin) & (centres <= high + margin)).all(axis=1)
+    core: Float32Array = centres[inside]
+    return core
+
+
+def _hull(points: npt.NDArray[np.floating], place: str) -> trimesh.Trimesh:
+    """Convex hull of points (N, 3); ``place`` begins the error when they span no volume."""
+    try:
+        hull: trimesh.Trimesh = trimesh.convex.convex_hull(points)
+    except (QhullError, ValueError) as error:
+        raise InputError(f"{place}: a hull needs points that span a volume (got {len(points)} points)") from error
+    return hull
+
+
+def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...]:
+    """Convex hulls of the connected parts of a mesh."""
+    parts = read_mesh(path, merge=False).split(only_watertight=False, repair=False)
+    return tuple(_hull(part.vertices, str(path)) for part in parts)
+
+
+def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """The triangles of all meshes, without colours or textures, and without welding one to another."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return trimesh.Trimesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+        process=False,
+    )

@@ -1,0 +1,246 @@
+"""Re-check a dataset from its files alone.
+
+The manifest's masks are the truth that every other file must agree with, and they must agree with the layouts, the
+scene and each other: exclusive, inside their silhouettes, of the stated boxes, areas and shares, above the thresholds.
+Then every file of every format is read back the way its users do, by pycocotools, pycolmap, OpenCV and the logic of the
+BOP toolkit, and compared with what is worked out anew from masks, cameras and poses (:mod:`mitsplat.audit.truth`):
+nothing that wrote the dataset takes part.
+
+The manifest and the files that describe all frames are read in step, a frame at a time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import Float64Array
+from mitsplat.audit.bop import BopReader
+from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
+from mitsplat.audit.layers import LayersReader, SightReader
+from mitsplat.audit.listed import ColmapReader, LayoutReader, VocReader, YoloReader
+from mitsplat.audit.owned import Owned, check_listed
+from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
+from mitsplat.audit.scene import SceneReader
+from mitsplat.audit.truth import TrueFrame
+from mitsplat.dataset.schema import Records, read_content
+from mitsplat.files import SPLITS, Record
+
+_SHARE = 1e-5
+"""Difference of shares that are stored with six decimals."""
+
+
+__all__ = ["POLYGON_AREA", "POLYGON_IOU", "Audit", "audit_dataset"]
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What an audit found.
+
+    Attributes:
+        frames, instances, files: How many were checked.
+        violations: File and sentence of each.
+        low_polygons: Masks of more than :data:`POLYGON_AREA` pixels whose polygon is below :data:`POLYGON_IOU` because
+            bridges join their parts.
+        marked: Instances below a threshold, by mark.
+        dropped: What was not labelled, by reason.
+    """
+
+    frames: int
+    instances: int
+    files: int
+    violations: tuple[tuple[str, str], ...]
+    low_polygons: int
+    marked: dict[str, int]
+    dropped: dict[str, int]
+
+
+def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda record: None) -> Audit:
+    """Check every file of a dataset.
+
+    Args:
+        root: The dataset.
+        hear: Is told every record that can be read, by ascending index.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat.
+    """
+    root = Path(root)
+    content = read_content(root)
+    records = Records(root, content)
+    readers, whole, owned = _readers(root, content), _Whole(), Owned(content)
+    violations: list[tuple[str, str]] = []
+    marked, dropped = Counter[str](), Counter[str]()
+    frames = instances = low = files = 0
+    for record in records:
+        hear(record)
+        frame, found = TrueFrame.of(root, record, content), list(_check_files(root, record))
+        damaged = {name for name, _ in found}
+        violations += found
+        violations += check_listed(record, content)
+        violations += ((f"manifest.jsonl, frame {frame.index}", text) for text in _check_labels(frame))
+        for file in record["files"]:
+            check = next((check for prefix, check in CHECKS.items() if file.startswith(prefix)), None)
+            if check is not None and file not in damaged:
+                violations += ((file, text) for text in check(frame, root / file))
+        violations += check_bop(frame, damaged)
+        repeated = whole.add(record)
+        violations += repeated
+        if not repeated:
+            for reader in readers:
+                violations += reader.check(frame)
+        owned.add(record)
+        frames, instances, files = frames + 1, instances + len(frame.instances), files + len(record["files"])
+        low += sum(i.area > POLYGON_AREA and i.entry["polygon_iou"] < POLYGON_IOU for i in frame.instances)
+        marked.update(mark for instance in frame.instances for mark in instance.entry["marks"])
+        dropped.update(record["labels"]["dropped"])
+    violations += records.violations
+    for reader in readers:
+        violations += reader.finish()
+    violations += whole.check(records)
+    violations += owned.orphans(root)
+    violations += _check_rest(root)
+    return Audit(frames, instances, files, tuple(violations), low, dict(marked), dict(dropped))
+
+
+def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
+    """What reads the files that describe all frames, and what compares frames with each other and the scene."""
+    make: dict[str, Callable[[], list[Reader]]] = {
+        "coco": lambda: [InstancesReader(root, content, "instances", split) for split in SPLITS],
+        "amodal": lambda: [InstancesReader(root, content, "amodal", split) for split in SPLITS],
+        "panoptic": lambda: [PanopticReader(root, content, split) for split in SPLITS],
+        "poses": lambda: [PosesReader(root, content, split) for split in SPLITS],
+        "voc": lambda: [VocReader(root, content)],
+        "bop": lambda: [BopReader(root, content)],
+        "colmap": lambda: [ColmapReader(root)],
+    }
+    readers: list[Reader] = [SceneReader(content), LayoutReader(root), LayersReader(content), SightReader()]
+    readers.append(YoloReader(root, content))
+    for name in make:
+        if name in content["scene"]["output"]["formats"]:
+            readers += make[name]()
+    return readers
+
+
+def _check_files(root: Path, record: Record) -> Violations:
+    for file, digest in record["files"].items():
+        if not (root / file).is_file():
+            yield file, "is missing"
+            continue
+        with (root / file).open("rb") as stored:
+            if hashlib.file_digest(stored, "sha256").hexdigest() != digest:
+                yield file, "is not what was written: its SHA-256 differs from the manifest's"
+
+
+def _check_rest(root: Path) -> Violations:
+    """What belongs to no format."""
+    sheet = root / "contact_sheet.jpg"
+    if not sheet.is_file() or cv2.imread(str(sheet)) is None:
+        yield sheet.name, "is missing or cannot be read as an image"
+    if not any((root / "scene").glob("*")):
+        yield "scene", "does not hold the scene file"
+
+
+def _check_labels(frame: TrueFrame) -> Iterator[str]:
+    """Whether the labels can be right at all."""
+    classes, rules = frame.content["classes"], frame.content["scene"]["labels"]
+    for number, count in Counter(label.id for label in frame.instances).items():
+        if count > 1:
+            yield f"instance {number} is labelled {count} times"
+    times = np.zeros(frame.size[::-1], dtype=np.uint16)
+    for label in frame.instances:
+        entry, name = label.entry, label.name
+        mask, amodal = frame.whole(label), frame.whole(label, amodal=True)
+        times += mask
+        if classes[label.kind] != entry["class"]:
+            yield f"{name}: class {label.kind} is not {entry['class']!r}"
+        for key, box, area, stated in (
+            ("box", label.box, label.area, entry["area"]),
+            ("amodal_box", label.amodal_box, label.amodal_area, entry["amodal_area"]),
+        ):
+            if list(box) != entry[key] or area != stated:
+                yield f"{name}: {key} {entry[key]} and area {stated} are not those of its mask"
+        if (mask & ~amodal).any():
+            yield f"{name}: its mask has pixels outside its silhouette"
+        if label.amodal_area > label.silhouette_area:
+            yield f"{name}: its silhouette is smaller in all than in the image"
+        x0, y0, x1, y1 = entry["silhouette_box"]
+        left, top, right, bottom = label.amodal_box
+        if not (x0 <= left and y0 <= top and x1 >= right and y1 >= bottom) or (
+            label.amodal_area == label.silhouette_area and (x0, y0, x1, y1) != label.amodal_box
+        ):
+            yield f"{name}: silhouette_box {entry['silhouette_box']} is not that of its silhouette"
+        fraction = label.area / label.amodal_area
+        if abs(fraction - entry["visible_fraction"]) > _SHARE:
+            yield f"{name}: its visible fraction is {fraction:.6f}, not {entry['visible_fraction']}"
+        truncation = 1 - label.amodal_area / label.silhouette_area
+        if abs(truncation - entry["truncation"]) > _SHARE:
+            yield f"{name}: its truncation is {truncation:.6f}, not {entry['truncation']}"
+        below = {"occluded": fraction < rules["min_visible"] - _SHARE}
+        below["disagreeing"] = entry["agreement"] < rules["min_agreement"] - _SHARE
+        if set(entry["marks"]) != {mark for mark, is_below in below.items() if is_below}:
+            yield f"{name}: its marks {entry['marks']} are not those that the thresholds give"
+        if label.area < rules["min_pixels"]:
+            yield f"{name}: has {label.area} pixels, fewer than {rules['min_pixels']}"
+        if not _is_rigid(label.pose):
+            yield f"{name}: its pose is not a rotation and a translation"
+    if (times > 1).any():
+        yield f"{np.count_nonzero(times > 1)} pixels belong to more than one instance"
+
+
+class _Whole:
+    """What no single frame shows: repeated frames and pictures, views of a layout in two splits; 16 bytes a frame."""
+
+    def __init__(self) -> None:
+        self._last = -1
+        self._splits, self._pictures = array("Q"), array("Q")
+
+    def add(self, record: Record) -> list[tuple[str, str]]:
+        """Remember a frame; what is wrong if it has a line already."""
+        self._splits.append(2 * record["layout"] + SPLITS.index(record["split"]))
+        self._pictures.append(_picture(record) or 0)
+        repeated = record["index"] == self._last
+        self._last = record["index"]
+        return [("manifest.jsonl", f"frame {record['index']} has several lines")] if repeated else []
+
+    def check(self, records: Records) -> Violations:
+        """What follows from all frames."""
+        layouts = np.unique(np.array(self._splits, dtype=np.uint64)) // 2
+        for layout in layouts[1:][layouts[1:] == layouts[:-1]]:
+            yield "manifest.jsonl", f"views of layout {layout} are in both {' and '.join(SPLITS)}"
+        pictures, counts = np.unique(np.array(self._pictures, dtype=np.uint64), return_counts=True)
+        same = {int(picture) for picture in pictures[counts > 1]} - {0}
+        first: dict[int, str] = {}
+        for record in records if same else ():
+            if (picture := _picture(record)) in same:
+                file = next(file for file in record["files"] if file.startswith("images/"))
+                if (other := first.setdefault(picture, file)) != file:
+                    yield file, f"is the same picture as {other}"
+
+
+def _picture(record: Record) -> int:
+    """The first 64 bits of the picture's SHA-256, 0 if it is none."""
+    digest = next(digest for file, digest in record["files"].items() if file.startswith("images/"))
+    try:
+        return int(digest[:16], 16)
+    except ValueError:
+        return 0
+
+
+def _is_rigid(pose: Float64Array) -> bool:
+    rotation = pose[:3, :3]
+    return bool(
+        pose.shape == (4, 4)
+        and np.isfinite(pose).all()
+        and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5
+        and np.linalg.det(rotation) > 0
+        and (pose[3] == (0, 0, 0, 1)).all()
+    )

@@ -1,0 +1,225 @@
+"""Text files that describe all frames, read back: VOC's lists, Ultralytics' ``data.yaml``, COLMAP's model, layouts."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from mitsplat.audit.described import Cursor, is_close
+from mitsplat.audit.owned import YOLO_FOLDERS
+from mitsplat.audit.read_back import Violations
+from mitsplat.audit.truth import TrueFrame
+from mitsplat.files import SPLITS
+
+_POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
+"""Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""
+_PIXEL = 1e-6
+"""Difference that OpenCV's and COLMAP's arithmetic makes [px]."""
+
+
+class VocReader:
+    """Which images belong to which split, and ``labelmap.txt``."""
+
+    def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
+        self._root, self._content = root, content
+        self._sets = {
+            split: Cursor(file := f"voc/ImageSets/Main/{split}.txt", _numbers_of(root / file)) for split in SPLITS
+        }
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """Whether the frame is in its split."""
+        cursor = self._sets[frame.split]
+        if cursor.broken:
+            return
+        found = list(cursor.take(frame.index))
+        yield from cursor.errors()
+        if not cursor.broken and len(found) != 1:
+            yield cursor.file, f"names image {frame.index:06d} {len(found)} times"
+
+    def finish(self) -> Violations:
+        """What is left, and the classes."""
+        for cursor in self._sets.values():
+            if not cursor.broken:
+                yield from cursor.finish()
+        file = "voc/labelmap.txt"
+        expected = [f"{name}:::" for name in ("background", *self._content["classes"])]
+        try:
+            lines = (self._root / file).read_text().splitlines()
+        except FileNotFoundError:
+            yield file, "is missing"
+        except (OSError, ValueError) as error:
+            yield file, f"cannot be read ({error})"
+        else:
+            if [line for line in lines if not line.startswith("#")] != expected:
+                yield file, "does not name the dataset's classes"
+
+
+def _numbers_of(path: Path) -> Iterator[tuple[int, str]]:
+    with path.open() as file:
+        for line in file:
+            yield int(line), line
+
+
+class YoloReader:
+    """``data.yaml`` of every task, as Ultralytics reads it."""
+
+    def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
+        self._root, self._content = root, content
+        self._splits: set[str] = set()
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """Remember the split."""
+        self._splits.add(frame.split)
+        yield from ()
+
+    def finish(self) -> Violations:
+        """Whether classes, folders and keypoints are the dataset's."""
+        for task, folder in YOLO_FOLDERS.items():
+            if task in self._content["scene"]["output"]["formats"]:
+                file = f"{folder}data.yaml"
+                for text in self._check(self._root / file, with_points=task == "yolo-pose"):
+                    yield file, text
+
+    def _check(self, path: Path, *, with_points: bool) -> Iterator[str]:
+        try:
+            data = YAML(typ="safe", pure=True).load(path.read_text())
+        except FileNotFoundError:
+            yield "is missing"
+            return
+        except (OSError, ValueError, YAMLError) as error:
+            yield f"cannot be read ({' '.join(str(error).split())})"
+            return
+        if not isinstance(data, dict):
+            yield "must be a mapping"
+            return
+        if data.get("names") != dict(enumerate(self._content["classes"])):
+            yield f"names are {str(data.get('names'))[:80]}, not {dict(enumerate(self._content['classes']))}"
+        for split in SPLITS:
+            shown = split if split in self._splits else next(iter(sorted(self._splits)), split)
+            if data.get(split) != f"images/{shown}":
+                yield f"{split} is {data.get(split)}, not images/{shown}"
+        if "path" in data:
+            yield "has a path, which ties it to where it was made"
+        if with_points:
+            names = self._content["keypoints"]
+            count = max(map(len, names), default=0)
+            padded = {i: [*own, *(f"unused_{k}" for k in range(len(own), count))] for i, own in enumerate(names)}
+            if data.get("kpt_shape") != [count, 3] or data.get("kpt_names") != padded:
+                yield f"its keypoints are not {padded}"
+
+
+class ColmapReader:
+    """``colmap/``, read by pycolmap in a process of its own, which it can end."""
+
+    def __init__(self, root: Path) -> None:
+        self._model = root / "colmap"
+        names = ("cameras", "images", "points3D")
+        self._missing = [name for name in names if not (self._model / f"{name}.txt").is_file()]
+        self._images = Cursor("colmap/images.txt", iter(()) if self._missing else self._read())
+
+    def _read(self) -> Iterator[tuple[int, Any]]:
+        command = [
+            sys.executable,
+            "-m",
+            "mitsplat.audit.colmap_worker",
+            str(self._model.resolve()),
+            json.dumps(_POINTS.tolist()),
+        ]
+        with tempfile.TemporaryFile("w+") as said:
+            child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True)
+            try:
+                for line in child.stdout or ():
+                    image = json.loads(line)
+                    yield image["id"] - 1, image
+                if child.wait():
+                    said.seek(0)
+                    lines = said.read().strip().splitlines() or [f"its process ended with status {child.returncode}"]
+                    raise ValueError(lines[-1])
+            finally:
+                if child.poll() is None:
+                    child.kill()
+                    child.wait()
+                if child.stdout is not None:
+                    child.stdout.close()
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """Compare the image's pose, and where its camera sees some points, with the manifest's."""
+        if self._images.broken or self._missing:
+            return
+        found = list(self._images.take(frame.index))
+        yield from self._images.errors()
+        if self._images.broken:
+            return
+        if len(found) != 1:
+            yield self._images.file, f"has {len(found)} images of frame {frame.index}"
+            return
+        for text in self._check(frame, found[0]):
+            yield self._images.file, f"frame {frame.index}: {text}"
+
+    def _check(self, frame: TrueFrame, image: Mapping[str, Any]) -> Iterator[str]:
+        if image["name"] != f"{frame.split}/{frame.image_name}":
+            yield f"its name is {image['name']}, not {frame.split}/{frame.image_name}"
+        if not is_close(image["camera_from_world"], frame.camera_from_world[:3], 1e-8):
+            yield "its pose is not that of the manifest's camera"
+        if image["size"] != list(frame.size) or not is_close(image["pixels"], frame.project(_POINTS), _PIXEL):
+            yield "its camera is not that of the manifest"
+
+    def finish(self) -> Violations:
+        """What is left."""
+        for name in self._missing:
+            yield f"colmap/{name}.txt", "is missing"
+        if not self._missing and not self._images.broken:
+            yield from self._images.finish()
+
+
+class LayoutReader:
+    """``layouts/``: where the objects came to rest, which the labels' poses must be."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._index, self._found = -1, dict[int, Any]()
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """Whether the labelled instances lie in the layout as the manifest says, and none of it is unaccounted for."""
+        index = frame.record["layout"]
+        file = f"layouts/{index:04d}.json"
+        if index != self._index:
+            self._index, self._found = index, {}
+            try:
+                stored = json.loads((self._root / file).read_bytes())
+                self._found = {entry["id"]: entry for entry in stored["instances"]}
+                if stored["index"] != index:
+                    yield file, f"is of layout {stored['index']}"
+            except FileNotFoundError:
+                yield file, "is missing"
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                yield file, f"cannot be read ({type(error).__name__}: {error})"
+        if not self._found:
+            return
+        where = f"manifest.jsonl, frame {frame.index}"
+        for label in frame.instances:
+            entry = self._found.get(label.id)
+            if entry is None:
+                yield where, f"{label.name} is not in {file}"
+            elif (entry.get("asset"), entry.get("class_index")) != (label.entry["asset"], label.kind):
+                yield where, f"{label.name} is of another asset or class than in {file}"
+            elif not is_close(entry.get("world_from_object"), label.pose, 1e-12):
+                yield where, f"{label.name} has another pose than in {file}"
+        dropped = Counter(frame.record["labels"]["dropped"])
+        del dropped["fragments"]
+        if len(frame.instances) + dropped.total() != len(self._found):
+            yield where, f"{len(frame.instances)} labels and {dropped.total()} instances without are not all of {file}"
+
+    def finish(self) -> Violations:
+        """Files of layouts that no frame shows belong to no frame."""
+        yield from ()

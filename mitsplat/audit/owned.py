@@ -1,0 +1,129 @@
+"""Which files a dataset must have, derived from its formats anew, and files that nothing accounts for."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from array import array
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsplat.audit.read_back import Violations
+from mitsplat.files import SPLITS, Record
+
+YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
+"""Where Ultralytics' tasks have their folders: labels lie beside the images that they are of."""
+_YOLO = {name: folder for name, folder in YOLO_FOLDERS.items() if folder}
+_ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic", "poses": "poses"}
+_FOLDERS = (
+    *("images", "labels", "layers", "annotations", "layouts", *_YOLO),
+    *("panoptic", "voc", "bop", "colmap", "depth", "normals", "instances", "semantic", "flow"),
+)
+"""Folders that hold nothing else than a dataset's files."""
+
+
+def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]:
+    """The files that a frame must have, each with the format that it is of."""
+    output = content["scene"]["output"]
+    formats, number, split = output["formats"], f"{record['index']:06d}", record["split"]
+    image, png = f"{number}.{output['image']}", f"{number}.png"
+    files = {f"images/{split}/{image}": "image"}
+    if "yolo" in formats:
+        files[f"labels/{split}/{number}.txt"] = "yolo"
+    for name, folder in _YOLO.items():
+        if name in formats:
+            files |= {f"{folder}images/{split}/{image}": name, f"{folder}labels/{split}/{number}.txt": name}
+    if "voc" in formats:
+        files |= {f"voc/JPEGImages/{image}": "voc", f"voc/Annotations/{number}.xml": "voc"}
+    for name in ("depth", "normals", "instances", "semantic", "panoptic"):
+        if name in formats:
+            files[f"{name}/{split}/{png}"] = name
+    if "flow" in formats and record["view"] + 1 < output["views"]:
+        files[f"flow/{split}/{number}.flo"] = "flow"
+    if "exr" in formats:
+        files[f"layers/{split}/{number}.exr"] = "exr"
+    if "bop" in formats:
+        scene = f"bop/{split}/{record['layout']:06d}"
+        files |= {f"{scene}/rgb/{image}": "bop", f"{scene}/depth/{png}": "bop"}
+        for position in range(len(record["labels"]["instances"])):
+            name = f"{number}_{position:06d}.png"
+            files |= {f"{scene}/mask/{name}": "bop", f"{scene}/mask_visib/{name}": "bop"}
+    return files
+
+
+def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
+    """Whether the manifest lists the files that the frame must have, and no others."""
+    where, wanted = f"manifest.jsonl, frame {record['index']}", files_of_frame(record, content)
+    for file, name in wanted.items():
+        if file not in record["files"]:
+            yield where, f"lists no file of the format {name} by the name {file}"
+    for file in record["files"]:
+        if file not in wanted:
+            yield where, f"lists {file}, which is of no format of the dataset"
+
+
+class Owned:
+    """Names of all files that something accounts for, 8 bytes each."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self._formats = content["scene"]["output"]["formats"]
+        self._assets = len(content["assets"])
+        self._names = array("Q")
+        self._last = ("", -1)
+        for file in self._of_all():
+            self._add(file)
+
+    def _of_all(self) -> Iterator[str]:
+        """Files that describe all frames."""
+        for name, described in _ANNOTATIONS.items():
+            if name in self._formats:
+                yield from (f"annotations/{described}_{split}.json" for split in SPLITS)
+        yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in self._formats)
+        if "voc" in self._formats:
+            yield from ("voc/labelmap.txt", *(f"voc/ImageSets/Main/{split}.txt" for split in SPLITS))
+        if "bop" in self._formats:
+            yield "bop/models/models_info.json"
+            yield from (f"bop/models/obj_{number:06d}.ply" for number in range(1, self._assets + 1))
+        if "colmap" in self._formats:
+            yield from (f"colmap/{name}.txt" for name in ("cameras", "images", "points3D"))
+
+    def add(self, record: Record) -> None:
+        """Account for the files of a frame, and those of its layout."""
+        for file in record["files"]:
+            self._add(file)
+        scene = record["split"], record["layout"]
+        if scene != self._last:
+            self._last = scene
+            self._add(f"layouts/{record['layout']:04d}.json")
+            if "bop" in self._formats:
+                folder = f"bop/{record['split']}/{record['layout']:06d}"
+                for part in ("camera", "gt", "gt_info"):
+                    self._add(f"{folder}/scene_{part}.json")
+
+    def _add(self, file: str) -> None:
+        self._names.append(_hash(file))
+
+    def orphans(self, root: Path) -> Violations:
+        """Files in the dataset's folders that nothing accounts for."""
+        known = np.sort(np.array(self._names, dtype=np.uint64))
+        for top in sorted(_FOLDERS):
+            for folder, folders, names in os.walk(root / top):
+                folders.sort()
+                # Ultralytics leaves a cache of what it read beside the labels.
+                files = [
+                    (Path(folder) / name).relative_to(root).as_posix()
+                    for name in sorted(names)
+                    if name != ".lock" and not name.endswith(".cache")
+                ]
+                hashes = np.array([_hash(file) for file in files], dtype=np.uint64)
+                found = np.searchsorted(known, hashes, side="right") > np.searchsorted(known, hashes)
+                for file, is_known in zip(files, found, strict=True):
+                    if not is_known:
+                        yield file, "belongs to no frame of the manifest"
+
+
+def _hash(file: str) -> int:
+    return int.from_bytes(hashlib.blake2b(file.encode("utf-8", "surrogateescape"), digest_size=8).digest(), "little")

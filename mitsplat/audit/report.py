@@ -1,0 +1,271 @@
+"""One page to look at a dataset by: a single HTML file that needs no network, no server and no other file."""
+
+from __future__ import annotations
+
+import html
+import json
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
+from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns, histogram
+from mitsplat.dataset.schema import Records, read_content
+from mitsplat.files import Record, write_text
+from mitsplat.formats.coco import image_file
+from mitsplat.html import inline_image, make_page
+from mitsplat.labels.labels import Labels
+from mitsplat.labels.overlay import class_colour
+from mitsplat.masks import Silhouette
+
+SAMPLES = 12
+"""Images that are shown, evenly spread over the dataset."""
+BRIGHTNESS_IMAGES = 200
+"""Images, evenly spread, that the brightness is read from."""
+
+_THUMBNAIL = 640
+_OVERLAYS = {"mask": "Masks", "box": "Boxes", "name": "Names", "alone": "Silhouettes, hidden parts included"}
+_SHOWN_FIRST = ("mask", "name")
+
+
+_SHARES = ("visible_fraction", "truncation", "agreement", "boundary_f1")
+
+
+class _Statistics:
+    """What is counted while the manifest is read once, for images of a size [px]."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.images, self.classes, self.per_image = Counter[str](), Counter[str](), Counter[int]()
+        self.shares = {key: Histogram((0, 1)) for key in _SHARES}
+        cells = 24, max(2, round(24 * size[1] / size[0]))
+        self.places, self.sizes = HeatMap(size, cells), HeatMap(size, cells)
+
+    def add(self, record: Record) -> None:
+        labels = record["labels"]
+        self.images[record["split"]] += 1
+        self.per_image[len(labels["instances"])] += 1
+        self.classes.update(label["class"] for label in labels["instances"])
+        boxes = np.array([label["box"] for label in labels["instances"]], dtype=np.float64).reshape(-1, 4)
+        self.places.add((boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2)
+        self.sizes.add(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
+        for key, counted in self.shares.items():
+            counted.add([label[key] for label in labels["instances"]])
+
+
+def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit]:
+    """Write the page of a dataset, ``report.html`` in it by default.
+
+    Returns:
+        Its path, and the audit that it shows.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat.
+        OSError: If the page cannot be written.
+    """
+    root = Path(root)
+    out = root / "report.html" if out is None else Path(out)
+    content = read_content(root)
+    records = Records(root, content)
+    output = content["scene"]["output"]
+    counted = _Statistics((output["width"], output["height"]))
+    audit = audit_dataset(root, counted.add)
+    name = str(content["scene"]["name"])
+    parts = [
+        f"<h1>{html.escape(name)}</h1>",
+        _summary(content, counted, audit, root),
+        _audit(audit),
+        _samples(root, records.some(SAMPLES)),
+        _charts(counted, _brightness(root, records.some(BRIGHTNESS_IMAGES)), _seconds(root)),
+        _details(content),
+    ]
+    write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
+    return out, audit
+
+
+def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: Path) -> str:
+    runs = _lines(root / "runs.jsonl")
+    rows = {
+        "Images": ", ".join(f"{count} {split}" for split, count in sorted(counted.images.items())),
+        "Size": f"{counted.size[0]} x {counted.size[1]} px",
+        "Instances": str(sum(counted.classes.values())),
+        "Not labelled": _counts(audit.dropped),
+        "Marked": _counts(audit.marked),
+        "Labels from": content["scene"]["labels"]["source"],
+        "Formats": ", ".join(content["scene"]["output"]["formats"]),
+        "Seed": str(content["scene"]["seed"]),
+        "Command": " ; ".join(run["command"] for run in runs) or "unknown",
+        "mitsplat": content["mitsplat"],
+    }
+    lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
+    return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2><table>{lines}</table></section>'
+
+
+def _audit(audit: Audit) -> str:
+    verdict = "No violations" if not audit.violations else f"{len(audit.violations)} violations"
+    found = "".join(
+        f"<li><code>{html.escape(file)}</code>: {html.escape(text)}</li>" for file, text in audit.violations[:100]
+    )
+    more = f"<p>and {len(audit.violations) - 100} more</p>" if len(audit.violations) > 100 else ""
+    return (
+        f'<section aria-labelledby="audit"><h2 id="audit">Audit</h2>'
+        f'<p class="{"good" if not audit.violations else "bad"}">{verdict} in {audit.files} files, '
+        f"{audit.instances} instances.</p>"
+        f"<p>Masks of more than {POLYGON_AREA} px in several parts whose YOLO polygon has an IoU below {POLYGON_IOU}, "
+        f"because bridges join the parts: {audit.low_polygons}.</p>"
+        f"{f'<ul>{found}</ul>' if found else ''}{more}</section>"
+    )
+
+
+def _samples(root: Path, records: Iterable[Record]) -> str:
+    boxes = "".join(
+        f'<label><input type="checkbox" data-overlay="{key}"{" checked" if key in _SHOWN_FIRST else ""}> {text}</label>'
+        for key, text in _OVERLAYS.items()
+    )
+    figures = "".join(_sample(root, record) for record in records)
+    return (
+        f'<section aria-labelledby="samples"><h2 id="samples">Samples</h2>'
+        f"<fieldset><legend>Show</legend>{boxes}</fieldset>"
+        f'<div class="samples {" ".join(f"show-{key}" for key in _SHOWN_FIRST)}" id="sheet">{figures}</div></section>'
+    )
+
+
+def _sample(root: Path, record: Record) -> str:
+    image = cv2.imread(str(root / image_file(record)))
+    if image is None:
+        return f"<figure><figcaption>Frame {record['index']}: its image cannot be read</figcaption></figure>"
+    labels = Labels.from_json(record["labels"])
+    height, width = image.shape[:2]
+    scale = min(1.0, _THUMBNAIL / width)
+    small = cv2.resize(
+        image, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
+    )
+    source = inline_image(small)
+    unit = width / 640
+    marks, names = [], []
+    for label in labels.instances:
+        colour = "rgb({},{},{})".format(*class_colour(label.class_index))
+        x0, y0, x1, y1 = label.box
+        title = (
+            f"{label.class_name} {label.id}: {label.visible_fraction:.0%} visible, {label.truncation:.0%} cut off"
+            f"{''.join(f', {mark}' for mark in label.marks)}"
+        )
+        marks.append(
+            f"<g><title>{html.escape(title)}</title>"
+            f'<path class="alone" d="{_path(label.amodal)}" stroke="{colour}"/>'
+            f'<path class="mask" d="{_path(Silhouette(label.box, label.mask))}" fill="{colour}" stroke="{colour}"/>'
+            f'<rect class="box" x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}" stroke="{colour}"/></g>'
+        )
+        names.append(
+            f'<text class="name" x="{x0}" y="{max(y0 - 3 * unit, 11 * unit):.0f}" font-size="{12 * unit:.1f}">'
+            f"{html.escape(label.class_name)}</text>"
+        )
+    classes = _counts(Counter(label.class_name for label in labels.instances))
+    caption = f"Frame {record['index']}, {record['split']}: {classes}"
+    text = html.escape(caption, quote=True)
+    return (
+        f'<figure><div class="picture"><img alt="{text}" src="{source}">'
+        f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks + names)}</svg></div>'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
+
+
+def _path(shape: Silhouette) -> str:
+    """Outlines of a mask along its pixels' centres as an SVG path, holes cut out by the even-odd rule."""
+    x, y = shape.box[:2]
+    rings, _ = cv2.findContours(shape.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
+    return "".join(
+        "M" + "L".join(f"{px + x + 0.5:g} {py + y + 0.5:g}" for px, py in ring.reshape(-1, 2)) + "Z" for ring in rings
+    )
+
+
+def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, list[float]]:
+    """Counts of pixels by luma in 32 bins, and each image's mean luma."""
+    counts, means = np.zeros(32, dtype=np.int64), []
+    for record in records:
+        grey = cv2.imread(str(root / image_file(record)), cv2.IMREAD_GRAYSCALE)
+        if grey is not None:
+            counts += np.histogram(grey, bins=32, range=(0, 256))[0]
+            means.append(float(grey.mean()))
+    return counts, means
+
+
+def _seconds(root: Path) -> dict[str, float]:
+    """Median seconds of every stage over the frames."""
+    stages: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
+    for line in _lines(root / "timings.jsonl"):
+        for stage, seconds in line.items():
+            if stage != "index":
+                stages[stage].append(seconds)
+    return {stage: round(float(np.median(values)), 4) for stage, values in stages.items()}
+
+
+def _charts(counted: _Statistics, brightness: tuple[np.ndarray, list[float]], seconds: dict[str, float]) -> str:
+    share = counted.shares
+    most = max([1, *counted.per_image])
+    charts = [
+        bars("Instances by class", dict(sorted(counted.classes.items()))),
+        columns(
+            "Instances per image",
+            [counted.per_image[number] for number in range(most + 1)],
+            [str(number) for number in range(most + 1)],
+            "instances",
+        ),
+        counted.places.draw("Where boxes lie", "middle of the box [px]"),
+        counted.sizes.draw("How large boxes are", "width to the right, height down [px]"),
+        share["visible_fraction"].draw("Visible fraction of instances", "visible fraction"),
+        share["truncation"].draw("Truncation of instances", "share beyond the border"),
+        share["agreement"].draw("Agreement of splats and proxies", "IoU"),
+        share["boundary_f1"].draw("Agreement of their boundaries", "boundary F1"),
+        columns(
+            "Brightness of pixels",
+            brightness[0],
+            [f"{8 * i} to {8 * i + 7}" for i in range(len(brightness[0]))],
+            "luma",
+        ),
+        histogram("Brightness of images", brightness[1], bounds=(0, 255), axis="mean luma"),
+        bars("Seconds per frame by stage, median", seconds, unit=" s"),
+    ]
+    return (
+        f'<section aria-labelledby="charts"><h2 id="charts">Statistics</h2>'
+        f'<div class="charts">{"".join(charts)}</div></section>'
+    )
+
+
+def _details(content: dict[str, Any]) -> str:
+    libraries = "".join(
+        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(version)}</td></tr>'
+        for name, version in content["libraries"].items()
+    )
+    scene = html.escape(json.dumps(content["scene"], indent=1))
+    return (
+        f'<section aria-labelledby="origin"><h2 id="origin">Origin</h2>'
+        f"<details><summary>Libraries</summary><table>{libraries}</table></details>"
+        f'<details><summary>Scene in effect</summary><pre tabindex="0">{scene}</pre></details></section>'
+    )
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        yield from map(json.loads, file)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()) if count) or "none"
+
+
+_SCRIPT = """
+"use strict";
+const sheet = document.getElementById("sheet");
+for (const box of document.querySelectorAll("input[data-overlay]")) {
+  const show = () => sheet.classList.toggle("show-" + box.dataset.overlay, box.checked);
+  box.addEventListener("change", show);
+  show();
+}
+"""

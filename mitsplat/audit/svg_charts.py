@@ -1,0 +1,187 @@
+"""Charts as inline SVG for a page without network or framework: each with a caption and its numbers as a table."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import Float64Array
+
+_WIDTH, _HEIGHT = 420, 190
+_LEFT, _BOTTOM, _TOP = 46, 34, 10
+
+
+def bars(caption: str, values: Mapping[str, float], *, unit: str = "") -> str:
+    """Horizontal bars with a name and a value each."""
+    if not values:
+        return _figure(caption, "<p>nothing</p>", [])
+    most = max(values.values()) or 1.0
+    row = 22
+    name_width = 150
+    marks = []
+    for i, (name, value) in enumerate(values.items()):
+        length = (_WIDTH - name_width - 70) * value / most
+        y = i * row
+        marks.append(
+            f'<text x="{name_width - 6}" y="{y + 15}" text-anchor="end">{html.escape(_short(name))}</text>'
+            f'<rect class="bar" x="{name_width}" y="{y + 3}" width="{length:.1f}" height="{row - 6}"/>'
+            f'<text x="{name_width + length + 5:.1f}" y="{y + 15}">{_number(value)}</text>'
+        )
+    drawing = _svg(caption, len(values) * row + 4, marks)
+    return _figure(caption, drawing, [(name, f"{_number(value)}{unit}") for name, value in values.items()])
+
+
+class Histogram:
+    """Counts of values in equal bins; values beyond ``bounds`` count in the outermost ones."""
+
+    def __init__(self, bounds: tuple[float, float], bins: int = 20) -> None:
+        self._bounds = bounds
+        self._counts = np.zeros(bins, dtype=np.int64)
+
+    def add(self, values: npt.ArrayLike) -> None:
+        """Count values."""
+        data = np.asarray(values, dtype=np.float64).ravel()
+        self._counts += np.histogram(np.clip(data, *self._bounds), bins=len(self._counts), range=self._bounds)[0]
+
+    def draw(self, caption: str, axis: str = "") -> str:
+        """The histogram as a chart."""
+        if not self._counts.any():
+            return _figure(caption, "<p>nothing</p>", [])
+        low, high = self._bounds
+        names = [f"{_number(a)} to {_number(b)}" for a, b in pairwise(np.linspace(low, high, len(self._counts) + 1))]
+        ends = {share: _number(low + share * (high - low)) for share in (0.0, 0.5, 1.0)}
+        return _columns(caption, self._counts, names, ends, axis)
+
+
+def histogram(
+    caption: str, values: npt.ArrayLike, *, bins: int = 20, bounds: tuple[float, float] | None = None, axis: str = ""
+) -> str:
+    """A histogram of values, from the smallest to the largest or within ``bounds``."""
+    data = np.asarray(values, dtype=np.float64).ravel()
+    if bounds is None:
+        bounds = (float(data.min()), float(data.max())) if data.size else (0.0, 1.0)
+    low, high = bounds
+    counted = Histogram((low, high if high > low else low + 1), bins)
+    counted.add(data)
+    return counted.draw(caption, axis)
+
+
+def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names: Sequence[str], axis: str = "") -> str:
+    """A histogram that was counted before, with a name for every bin."""
+    ends = (
+        {0.0: names[0], 0.5: names[len(names) // 2], 1.0: names[-1]}
+        if len(names) > 2
+        else dict.fromkeys((0.0,), names[0])
+    )
+    return _columns(caption, np.asarray(counts), names, ends, axis)
+
+
+class HeatMap:
+    """Counts of points (x, y) in a grid over (0, 0) to ``size``, y downwards."""
+
+    def __init__(self, size: tuple[float, float], cells: tuple[int, int]) -> None:
+        self._size = size
+        self._counts = np.zeros((cells[1], cells[0]))
+
+    def add(self, x: npt.ArrayLike, y: npt.ArrayLike) -> None:
+        """Count points."""
+        counts, _, _ = np.histogram2d(
+            np.clip(np.asarray(y, dtype=np.float64), 0, self._size[1]),
+            np.clip(np.asarray(x, dtype=np.float64), 0, self._size[0]),
+            bins=self._counts.shape,
+            range=((0, self._size[1]), (0, self._size[0])),
+        )
+        self._counts += counts
+
+    def draw(self, caption: str, axes: str) -> str:
+        """The map as a chart."""
+        return _heat_map(caption, self._counts, self._size, axes)
+
+
+def heat_map(
+    caption: str, x: npt.ArrayLike, y: npt.ArrayLike, *, size: tuple[float, float], cells: tuple[int, int], axes: str
+) -> str:
+    """A map of points."""
+    counted = HeatMap(size, cells)
+    counted.add(x, y)
+    return counted.draw(caption, axes)
+
+
+def _heat_map(caption: str, counts: Float64Array, size: tuple[float, float], axes: str) -> str:
+    cells = counts.shape[::-1]
+    most = counts.max() or 1.0
+    width = _WIDTH - _LEFT - 10
+    height = width * size[1] / size[0]
+    dx, dy = width / cells[0], height / cells[1]
+    marks = [f'<rect class="frame" x="{_LEFT}" y="{_TOP}" width="{width}" height="{height:.1f}"/>']
+    for row, column in zip(*np.nonzero(counts), strict=True):
+        share = np.sqrt(counts[row, column] / most)
+        marks.append(
+            f'<rect class="bar" x="{_LEFT + column * dx:.1f}" y="{_TOP + row * dy:.1f}" width="{dx:.1f}" '
+            f'height="{dy:.1f}" fill-opacity="{0.12 + 0.88 * share:.2f}"/>'
+        )
+    base = _TOP + height
+    marks.append(f'<text x="{_LEFT}" y="{base + 14:.1f}">0</text>')
+    marks.append(f'<text x="{_LEFT + width}" y="{base + 14:.1f}" text-anchor="end">{_number(size[0])}</text>')
+    marks.append(f'<text x="{_LEFT - 5}" y="{_TOP + 10}" text-anchor="end">0</text>')
+    marks.append(f'<text x="{_LEFT - 5}" y="{base:.1f}" text-anchor="end">{_number(size[1])}</text>')
+    marks.append(f'<text x="{_LEFT + width / 2}" y="{base + 28:.1f}" text-anchor="middle">{html.escape(axes)}</text>')
+    busiest = np.unravel_index(int(counts.argmax()), counts.shape)
+    numbers = [
+        ("points", _number(counts.sum())),
+        ("cells with a point", f"{np.count_nonzero(counts)} of {counts.size}"),
+        ("busiest cell (column, row)", f"{busiest[1] + 1}, {busiest[0] + 1}: {_number(most)}"),
+    ]
+    return _figure(caption, _svg(caption, base + 34, marks), numbers)
+
+
+def _columns(
+    caption: str, counts: npt.NDArray[np.integer], names: Sequence[str], ends: Mapping[float, str], axis: str
+) -> str:
+    most = int(counts.max()) or 1
+    width, height = _WIDTH - _LEFT - 10, _HEIGHT - _BOTTOM - _TOP
+    step = width / len(counts)
+    base = _TOP + height
+    marks = [
+        f'<rect class="bar" x="{_LEFT + i * step + 0.5:.1f}" y="{base - height * count / most:.1f}" '
+        f'width="{max(step - 1, 0.5):.1f}" height="{height * count / most:.1f}"/>'
+        for i, count in enumerate(counts)
+        if count
+    ]
+    marks.append(f'<line class="axis" x1="{_LEFT}" y1="{base}" x2="{_LEFT + width}" y2="{base}"/>')
+    for share, text in ends.items():
+        anchor = {0.0: "start", 0.5: "middle", 1.0: "end"}[share]
+        x = _LEFT + share * width
+        marks.append(f'<text x="{x:.1f}" y="{base + 14}" text-anchor="{anchor}">{html.escape(text)}</text>')
+    marks.append(f'<text x="{_LEFT - 5}" y="{_TOP + 10}" text-anchor="end">{_number(most)}</text>')
+    marks.append(f'<text x="{_LEFT - 5}" y="{base}" text-anchor="end">0</text>')
+    marks.append(f'<text x="{_LEFT + width / 2}" y="{base + 28}" text-anchor="middle">{html.escape(axis)}</text>')
+    numbers = [(name, f"{count}") for name, count in zip(names, counts, strict=True) if count]
+    return _figure(caption, _svg(caption, _HEIGHT, marks), numbers)
+
+
+def _svg(caption: str, height: float, marks: Sequence[str]) -> str:
+    label = html.escape(f"Chart: {caption}. Its numbers follow in a table.", quote=True)
+    return f'<svg role="img" aria-label="{label}" viewBox="0 0 {_WIDTH} {height:.0f}">{"".join(marks)}</svg>'
+
+
+def _figure(caption: str, drawing: str, numbers: Sequence[tuple[str, str]]) -> str:
+    rows = "".join(
+        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(value)}</td></tr>' for name, value in numbers
+    )
+    table = f"<details><summary>Numbers</summary><table>{rows}</table></details>" if rows else ""
+    return f"<figure><figcaption>{html.escape(caption)}</figcaption>{drawing}{table}</figure>"
+
+
+def _number(value: float) -> str:
+    if abs(value) >= 1e5:
+        return f"{value / 1e6:.3g} M"
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.3g}"
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 22 else name[:21] + "…"

@@ -1,0 +1,224 @@
+"""What a frame's line in the manifest means, worked out anew from its masks, poses and intrinsics.
+
+The audit compares files with this. Nothing here calls what wrote them: masks are decoded by pycocotools, poses inverted
+by NumPy, points projected by OpenCV, everything else is counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from pycocotools import mask as coco_mask
+
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+from mitsplat.files import Record
+
+Box = tuple[int, int, int, int]
+"""Bounds (x0, y0, x1, y1) [px], half-open."""
+
+VOC_TRUNCATED, VOC_OCCLUDED = 0.15, 0.05
+"""Shares of an object beyond the box of what is seen, and hidden in it, above which VOC's guidelines set its flags."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrueInstance:
+    """An instance of a frame.
+
+    Attributes:
+        entry: What the manifest states of it.
+        box: Bounds of what is seen of it, counted from the mask.
+        mask: Its pixels in the box.
+        amodal_box, amodal: The same of all that it covers in the image.
+    """
+
+    entry: Mapping[str, Any]
+    box: Box
+    mask: BoolArray
+    amodal_box: Box
+    amodal: BoolArray
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any], width: int, height: int) -> TrueInstance:
+        """Decode the masks, neither of which is empty."""
+        return cls(entry, *_decode(entry["rle"], width, height), *_decode(entry["amodal_rle"], width, height))
+
+    @property
+    def id(self) -> int:
+        """Value in id maps."""
+        return int(self.entry["id"])
+
+    @property
+    def kind(self) -> int:
+        """Class index."""
+        return int(self.entry["class_index"])
+
+    @property
+    def name(self) -> str:
+        """How sentences begin."""
+        return f"instance {self.id}"
+
+    @property
+    def pose(self) -> Float64Array:
+        """``world_from_object``, shape (4, 4) [m]."""
+        return np.array(self.entry["world_from_object"], dtype=np.float64)
+
+    @cached_property
+    def area(self) -> int:
+        """Pixels that are seen."""
+        return int(np.count_nonzero(self.mask))
+
+    @cached_property
+    def amodal_area(self) -> int:
+        """Pixels of the image that it covers."""
+        return int(np.count_nonzero(self.amodal))
+
+    @property
+    def silhouette_area(self) -> int:
+        """Pixels that it covers, beyond the image's border too; no file of a frame shows those."""
+        return int(self.entry["silhouette_area"])
+
+    @cached_property
+    def voc_flags(self) -> tuple[bool, bool]:
+        """Whether VOC calls it truncated, and occluded."""
+        x0, y0, x1, y1 = self.box
+        left, top = self.amodal_box[:2]
+        boxed = int(np.count_nonzero(self.amodal[max(0, y0 - top) : y1 - top, max(0, x0 - left) : x1 - left]))
+        hidden = boxed - self.area
+        beyond = self.silhouette_area - boxed
+        return bool(beyond > VOC_TRUNCATED * self.silhouette_area), bool(hidden > VOC_OCCLUDED * boxed)
+
+
+@dataclass(frozen=True, eq=False)
+class TrueFrame:
+    """A frame's record, and the dataset that it is in."""
+
+    root: Path
+    record: Record
+    content: Mapping[str, Any]
+    instances: tuple[TrueInstance, ...]
+
+    @classmethod
+    def of(cls, root: Path, record: Record, content: Mapping[str, Any]) -> TrueFrame:
+        """The frame of a record that :mod:`mitsplat.dataset.schema` has checked."""
+        width, height = record["labels"]["size"]
+        return cls(
+            root,
+            record,
+            content,
+            tuple(TrueInstance.of(entry, width, height) for entry in record["labels"]["instances"]),
+        )
+
+    @property
+    def index(self) -> int:
+        """Frame index."""
+        return int(self.record["index"])
+
+    @property
+    def split(self) -> str:
+        """``train`` or ``val``."""
+        return str(self.record["split"])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        width, height = self.record["labels"]["size"]
+        return width, height
+
+    @property
+    def formats(self) -> list[str]:
+        """Formats of the dataset."""
+        return list(self.content["scene"]["output"]["formats"])
+
+    @property
+    def image_name(self) -> str:
+        """File name of the frame's picture."""
+        return f"{self.index:06d}.{self.content['scene']['output']['image']}"
+
+    @property
+    def bop_folder(self) -> str:
+        """Where BOP has the frame's layout."""
+        return f"bop/{self.split}/{self.record['layout']:06d}"
+
+    def whole(self, instance: TrueInstance, *, amodal: bool = False) -> BoolArray:
+        """What is seen of an instance, or all that it covers, in the whole image (H, W)."""
+        width, height = self.size
+        canvas = np.zeros((height, width), dtype=bool)
+        x0, y0, x1, y1 = instance.amodal_box if amodal else instance.box
+        canvas[y0:y1, x0:x1] = instance.amodal if amodal else instance.mask
+        return canvas
+
+    @cached_property
+    def ids(self) -> Int64Array:
+        """Id of the labelled instance of every pixel, 0 for anything else, (H, W)."""
+        return self._painted([instance.id for instance in self.instances])
+
+    @cached_property
+    def classes(self) -> Int64Array:
+        """Class index + 1 of every labelled pixel, 0 for anything else, (H, W)."""
+        return self._painted([instance.kind + 1 for instance in self.instances])
+
+    def _painted(self, values: list[int]) -> Int64Array:
+        width, height = self.size
+        canvas = np.zeros((height, width), dtype=np.int64)
+        for instance, value in zip(self.instances, values, strict=True):
+            x0, y0, x1, y1 = instance.box
+            canvas[y0:y1, x0:x1][instance.mask] = value
+        return canvas
+
+    @property
+    def world_from_camera(self) -> Float64Array:
+        """As the manifest states it, shape (4, 4) [m]."""
+        return np.array(self.record["camera"]["world_from_camera"], dtype=np.float64)
+
+    @cached_property
+    def camera_from_world(self) -> Float64Array:
+        """Shape (4, 4) [m]."""
+        return np.asarray(np.linalg.inv(self.world_from_camera))
+
+    @property
+    def intrinsics(self) -> Float64Array:
+        """Shape (3, 3) [px], pixel centres at +0.5."""
+        return np.array(self.record["camera"]["intrinsics"], dtype=np.float64)
+
+    @property
+    def distortion(self) -> Float64Array:
+        """OpenCV's coefficients."""
+        return np.array(self.record["camera"]["distortion"], dtype=np.float64)
+
+    def project(self, points: Float64Array) -> Float64Array:
+        """Pixels (N, 2) of points in the camera's frame (N, 3), all before the camera."""
+        points, zero = np.ascontiguousarray(points).reshape(-1, 1, 3), np.zeros(3)
+        if self.record["camera"]["lens"] == "fisheye":
+            pixels, _ = cv2.fisheye.projectPoints(points, zero, zero, self.intrinsics, self.distortion)
+        else:
+            pixels, _ = cv2.projectPoints(points, zero, zero, self.intrinsics, self.distortion)
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+    def slopes(self, pixels: Float64Array) -> Float64Array:
+        """Ray slopes (x / z, y / z) of pixels, both (N, 2)."""
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+        if self.record["camera"]["lens"] == "fisheye":
+            slopes = cv2.fisheye.undistortPoints(pixels, self.intrinsics, self.distortion, criteria=criteria)
+        else:
+            eye = np.eye(3)
+            slopes = cv2.undistortPoints(pixels, self.intrinsics, self.distortion, None, eye, eye, criteria)
+        return np.asarray(slopes, dtype=np.float64).reshape(-1, 2)
+
+
+def bounds_of(mask: BoolArray) -> Box:
+    """Bounds of a mask's pixels, all 0 for an empty one."""
+    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (int(xs[0]), int(ys[0]), int(xs[-1]) + 1, int(ys[-1]) + 1) if len(xs) else (0, 0, 0, 0)
+
+
+def _decode(code: str, width: int, height: int) -> tuple[Box, BoolArray]:
+    whole = coco_mask.decode({"size": [height, width], "counts": code})
+    x0, y0, x1, y1 = box = bounds_of(whole)
+    return box, np.ascontiguousarray(whole[y0:y1, x0:x1], dtype=bool)

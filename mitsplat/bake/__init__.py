@@ -1,0 +1,12 @@
+"""CAD meshes and scans to assets.
+
+In: a mesh with its materials. Out: an :class:`~mitsplat.asset.Asset` whose flat Gaussians on its surface show what the
+path tracer saw, with a proxy mesh, convex pieces, and a report that shows the mesh beside the splats.
+"""
+
+from __future__ import annotations
+
+from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
+from mitsplat.bake.materials import Finish
+
+__all__ = ["BakeResult", "BakeSettings", "Finish", "bake_asset"]

@@ -1,0 +1,440 @@
+"""CAD meshes to assets: surface-aligned Gaussians whose outgoing radiance Mitsuba's path tracer bakes.
+
+Surfels (:mod:`mitsplat.bake.surfels`) are seen from directions all over their hemispheres. The radiance that leaves
+them towards each, display-encoded, is fitted with spherical harmonics. A diffuse white surface under the ``uniform``
+light has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or face
+colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.spatial import KDTree
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.asset import Asset
+from mitsplat.bake.materials import Finish
+from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts, world_from_file
+from mitsplat.bake.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
+from mitsplat.bake.proxy_mesh import make_proxy
+from mitsplat.bake.surfels import Surfels, place_surfels
+from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
+from mitsplat.camera import Camera
+from mitsplat.colour import encode_srgb
+from mitsplat.errors import InputError
+from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
+from mitsplat.mesh import convex_pieces
+from mitsplat.progress import Progress
+from mitsplat.render.layers import ensure_variant
+from mitsplat.scene.scene import LightSpec
+from mitsplat.spherical_harmonics import sh_basis
+from mitsplat.splats import Splats
+from mitsplat.variant import one_at_a_time
+
+_OPACITY = 0.98
+_HIDDEN = 0.01
+"""Radiance of a white surface under the uniform light below which nobody sees it."""
+_DETAIL = 7.0
+"""How many times denser Gaussians are where the texture changes strongly."""
+_MOST_GAUSSIANS = 2_000_000
+_SMALLEST, _LARGEST = 0.001, 5.0
+"""Size of objects [m] outside of which units are wrong rather than objects unusual."""
+_STAGES = {
+    "placing Gaussians": 14,
+    "tracing their radiance": 16,
+    "path-tracing pictures": 14,
+    "fitting to the pictures": 40,
+    "finding convex pieces": 25,
+    "comparing with the mesh": 8,
+}
+"""What a bake does, and its shares of the time."""
+_DARKEST, _BRIGHTEST = 0.6, 1.4
+"""Brightness relative to its textures that corners in the shade and highlights explain."""
+_RIDGE = 0.02
+"""Weight of the penalty on view dependence, relative to the data: decides what no ray has seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class BakeResult:
+    """A baked asset and how close it comes to a path-traced picture of its mesh.
+
+    Attributes:
+        asset: The asset, in metres, z up.
+        psnr: Over whole images of unseen views [dB]; NaN without verification.
+        psnr_object: Over the mesh's pixels alone [dB]; NaN without verification.
+        views: The pictures of that comparison.
+        surface: The mesh that was baked, all parts of it [m], z up; None where it was not kept.
+        brightness: Mean brightness of the splats relative to the textures of the file, read from it once more; None
+            without textures of its own or under a scene's lights.
+        warnings: What a user should know, a sentence each.
+    """
+
+    asset: Asset
+    psnr: float
+    psnr_object: float
+    views: tuple[BakedView, ...] = ()
+    surface: trimesh.Trimesh | None = None
+    brightness: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """How finely a mesh is baked.
+
+    Attributes:
+        gaussians: Number of Gaussians aimed for.
+        sh_degree: Degree of the spherical harmonics, 0 to 3; metal needs 2.
+        directions: Directions in which every Gaussian is seen.
+        samples: Light paths per direction.
+        bounces: Longest light path.
+        sharpening: Rounds that undo the blur which overlapping Gaussians cause.
+        density: Relative density of Gaussians of a part of the mesh, by its name; 1 where unnamed.
+        proxy_faces: Most faces of the proxy mesh.
+        fit_views: Path-traced pictures all around the mesh that the Gaussians are fitted to at last.
+        fit_steps: Steps of that fit; 0 skips it.
+        verify_views: Views in which the result is compared with the mesh; 0 skips it.
+        seed: Decides every random number.
+    """
+
+    gaussians: int = 20000
+    sh_degree: int = 2
+    directions: int = 32
+    samples: int = 16
+    bounces: int = 6
+    sharpening: int = 4
+    density: Mapping[str, float] | None = None
+    proxy_faces: int = 10000
+    fit_views: int = 32
+    fit_steps: int = 300
+    verify_views: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("gaussians", "directions", "samples", "bounces", "proxy_faces"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1 (got {getattr(self, name)})")
+        if self.gaussians > _MOST_GAUSSIANS:
+            raise InputError(f"gaussians must be at most {_MOST_GAUSSIANS} (got {self.gaussians})")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
+
+
+@one_at_a_time
+def bake_asset(
+    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    *,
+    name: str,
+    class_name: str | None = None,
+    kind: Literal["object", "environment"] = "object",
+    light: str | Sequence[LightSpec] = "uniform",
+    settings: BakeSettings | None = None,
+    metres_per_unit: float = 1.0,
+    up: Literal["y", "z"] = "z",
+    density: float = 1000.0,
+    friction: float = 0.5,
+    pieces: Sequence[trimesh.Trimesh] = (),
+    cameras: Sequence[Camera] = (),
+    fit_cameras: Sequence[Camera] = (),
+    finish: Finish | None = None,
+    any_size: bool = False,
+    progress: Progress | None = None,
+) -> BakeResult:
+    """Bake a textured or coloured mesh into an asset of Gaussians.
+
+    Args:
+        mesh: A mesh, a scene of several parts, or a file that trimesh reads.
+        name: Name of the asset.
+        class_name: Class that detectors learn; ``name`` if None.
+        kind: Objects get convex pieces for physics.
+        light: ``uniform`` (radiance 1 from everywhere), ``studio`` (soft boxes all around, mean radiance 1), or the
+            lights of a scene, which the asset then carries as ``capture_light: scene``.
+        settings: How finely to bake.
+        metres_per_unit: Length of the mesh's unit [m].
+        up: Axis that points up in the mesh (glTF: y).
+        density: Mass density [kg/m^3].
+        friction: Coulomb friction coefficient.
+        pieces: Convex pieces of an object for physics [m], z up; by default the proxy mesh is decomposed.
+        cameras: Views for the comparison; by default all around the mesh.
+        fit_cameras: Views of the pictures that the fit takes; by default all around the mesh, others than for the
+            comparison.
+        finish: Colour and gloss to use instead of the file's own.
+        any_size: Bake an object even if it is smaller than 1 mm or larger than 5 m, which tells of wrong units.
+        progress: Told how much of how much is done, and the stage.
+
+    Raises:
+        InputError: Before work starts, if the mesh cannot be read, is empty or of a size that tells of wrong units, or
+            if another value breaks a rule.
+    """
+    ensure_variant()
+    settings = settings or BakeSettings()
+    if not (density > 0 and np.isfinite(density)):
+        raise InputError(f"density must be a number > 0 in kg/m^3 (got {density:g})")
+    if not (friction >= 0 and np.isfinite(friction)):
+        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
+    stages = _Stages(progress)
+    lights = bake_lights(light)
+    parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
+    surface = trimesh.util.concatenate([part.mesh for part in parts])
+    if kind == "object" and not any_size:
+        _check_size(str(mesh) if isinstance(mesh, str | Path) else name, surface, metres_per_unit)
+    scene = mitsuba_scene(parts, lights)
+    stages("placing Gaussians")
+    rng = np.random.default_rng(settings.seed)
+    relative = settings.density or {}
+    face_density = np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts])
+    clay = mitsuba_scene(parts, bake_lights("uniform"), clay=True)
+    wanted = settings.gaussians
+    for _ in range(2):
+        surfels = place_surfels(surface, face_density, wanted, rng)
+        surfels = surfels.subset(_seen(clay, surfels, settings, rng))
+        if len(surfels) > 0.9 * settings.gaussians:
+            break
+        wanted = round(wanted * settings.gaussians / max(len(surfels), 0.2 * settings.gaussians))
+    if not len(surfels):
+        raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
+    stages("tracing their radiance")
+    colour = _fit_radiance(scene, surfels, settings, rng, stages)
+    splats = Splats(
+        means=surfels.centres.astype(np.float32),
+        quats=surfels.quats.astype(np.float32),
+        scales=surfels.scales.astype(np.float32),
+        opacities=np.full(len(surfels), _OPACITY, dtype=np.float32),
+        sh=_sharpened(surfels, colour, settings.sharpening).astype(np.float32),
+    )
+    if settings.fit_steps:
+        stages("path-tracing pictures")
+        fit_cameras = fit_cameras or _orbit(surface, settings.fit_views, turn=0.0)
+        pictures = []
+        for view, camera in enumerate(fit_cameras):
+            stages("path-tracing pictures", view / len(fit_cameras))
+            pictures.append(_picture(scene, camera, settings, view))
+        stages("fitting to the pictures")
+        refining = RefineSettings(iterations=settings.fit_steps, seed=settings.seed)
+        splats = refine_splats(
+            splats,
+            pictures,
+            refining,
+            progress=lambda step, _: stages("fitting to the pictures", step / settings.fit_steps),
+        )
+    stages("finding convex pieces")
+    proxy = make_proxy(parts, settings.proxy_faces)
+    area = np.array([part.mesh.area for part in parts])
+    asset = Asset(
+        name=name,
+        class_name=class_name or name,
+        splats=splats,
+        mesh=proxy,
+        pieces=tuple(pieces) or (convex_pieces(proxy) if kind == "object" else ()),
+        kind=kind,
+        density=density,
+        friction=friction,
+        roughness=float(np.average([part.roughness for part in parts], weights=area)),
+        specular=float(np.average([part.specular for part in parts], weights=area)),
+        capture_light="uniform" if isinstance(light, str) else "scene",
+        white=None if isinstance(light, str) else float(np.pi),
+    )
+    warnings = [warning for part in parts for warning in part.warnings]
+    if not settings.verify_views:
+        stages.end()
+        return BakeResult(asset, float("nan"), float("nan"), surface=surface, warnings=tuple(warnings))
+    stages("comparing with the mesh")
+    cameras = cameras or _orbit(surface, settings.verify_views)
+    views, whole, on_object = compare_views(
+        scene, splats, cameras, bounces=settings.bounces, seed=settings.seed, progress=stages.part
+    )
+    brightness = None
+    if isinstance(light, str) and (finish is None or finish.colour is None):
+        brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up))
+    if brightness is not None and not _DARKEST < brightness < _BRIGHTEST:
+        warnings.append(
+            f"the splats are {brightness:.2g} times as bright as the textures of the file: "
+            "are the factors of its materials meant?"
+        )
+    stages.end()
+    return BakeResult(asset, whole, on_object, views, surface, brightness, tuple(warnings))
+
+
+class _Stages:
+    """Tells how far a bake is, of 100."""
+
+    def __init__(self, tell: Progress | None) -> None:
+        self._tell, self._stage = tell, next(iter(_STAGES))
+
+    def __call__(self, stage: str, share: float = 0.0) -> None:
+        self._stage = stage
+        if self._tell is not None:
+            names = list(_STAGES)
+            before = sum(_STAGES[name] for name in names[: names.index(stage)])
+            self._tell(int(100 * (before + share * _STAGES[stage]) / sum(_STAGES.values())), 100, stage)
+
+    def part(self, share: float) -> None:
+        """So much of the present stage is done."""
+        self(self._stage, share)
+
+    def end(self) -> None:
+        """All is done."""
+        if self._tell is not None:
+            self._tell(100, 100, "done")
+
+
+def _check_size(source: str, surface: trimesh.Trimesh, metres_per_unit: float) -> None:
+    """Refuse objects whose size tells of wrong units."""
+    size = float(surface.extents.max())
+    if _SMALLEST <= size <= _LARGEST:
+        return
+    factor, unit = (0.001, "millimetres") if size > _LARGEST else (1000.0, "metres")
+    likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
+    raise InputError(
+        f"{source}: an object must be {_SMALLEST:g} to {_LARGEST:g} m across (got {size:.3g} m at {metres_per_unit:g} "
+        f"metres per unit: {likely if _SMALLEST <= size * factor <= _LARGEST else ''}--any-size bakes it as it is)"
+    )
+
+
+def _hemisphere(count: int) -> Float64Array:
+    """Directions (M, 3) evenly over the hemisphere around z, none closer than 3 degrees to the horizon."""
+    height = 1.0 - 0.95 * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    radius = np.sqrt(1.0 - height**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
+
+
+def _turned(frames: Float64Array, directions: Float64Array, rng: np.random.Generator) -> Float64Array:
+    """``directions`` (M, 3) in every one of ``frames`` (N, 3, 3), each turned by a random angle: (N, M, 3)."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, (len(frames), 1))
+    cos, sin = np.cos(angle), np.sin(angle)
+    local = np.empty((len(frames), len(directions), 3))
+    local[..., 0] = cos * directions[:, 0] - sin * directions[:, 1]
+    local[..., 1] = sin * directions[:, 0] + cos * directions[:, 1]
+    local[..., 2] = directions[:, 2]
+    return np.asarray(np.einsum("nij,nmj->nmi", frames, local))
+
+
+def _seen(clay: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator) -> BoolArray:
+    """Whether light from outside finds its way to a surfel (N,): not inside a solid, a closed hollow or under a label.
+
+    ``clay`` is the scene in white, under the uniform light, its faces black from behind.
+    """
+    directions = _turned(surfels.frames, _hemisphere(8), rng)
+    origins = surfels.points[:, None] + _lift(clay) * directions
+    radiance, _ = trace_radiance(
+        clay,
+        origins.reshape(-1, 3),
+        -directions.reshape(-1, 3),
+        samples=4,
+        bounces=2,
+        seed=int(rng.integers(1 << 30)),
+    )
+    return np.asarray(radiance.reshape(len(surfels), -1).mean(axis=1) > _HIDDEN)
+
+
+def _lift(scene: mi.Scene) -> float:
+    """Distance above a surface [m] at which rays towards it start: little, but more than float32's rounding."""
+    box = scene.bbox()
+    return 1e-5 * float(max(abs(v) for v in (*box.min, *box.max)))
+
+
+def _hits_nearby(
+    scene: mi.Scene, origins: Float64Array, directions: Float64Array, normals: Float64Array, reach: Float64Array
+) -> BoolArray:
+    """Whether rays (N, M, 3) hit a surface within ``reach`` (N,) [m] that faces much as ``normals`` (N, 3) do."""
+    rays = mi.Ray3f(
+        mi.Point3f(origins.reshape(-1, 3).T.astype(np.float32)),
+        mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)),
+    )
+    hit = scene.ray_intersect_preliminary(rays)
+    normal = np.asarray(hit.compute_surface_interaction(rays).n).T.reshape(origins.shape)
+    distance = np.asarray(hit.t).reshape(origins.shape[:2])
+    alike = np.einsum("nmd,nd->nm", normal, normals) > 0.8
+    return np.asarray((distance < reach[:, None]) & alike)
+
+
+def _fit_radiance(
+    scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator, stages: _Stages
+) -> Float64Array:
+    """Spherical-harmonic coefficients (N, K, 3) of the display-encoded radiance that leaves every surfel."""
+    local = _hemisphere(settings.directions)
+    weights = 0.2 + local[:, 2]
+    terms = (settings.sh_degree + 1) ** 2
+    penalty = _RIDGE * weights.sum() * np.diag([1e-6] + [1.0] * (terms - 1)) / (4.0 * np.pi)
+    coefficients = np.empty((len(surfels), terms, 3))
+    step = max(1, RAYS_PER_LAUNCH // (settings.directions * settings.samples))
+    for start in range(0, len(surfels), step):
+        stages.part(start / len(surfels))
+        chunk = slice(start, start + step)
+        frames, scales = surfels.frames[chunk], surfels.scales[chunk]
+        towards = _turned(frames, local, rng)
+        # Footprint samples average the texture over the Gaussian instead of aliasing it.
+        offset = np.clip(rng.normal(size=(*towards.shape[:2], 2)), -1.5, 1.5) * 0.5 * scales[:, None, :2]
+        origins = surfels.points[chunk, None] + np.einsum("nij,nmj->nmi", frames[:, :, :2], offset)
+        origins += (0.3 * scales[:, None, :1] + _lift(scene)) * towards
+        on_surface = _hits_nearby(scene, origins, -towards, frames[:, :, 2], 1.2 * scales[:, 0])
+        origins = np.where(on_surface[..., None], origins, surfels.points[chunk, None] + _lift(scene) * towards)
+        radiance, _ = trace_radiance(
+            scene,
+            origins.reshape(-1, 3),
+            -towards.reshape(-1, 3),
+            samples=settings.samples,
+            bounces=settings.bounces,
+            seed=int(rng.integers(1 << 30)),
+        )
+        basis = sh_basis(-towards.reshape(-1, 3), settings.sh_degree).reshape(*towards.shape[:2], terms)
+        weighted = weights[:, None] * basis
+        target = encode_srgb(radiance).reshape(*towards.shape) - 0.5
+        coefficients[chunk] = np.linalg.solve(
+            np.einsum("nmk,nml->nkl", weighted, basis) + penalty, np.einsum("nmk,nmc->nkc", weighted, target)
+        )
+    return coefficients
+
+
+def _sharpened(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Array:
+    """Colours (N, K, 3) whose blend at every surfel comes close to ``target`` (N, K, 3).
+
+    Van Cittert's iteration; colours stay within those of their neighbours, so that nothing rings.
+    """
+    if not rounds or len(surfels) < 2:
+        return target
+    neighbours = min(16, len(surfels))
+    _, index = KDTree(surfels.points).query(surfels.points, k=neighbours)
+    offset = surfels.points[:, None] - surfels.points[index]
+    local = np.einsum("nkj,nkji->nki", offset, surfels.frames[index]) / surfels.scales[index]
+    facing = np.einsum("nkd,nd->nk", surfels.normals[index], surfels.normals) > 0.8
+    blend = np.exp(-0.5 * (local[..., :2] ** 2).sum(axis=2)) * facing
+    blend /= blend.sum(axis=1, keepdims=True)
+    colour = target.copy()
+    for band in range(target.shape[1]):
+        wanted, now = target[:, band], colour[:, band]
+        around = wanted[index]
+        low, high = around.min(axis=1), around.max(axis=1)
+        for _ in range(rounds):
+            now = np.clip(now + 0.7 * (wanted - np.einsum("nk,nkc->nc", blend, now[index])), low, high)
+        colour[:, band] = now
+    return colour
+
+
+def _picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:
+    """A path-traced picture of the mesh to fit to."""
+    seed = settings.seed + 1000 + view
+    radiance, cover = render_mesh(scene, camera, samples=16, bounces=settings.bounces, seed=seed)
+    return Picture(camera, encode_srgb(radiance).astype(np.float32), cover.astype(np.float32))
+
+
+def _orbit(surface: trimesh.Trimesh, count: int, *, turn: float = 0.7) -> list[Camera]:
+    """Views (``count``) from all around that frame the mesh."""
+    centre = surface.bounds.mean(axis=0)
+    radius = 0.5 * float(np.linalg.norm(surface.extents))
+    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + turn
+    ring = np.sqrt(1.0 - height**2)
+    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=1)
+    return [
+        Camera.look_at(centre + 4.5 * radius * d, centre, width=256, height=256, fov_x=29.0, near=0.1 * radius)
+        for d in outward
+    ]

@@ -1,0 +1,224 @@
+"""What meshes look like: the materials of mesh files, and finishes that users give instead.
+
+Colours of files are display-encoded (PLY, STL, OBJ with its MTL), but for glTF's factors and vertex colours, which are
+linear by its specification (Khronos, *glTF 2.0*, 3.9.2 and 3.7.2.1). A texture without a factor counts as it is. An
+MTL without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageColor
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from mitsplat.arrays import Float64Array
+from mitsplat.colour import decode_srgb
+from mitsplat.errors import InputError
+
+DIELECTRIC_SPECULAR = 0.04
+"""Reflectance at normal incidence of common plastics, lacquers and glass."""
+MOST_SPECULAR = 0.08
+UNKNOWN_COLOUR = 0.5
+"""Linear grey of what has no colour."""
+ROUGHNESS = 0.6
+LEAST_ROUGHNESS = 0.05
+_OPAQUE = 0.999
+_TRIMESH_DIFFUSE = (102, 102, 102)
+"""What trimesh fills in for a ``Kd`` that is absent."""
+
+
+@dataclass(frozen=True)
+class Finish:
+    """A material to use instead of a file's own; each value replaces that of all parts, None leaves it.
+
+    A colour replaces textures and vertex colours. Roughness, metalness or specular on a matt part make it glossy.
+
+    Attributes:
+        colour: Display-encoded: a name or ``#rrggbb`` as in CSS, or red, green, blue from 0 to 1.
+        roughness: Of glTF's material model, 0 (a mirror) to 1.
+        metallic: 0 for what is no metal to 1 for metal.
+        specular: Reflectance at normal incidence of what is no metal, 0 (matt) to 0.08; 0.04 for plastics.
+    """
+
+    colour: str | tuple[float, float, float] | None = None
+    roughness: float | None = None
+    metallic: float | None = None
+    specular: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in (("roughness", 1.0), ("metallic", 1.0), ("specular", MOST_SPECULAR)):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= most:
+                cause = " (more is a metal: give metallic 1)" if name == "specular" and value > most else ""
+                raise InputError(f"{name} must be from 0 to {most:g} (got {value:g}){cause}")
+        self.linear_colour()
+
+    def linear_colour(self) -> Float64Array | None:
+        """Linear red, green and blue, shape (3,), or None."""
+        if self.colour is None:
+            return None
+        if isinstance(self.colour, str):
+            try:
+                encoded = np.array(ImageColor.getrgb(self.colour)[:3]) / 255.0
+            except ValueError:
+                raise InputError(f"colour must be a name or #rrggbb, such as steelblue (got {self.colour!r})") from None
+        else:
+            encoded = np.asarray(self.colour, dtype=np.float64)
+            if encoded.shape != (3,) or not ((encoded >= 0) & (encoded <= 1)).all():
+                raise InputError(f"colour must be red, green and blue from 0 to 1 (got {self.colour!r})")
+        return decode_srgb(encoded)
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """One material, uniform but for its texture.
+
+    Attributes:
+        factor: Linear colour, or what multiplies the texture, shape (3,).
+        texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
+        metallic: 0 to 1.
+        roughness: Of glTF's material model, > 0.
+        specular: Reflectance at normal incidence of what is no metal.
+        shiny: Whether a highlight is reflected at all.
+        warnings: What of the file's material is left out, a sentence each.
+    """
+
+    factor: Float64Array
+    texture: npt.NDArray[np.uint8] | None
+    metallic: float = 0.0
+    roughness: float = 1.0
+    specular: float = DIELECTRIC_SPECULAR
+    shiny: bool = True
+    warnings: tuple[str, ...] = ()
+
+
+def read_material(material: Any) -> Material:
+    """Material of trimesh's."""
+    if isinstance(material, PBRMaterial):
+        return _read_gltf(material)
+    if isinstance(material, SimpleMaterial):
+        return _read_mtl(material)
+    return _read_gltf(material.to_pbr())
+
+
+def _read_gltf(source: PBRMaterial) -> Material:
+    warnings = []
+    # trimesh keeps the file's linear numbers in steps of 1/255.
+    factor = np.ones(3) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
+    if source.alphaMode not in (None, "OPAQUE") and (factor[3:] < _OPAQUE).any():
+        warnings.append("it is transparent, and baked opaque")
+    if source.emissiveTexture is not None or np.any(source.emissiveFactor):
+        warnings.append("it shines by itself, which is not baked")
+    metallic = 0.0 if source.metallicFactor is None else float(source.metallicFactor)
+    roughness = ROUGHNESS if source.roughnessFactor is None else float(source.roughnessFactor)
+    if source.metallicRoughnessTexture is not None:
+        # Absent factors are 1 beside this texture; its green is roughness, its blue metalness.
+        means = np.asarray(source.metallicRoughnessTexture.convert("RGB")).reshape(-1, 3).mean(axis=0) / 255.0
+        metallic = means[2] * (1.0 if source.metallicFactor is None else metallic)
+        roughness = means[1] * (1.0 if source.roughnessFactor is None else roughness)
+        warnings.append("its metalness and roughness are baked as the means of their texture")
+    return Material(
+        factor[:3],
+        _pixels(source.baseColorTexture, warnings),
+        float(np.clip(metallic, 0.0, 1.0)),
+        float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)),
+        warnings=tuple(warnings),
+    )
+
+
+def _read_mtl(source: SimpleMaterial) -> Material:
+    """An MTL's material: the file's own keys, because trimesh fills in a dark grey for a ``Kd`` that is absent."""
+    keys: Mapping[str, Any] = source.kwargs
+    warnings: list[str] = []
+    texture = _pixels(source.image, warnings)
+    diffuse = _numbers(keys, "kd")
+    if diffuse is None and not np.array_equal(source.diffuse[:3], _TRIMESH_DIFFUSE):
+        diffuse = np.asarray(source.diffuse[:3]) / 255.0
+    if diffuse is not None:
+        factor = decode_srgb(np.broadcast_to(np.clip(diffuse, 0, 1), 3))
+    else:
+        factor = np.ones(3) if texture is not None else np.full(3, UNKNOWN_COLOUR)
+    opacity, transparency = _numbers(keys, "d"), _numbers(keys, "tr")
+    if (opacity is not None and opacity[-1] < _OPAQUE) or (transparency is not None and transparency[0] > 1 - _OPAQUE):
+        warnings.append("it is transparent, and baked opaque")
+    emission = _numbers(keys, "ke")
+    if "map_ke" in keys or (emission is not None and emission.any()):
+        warnings.append("it shines by itself, which is not baked")
+    left_out = sorted({"map_pr", "map_pm", "map_ks", "map_ns", "map_d", "map_bump", "bump", "norm"} & set(keys))
+    if left_out:
+        warnings.append(f"its {', '.join(left_out)} {'is' if len(left_out) == 1 else 'are'} left out")
+    given_roughness, metallic = _numbers(keys, "pr"), _numbers(keys, "pm")
+    highlight, illumination = _numbers(keys, "ks"), _numbers(keys, "illum")
+    physical = given_roughness is not None or metallic is not None
+    specular = 0.0 if highlight is None else min(MOST_SPECULAR, MOST_SPECULAR * float(highlight.mean()))
+    if illumination is not None and illumination[0] < 2 and not physical:
+        specular = 0.0
+    if physical and highlight is None:
+        specular = DIELECTRIC_SPECULAR
+    roughness = ROUGHNESS
+    if given_roughness is not None:
+        roughness = float(given_roughness[0])
+    elif (exponent := _numbers(keys, "ns")) is not None:
+        # Phong's exponent as the slope's variance of a microfacet surface (Walter et al. 2007).
+        roughness = (2.0 / (max(0.0, float(exponent[0])) + 2.0)) ** 0.25
+    metal = 0.0 if metallic is None else float(np.clip(metallic[0], 0.0, 1.0))
+    shiny = specular > 0 or metal > 0
+    return Material(
+        factor,
+        texture,
+        metal,
+        float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)) if shiny else 1.0,
+        specular,
+        shiny,
+        tuple(warnings),
+    )
+
+
+def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
+    """Numbers of an MTL's key, or None where it is absent or damaged."""
+    try:
+        found = np.atleast_1d(np.asarray(keys[name], dtype=np.float64))
+    except (KeyError, ValueError):
+        return None
+    return found if len(found) and np.isfinite(found).all() else None
+
+
+def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.uint8] | None:
+    if image is None:
+        return None
+    if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
+        warnings.append("its texture has transparent places, which are baked opaque")
+    return np.array(image.convert("RGB"))
+
+
+def check_textures(mesh: Path) -> None:
+    """Refuse an OBJ whose material file or textures are missing: without them it would bake in grey.
+
+    Raises:
+        InputError: If a file that the OBJ or its MTL names is missing or is no image.
+    """
+    if mesh.suffix.lower() != ".obj":
+        return
+    for library in _named(mesh, ("mtllib",)):
+        path = mesh.parent / library
+        if not path.is_file():
+            raise InputError(f"{mesh}: its material file {library} is missing; put it there, or give a colour")
+        for texture in _named(path, ("map_kd",)):
+            try:
+                with Image.open(path.parent / texture) as image:
+                    image.verify()
+            except (OSError, SyntaxError, ValueError) as error:
+                missing = not (path.parent / texture).is_file()
+                fault = "is missing" if missing else f"cannot be read ({error})"
+                raise InputError(f"{path}: its texture {texture} {fault}; put it there, or give a colour") from None
+
+
+def _named(path: Path, keys: tuple[str, ...]) -> list[str]:
+    lines = (line.strip().split(maxsplit=1) for line in path.read_text("utf-8", errors="replace").splitlines())
+    return [line[1].strip() for line in lines if len(line) == 2 and line[0].lower() in keys]

@@ -1,0 +1,108 @@
+"""What a bake came to: its splats beside the path-traced mesh, and beside the textures of its file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from trimesh.visual import TextureVisuals
+from trimesh.visual.color import uv_to_color
+
+from mitsplat.arrays import Float64Array
+from mitsplat.bake.path_tracing import render_mesh
+from mitsplat.camera import Camera
+from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.image_metrics import psnr_of
+from mitsplat.spherical_harmonics import evaluate_sh
+from mitsplat.splats import Splats
+
+_POINTS = 4000
+_NEAR = 3.0
+"""Distance from the next Gaussian, in standard deviations of it, beyond which a point of the mesh is hidden."""
+
+
+@dataclass(frozen=True, eq=False)
+class BakedView:
+    """One view of the mesh and of its splats.
+
+    Attributes:
+        mesh: Path-traced picture of the mesh, display-encoded, black where nothing is, shape (H, W, 3).
+        splats: The same of the splats.
+        cover: Share of each pixel that the mesh covers, shape (H, W).
+        psnr: Of the whole picture [dB].
+    """
+
+    mesh: Float64Array
+    splats: Float64Array
+    cover: Float64Array
+    psnr: float
+
+
+def compare_views(
+    scene: mi.Scene,
+    splats: Splats,
+    cameras: Sequence[Camera],
+    *,
+    bounces: int,
+    seed: int,
+    progress: Callable[[float], None],
+) -> tuple[tuple[BakedView, ...], float, float]:
+    """Views of the mesh and the splats, and PSNR [dB] of all together: whole images, and the mesh's pixels alone."""
+    from mitsplat.render.layers import render_splats
+
+    views, errors, on_object = [], [], []
+    for number, camera in enumerate(cameras):
+        progress(number / len(cameras))
+        truth, cover = render_mesh(scene, camera, samples=36, bounces=bounces, seed=seed + number)
+        mesh, shown = (np.clip(encode_srgb(rgb), 0, 1) for rgb in (truth, render_splats(splats, camera).rgb))
+        error = (shown - mesh) ** 2
+        errors.append(error.mean())
+        on_object.append(error[cover > 0].mean() if cover.any() else np.nan)
+        views.append(BakedView(mesh, shown, cover, psnr_of(float(error.mean()))))
+    return tuple(views), psnr_of(float(np.mean(errors))), psnr_of(float(np.nanmean(on_object)))
+
+
+def compare_with_textures(
+    mesh: trimesh.Trimesh | trimesh.Scene | str | Path, splats: Splats, world_from_file: Float64Array
+) -> float | None:
+    """Brightness of the splats relative to the textures of a mesh, at points of its surface; None without textures.
+
+    The texture is looked up by trimesh in the file's own image, past all that is known of materials here. Under light
+    of radiance 1 from everywhere a convex matt surface has its texture's brightness.
+    """
+    if isinstance(mesh, str | Path):
+        mesh = trimesh.load_scene(mesh)
+    scene = mesh if isinstance(mesh, trimesh.Scene) else trimesh.Scene({"mesh": mesh})
+    points, normals, colours = [], [], []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        visual = geometry.visual
+        if not isinstance(visual, TextureVisuals) or visual.uv is None:
+            continue
+        image = getattr(visual.material, "baseColorTexture", None) or getattr(visual.material, "image", None)
+        if image is None:
+            continue
+        at, face = trimesh.sample.sample_surface(geometry, _POINTS, seed=0)
+        share = trimesh.triangles.points_to_barycentric(geometry.triangles[face], at)
+        uv = np.einsum("nk,nkd->nd", share, np.asarray(visual.uv)[geometry.faces[face]])
+        pose = world_from_file @ transform
+        points.append(trimesh.transform_points(at, pose))
+        normals.append(geometry.face_normals[face] @ pose[:3, :3].T)
+        colours.append(uv_to_color(uv, image)[:, :3] / 255.0)
+    if not points:
+        return None
+    place, normal, own = (np.concatenate(values) for values in (points, normals, colours))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    distance, nearest = KDTree(splats.means).query(place)
+    outward = Rotation.from_quat(splats.quats[nearest]).as_matrix()[:, :, 2]
+    seen = (distance < _NEAR * splats.scales[nearest].max(axis=1)) & (np.einsum("nd,nd->n", outward, normal) > 0.7)
+    baked = evaluate_sh(splats.sh[nearest], -outward)
+    expected = decode_srgb(own)[seen].mean() if seen.any() else 0.0
+    return float(decode_srgb(baked)[seen].mean() / expected) if expected > 0 else None

@@ -1,0 +1,195 @@
+"""Photographs as they come from a camera: which are usable, and the upright copies that everything else works on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import ExifTags, Image, ImageOps
+
+from mitsplat.capture.capture import Photo, stored_name
+from mitsplat.errors import InputError
+from mitsplat.files import IMAGE_ERRORS, write_file
+from mitsplat.progress import Progress
+
+SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+_UNREAD = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")
+_LOSSY = ("JPEG", "MPO", "WEBP")
+
+_JUDGED_EDGE = 800
+"""Longer edge at which sharpness is measured [px], so that size and noise matter little."""
+
+_BLURRED = 0.12
+"""Share of the set's median sharpness. Gaussian blur of 3 px in 1600 px comes below it; views of one object, which
+differ by a factor of 2.5 to either side, do not."""
+
+_CLIPPED = 0.9
+"""Share of black or white pixels from which a photo is unusable; a white sweep behind a part covers less."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An upright copy of a photo.
+
+    Attributes:
+        name: Path of the photo below the folder given, as the user knows it.
+        file: The copy.
+        size: Width and height [px].
+        orientation: EXIF orientation that was applied, 1 to 8 (1: none).
+        lens: Camera, focal length and size; photos that agree in it can share intrinsics.
+    """
+
+    name: str
+    file: Path
+    size: tuple[int, int]
+    orientation: int
+    lens: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Judged:
+    prepared: Prepared
+    sharpness: float
+    clipped: tuple[float, float]
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """The photographs below a folder, sorted; hidden files are left out.
+
+    Raises:
+        InputError: If the folder does not exist.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of photographs")
+    below = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES + _UNREAD and path.is_file())
+    return sorted(path for path in below if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+
+
+def prepare_photos(
+    folder: Path, out: Path, *, max_size: int, upright: bool = True, progress: Progress | None = None
+) -> tuple[list[Prepared], dict[str, str]]:
+    """Upright copies of the usable photographs below ``folder``, and why the others are not, by name.
+
+    EXIF orientation is applied, since COLMAP ignores it; what is larger than ``max_size`` is reduced. A photo that
+    needs neither is copied byte by byte.
+
+    Args:
+        folder: Photographs in any depth.
+        out: Folder of the copies; those that are there already are not made again.
+        max_size: Longest edge of the copies [px].
+        upright: Whether EXIF orientation is applied; cameras that are known already ignore it.
+        progress: Told the photos done.
+
+    Raises:
+        InputError: If the folder does not exist.
+    """
+    files = find_photos(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    judged: list[_Judged] = []
+    rejected: dict[str, str] = {}
+    with ThreadPoolExecutor(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()) as pool:
+        results = pool.map(partial(_prepare, folder=folder, out=out, max_size=max_size, upright=upright), files)
+        for done, (file, result) in enumerate(zip(files, results, strict=True), start=1):
+            if isinstance(result, str):
+                rejected[file.relative_to(folder).as_posix()] = result
+            else:
+                judged.append(result)
+            if progress is not None:
+                progress(done, len(files), "reading photos")
+    median = float(np.median([photo.sharpness for photo in judged])) if judged else 0.0
+    good = []
+    for photo in judged:
+        reason = _fault(photo, median)
+        if reason is None:
+            good.append(photo.prepared)
+        else:
+            rejected[photo.prepared.name] = reason
+    return good, rejected
+
+
+def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: bool) -> _Judged | str:
+    """The photo's upright copy, or why it cannot be read."""
+    if path.suffix.lower() in _UNREAD:
+        return f"{path.suffix[1:].upper()} files are not read; export it as JPEG or PNG"
+    name = path.relative_to(folder).as_posix()
+    try:
+        with Image.open(path) as image:
+            image.load()
+            exif = image.getexif()
+            details = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+            orientation = int(exif.get(ExifTags.Base.Orientation, 1)) if upright else 1
+            turned = ImageOps.exif_transpose(image) if upright else image
+            lossy, kept = image.format in _LOSSY, image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
+    except IMAGE_ERRORS as error:
+        return f"it cannot be read ({error})"
+    kept &= max(turned.size) <= max_size and orientation == 1
+    suffix = path.suffix if kept else ".jpg" if lossy else ".png"
+    file = out / stored_name(name, suffix)
+    rgb = _eight_bit(turned)
+    if max(rgb.size) > max_size:
+        rgb.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
+    if not file.exists():
+        if kept:
+            write_file(file, partial(shutil.copyfile, path))
+        else:
+            # EXIF goes along for the focal length, which COLMAP starts from, without the orientation.
+            exif = turned.getexif()
+            exif.pop(ExifTags.Base.Orientation, None)
+            options = {"quality": 95, "subsampling": 0} if lossy else {}
+            write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", exif=exif, **options))
+    focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
+    lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
+    grey = np.asarray(rgb.convert("L"))
+    clipped = (float(np.mean(grey <= 4)), float(np.mean(grey >= 251)))
+    return _Judged(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), _sharpness(grey), clipped)
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """RGB with 8 bits a channel; transparent pixels keep their colour, 16-bit grey its upper byte."""
+    if image.mode.startswith("I"):
+        return Image.fromarray((np.asarray(image).astype(np.int64) // 256).clip(0, 255).astype(np.uint8)).convert("RGB")
+    return image.convert("RGB")
+
+
+def _sharpness(grey: npt.NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian (Pech-Pacheco et al. 2000) at a fixed size."""
+    scale = _JUDGED_EDGE / max(grey.shape)
+    if scale < 1:
+        grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+def _fault(photo: _Judged, median_sharpness: float) -> str | None:
+    black, white = photo.clipped
+    if black > _CLIPPED:
+        return f"it is too dark ({black:.0%} of it is black)"
+    if white > _CLIPPED:
+        return f"it is too bright ({white:.0%} of it is white)"
+    if photo.sharpness < _BLURRED * median_sharpness:
+        return f"it is blurred (sharpness {photo.sharpness / median_sharpness:.0%} of the median photo's)"
+    return None
+
+
+def undistort(photo: Photo) -> Photo:
+    """The photo resampled to a pinhole camera that sees nothing beyond its border; its file is replaced by a PNG."""
+    camera = photo.camera
+    if not camera.distortion:
+        return photo
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
+    lens, size = (camera.intrinsics - half, np.array(camera.distortion)), (camera.width, camera.height)
+    pinhole, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 0)
+    pinhole = np.asarray(pinhole)
+    x, y = cv2.initUndistortRectifyMap(*lens, np.eye(3), pinhole, size, cv2.CV_32FC1)
+    rgb, _ = photo.picture()
+    pixels = cv2.remap(np.rint(255 * rgb).astype(np.uint8), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    file = photo.file.with_name(f"{photo.file.name}.undistorted.png")
+    write_file(file, lambda part: Image.fromarray(np.asarray(pixels)).save(part, "PNG"))
+    (fx, _, cx), (_, fy, cy), _ = (pinhole + half).tolist()
+    return replace(photo, file=file, camera=replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=()))

@@ -1,0 +1,369 @@
+"""From a folder of photographs to a :class:`~mitsplat.capture.capture.Capture`, the stage of ``mitsplat capture``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mitsplat.capture.board_mask import bare_squares
+from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
+from mitsplat.capture.known_poses import read_poses
+from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
+from mitsplat.capture.metric_frame import DEFAULT_BOARD, Anchor, find_anchor
+from mitsplat.capture.overview import capture_sheet
+from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
+from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, Model, find_cameras
+from mitsplat.capture.targets import Board
+from mitsplat.errors import InputError
+from mitsplat.files import write_file, write_text
+from mitsplat.progress import Progress
+
+MIN_PHOTOS = 3
+MIN_REGISTERED = 0.75
+"""Share of the photos given from which a capture counts as a success."""
+
+FEW_POINTS = 3 * MIN_POINTS
+"""A camera that observes fewer points is worth a warning."""
+
+_INPUTS = "inputs.json"
+_RECORDED = ("source", "reprojection_error", "doubtful")
+"""What this file holds of a result beside its inputs."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What decides a capture beside its photographs.
+
+    Attributes:
+        kind: An object is cut out by masks; an environment is not.
+        max_size: Longest edge at which photos are used [px].
+        board: ChArUco board to look for.
+        tag: Edge of AprilTags as printed [m]; unknown if None.
+        scale_from: Two places and their distance [m], as in :func:`mitsplat.capture.metric_frame.spot`.
+        poses: COLMAP model or ``transforms.json`` to take cameras from.
+        metric: Whether ``poses`` are in metres with z up, and stay as they are.
+        masks: Folder of masks.
+        mask_model: ONNX file of a segmentation network.
+        undistorted: Whether photos are resampled to pinhole cameras.
+    """
+
+    kind: Literal["object", "environment"] = "object"
+    max_size: int = 1600
+    board: Board = DEFAULT_BOARD
+    tag: float | None = None
+    scale_from: tuple[str, str, float] | None = None
+    poses: Path | None = None
+    metric: bool = False
+    masks: Path | None = None
+    mask_model: Path | None = None
+    undistorted: bool = False
+
+    def __post_init__(self) -> None:
+        rules = (
+            (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
+            (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
+            (self.metric and self.poses is None, "poses must be given to be taken as metric"),
+            (self.masks is not None and self.mask_model is not None, "give a folder of masks or a model, not both"),
+        )
+        for broken, rule in rules:
+            if broken:
+                raise InputError(rule)
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureResult:
+    """A capture and what there is to say about it.
+
+    Attributes:
+        capture: As in its folder.
+        given: Number of photographs given.
+        source: Where scale and gravity come from, a clause.
+        reprojection_error: Mean over all observations [px].
+        doubtful: Share of the matches that a camera explains, where it is low and no board confirms the camera.
+    """
+
+    capture: Capture
+    given: int
+    source: str
+    reprojection_error: float
+    doubtful: Mapping[str, float]
+
+    @property
+    def registered(self) -> float:
+        """Share of the photos given that are in the capture."""
+        return len(self.capture.photos) / self.given
+
+    @property
+    def weak(self) -> dict[str, int]:
+        """Photos that observe few points, and how many."""
+        counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
+        return {name: count for name, count in counts.items() if count < FEW_POINTS}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of photos that are in the capture, one sentence each."""
+        warnings = []
+        if self.doubtful:
+            shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
+            warnings.append(
+                f"cameras explain few of their matches and may be wrong, leave them out or add others: {shares}"
+            )
+        if self.weak:
+            warnings.append(f"weakly held, more overlap would help: {', '.join(self.weak)}")
+        return tuple(warnings)
+
+    @property
+    def shortcoming(self) -> str | None:
+        """The threshold that was missed and what would help, or None."""
+        if self.registered >= MIN_REGISTERED:
+            return None
+        return (
+            f"only {len(self.capture.photos)} of {self.given} photos ({self.registered:.0%}) could be used, "
+            f"{MIN_REGISTERED:.0%} are wanted: take sharp photos of one thing at steps of about ten degrees, with "
+            "texture under it and even light"
+        )
+
+
+def capture_photos(
+    photos: Path, out: Path, settings: CaptureSettings = CaptureSettings(), *, progress: Progress | None = None
+) -> CaptureResult:
+    """Find cameras, scale, gravity and masks of photographs; what an interrupted or finished run left is used.
+
+    Args:
+        photos: Folder of photographs of one object or place.
+        out: Folder of the capture; ``sfm/`` in it keeps what a repeated run can use.
+        settings: What else decides the result.
+        progress: Told steps done, of how many, and what is being done.
+
+    Raises:
+        InputError: If there are fewer than three usable photographs, or no cameras can be found from them, or what is
+            given lies where the capture is written.
+        MissingResourceError: If COLMAP or the masks' model fails to run.
+    """
+    _keep_apart(out, photos, settings.masks)
+    files = find_photos(photos)
+    if len(files) < MIN_PHOTOS:
+        raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
+    inputs = _inputs(photos, files, settings)
+    if (done := _finished(out, inputs)) is not None:
+        return done
+    work = out / "sfm"
+    for marker in (_INPUTS, CAPTURE_FILE):  # pictures and masks are about to be others
+        (out / marker).unlink(missing_ok=True)
+    _forget_other_photos(out, inputs, settings)
+    prepared, rejected = prepare_photos(
+        photos, out / "images", max_size=settings.max_size, upright=settings.poses is None, progress=progress
+    )
+    if len(prepared) < MIN_PHOTOS:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
+        raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
+    by_file = {photo.file.name: photo for photo in prepared}
+    model, anchor, faults = _find_model(photos, by_file, settings, work, progress)
+    rejected |= {by_file[file].name: fault for file, fault in faults.items()}
+    capture = Capture(
+        photos=tuple(
+            Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
+            for file, camera in model.cameras.items()
+        ),
+        points=model.points,
+        colours=model.colours,
+        units=anchor.units,
+        up=anchor.up,
+        rejected=rejected,
+        scale_error=anchor.scale_error,
+    ).transformed(anchor.matrix)
+    # What is near depends on what the units are; poses carry none.
+    near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
+    capture = replace(capture, photos=near, table=anchor.table)
+    if settings.undistorted:
+        capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
+    if settings.kind == "object":
+        capture = _masked(capture, anchor, settings, prepared, out, progress)
+        if len(capture.photos) < MIN_PHOTOS:
+            name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
+            raise InputError(
+                f"{photos}: only {len(capture.photos)} photos can be cut out ({name}: {reason}); give masks"
+            )
+    capture = capture.save(out)
+    used = {photo.file.name for photo in capture.photos}
+    for path in (out / "images").iterdir():
+        if path.name not in used:
+            path.unlink()
+    write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
+    kept = {photo.name for photo in capture.photos}
+    doubtful = {
+        by_file[file].name: share
+        for file, share in model.agreement.items()
+        if share < SURE_AGREEMENT and file not in anchor.confirmed and by_file[file].name in kept
+    }
+    result = CaptureResult(capture, len(files), anchor.source, model.reprojection_error, doubtful)
+    record = {key: getattr(result, key) for key in _RECORDED}
+    write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
+    return result
+
+
+def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
+    """Refuse to write among what was given: files of a capture that are no longer needed are removed."""
+    if out.resolve().is_relative_to(photos.resolve()):
+        raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
+    for given in (photos, masks):
+        for made in ("images", "masks", "sfm"):
+            if given is not None and given.resolve().is_relative_to((out / made).resolve()):
+                raise InputError(f"{given}: must not lie in {out / made}, which is written anew")
+
+
+def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
+    """What decides a capture, in JSON."""
+
+    def digest(path: Path) -> str:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    given = [path for path in (settings.poses, settings.masks, settings.mask_model) if path is not None]
+    others = [path for place in given for path in (sorted(place.rglob("*")) if place.is_dir() else [place])]
+    return {
+        "photos": {path.relative_to(photos).as_posix(): digest(path) for path in files},
+        "settings": json.loads(json.dumps(asdict(settings), default=str)),
+        "files": {str(path): digest(path) for path in others if path.is_file()},
+    }
+
+
+def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
+    """The result that ``out`` holds already, if it is of the same inputs."""
+    try:
+        record = json.loads((out / _INPUTS).read_text())
+        if record["inputs"] != inputs:
+            return None
+        capture = Capture.load(out)
+        return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
+    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
+        return None
+
+
+def _forget_other_photos(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
+    """Drop masks, and copies and matches that were made of other photographs or in another way."""
+    way = settings.max_size, settings.poses is None, settings.undistorted
+    marker = json.dumps([inputs["photos"], *way], sort_keys=True)
+    file = out / "sfm" / "photos.json"
+    if not (file.exists() and file.read_text() == marker):
+        shutil.rmtree(out / "sfm", ignore_errors=True)
+        shutil.rmtree(out / "images", ignore_errors=True)
+        write_text(file, marker)
+    elif settings.undistorted:  # the pictures of an earlier run may bear the names of the copies
+        shutil.rmtree(out / "images", ignore_errors=True)
+    shutil.rmtree(out / "masks", ignore_errors=True)
+
+
+def _find_model(
+    photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
+) -> tuple[Model, Anchor, dict[str, str]]:
+    """Cameras that neither each other nor a board contradicts, where they are put, and why other files have none."""
+    faults: dict[str, str] = {}
+    if settings.poses is not None:
+        model = read_poses(settings.poses, list(by_file.values()), work, progress)
+    else:
+        model, faults = _without_faults(find_cameras(list(by_file.values()), work, progress))
+    _demand_cameras(photos, model, by_file, faults)
+    anchor = _anchored(model, by_file, settings)
+    while anchor.wrong:
+        faults |= {
+            file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
+            for file, error in anchor.wrong.items()
+        }
+        model, further = _without_faults(model.without(anchor.wrong), least=0 if settings.poses else MIN_POINTS)
+        faults |= further
+        _demand_cameras(photos, model, by_file, faults)
+        anchor = _anchored(model, by_file, settings)
+    absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
+    elsewhere = "it only fits a smaller group of photos, as of another object or side"
+    for file in by_file.keys() - model.cameras.keys() - faults.keys():
+        faults[file] = elsewhere if file in model.elsewhere else absent
+    return model, anchor, faults
+
+
+def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared], faults: Mapping[str, str]) -> None:
+    """Refuse too few cameras."""
+    if len(model.cameras) < MIN_PHOTOS:
+        reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
+        raise InputError(
+            f"{photos}: cameras of only {len(model.cameras)} of {len(by_file)} photos could be found, {MIN_PHOTOS} are "
+            f"needed{f' ({reasons})' if reasons else ''}; take them closer together, and with texture on or under the "
+            "object"
+        )
+
+
+def _without_faults(model: Model, least: int = MIN_POINTS) -> tuple[Model, dict[str, str]]:
+    """The model without cameras that contradict the others or observe fewer points, and why each is left out."""
+    shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
+    wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
+    model, weak = model.without(wrong).without_weak(least)
+    faults = {
+        file: f"its camera is wrong: it explains only {share:.0%} of its matches" for file, share in wrong.items()
+    }
+    return model, faults | {
+        file: f"only {points} points could be matched in it, {least} are needed" for file, points in weak.items()
+    }
+
+
+def _anchored(model: Model, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
+    if settings.metric:
+        return Anchor(np.eye(4), "metre", "z", table=True, source="the poses given")
+    return find_anchor(
+        model,
+        {file: by_file[file].file for file in model.cameras},
+        board=settings.board,
+        tag=settings.tag,
+        scale_from=_spots(settings.scale_from, by_file),
+        centred=settings.kind == "object",
+    )
+
+
+def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepared]) -> tuple[str, str, float] | None:
+    """``scale_from`` with the copies' names instead of the photos'."""
+    if scale_from is None:
+        return None
+    files = {photo.name: file for file, photo in by_file.items()}
+
+    def stored(spot: str) -> str:
+        name, colon, pixel = spot.rpartition(":")
+        return f"{files.get(name, name)}{colon}{pixel}" if colon else files.get(spot, spot)
+
+    one, other, metres = scale_from
+    return stored(one), stored(other), metres
+
+
+def _masked(
+    capture: Capture,
+    anchor: Anchor,
+    settings: CaptureSettings,
+    prepared: Sequence[Prepared],
+    out: Path,
+    progress: Progress | None,
+) -> Capture:
+    mask_folder = out / "masks"
+    if settings.masks is not None:
+        made = {photo.name: photo for photo in prepared}
+        return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
+    if settings.mask_model is not None:
+        return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
+    if not anchor.table:
+        raise InputError(
+            "no table was found under the object to cut it out by: give masks (--masks or --mask-model), put it on "
+            "something with texture, or capture it as an environment (--kind environment)"
+        )
+    points = object_points(capture)
+    bare = None if anchor.board is None else partial(bare_squares, settings.board, anchor.board)
+    above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
+    masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
+    if len(masked.photos) < MIN_PHOTOS:
+        return masked
+    # What a photo was rejected for may be what the others set right.
+    return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=above)

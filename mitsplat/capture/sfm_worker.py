@@ -1,0 +1,303 @@
+"""Structure from motion by pycolmap, in a process of its own: ``python -m mitsplat.capture.sfm_worker JOB``.
+
+pycolmap can end the process it runs in, and breaks zlib where that was not used before. So nothing else imports it;
+:mod:`mitsplat.capture.structure_from_motion` starts this module, follows its progress and reads what it leaves in the
+job's folder.
+
+JOB is a JSON file, see :func:`run`; ``model.npz`` next to it is the result, ``status`` what is being done.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import threading
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+zlib.compress(b"before pycolmap")
+
+import numpy as np  # noqa: E402
+import pycolmap  # noqa: E402
+
+SEED = 1
+SEQUENTIAL_OVERLAP = 10
+MAX_SAMPSON = 4.0
+"""Error up to which cameras explain a match, as in COLMAP's own verification [px]."""
+
+BLOCK = 12
+"""Images in a block of exhaustive matching: results are stored, and so progress seen, per pair of blocks."""
+
+
+def main(job_file: Path) -> None:
+    """Do the job; whatever goes wrong is left as one line in ``error``."""
+    folder = job_file.parent
+    try:
+        run(json.loads(job_file.read_text()), folder)
+    except (ValueError, RuntimeError, OSError, KeyError, IndexError) as error:
+        (folder / "error").write_text(" ".join(str(error).split()) or type(error).__name__)
+        sys.exit(1)
+
+
+def end_with_parent() -> None:
+    """End this process when the one at the other end of its standard input does, however that ends.
+
+    Left alone it would write on into the database that the next run takes up.
+    """
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def run(job: dict[str, Any], folder: Path) -> None:
+    """Find or read a model and store it.
+
+    Args:
+        job: ``task``: "read" a COLMAP model from ``model``; or "reconstruct" from ``groups`` (names of the photos in
+            ``images`` by shared intrinsics), with ``features``, ``first_octave``, ``matching`` ("exhaustive" or
+            "sequential") and ``enough``, the number of photos below which the global mapper is tried as well; or
+            "triangulate", the same with known ``cameras`` (see :func:`known_model`).
+        folder: Where the database and the results are.
+    """
+    if job["task"] == "read":
+        store(folder, [pycolmap.Reconstruction(job["model"])])
+        return
+    images, database = Path(job["images"]), folder / "database.db"
+    extract(job, images, database, folder)
+    match(job, database, folder)
+    if job["task"] == "triangulate":
+        say(folder, "triangulating")
+        known = known_model(job["cameras"], database)
+        (folder / "known").mkdir(exist_ok=True)
+        found = pycolmap.triangulate_points(known, database, images, folder / "known", options=mapping())
+        store(folder, [found])
+    else:
+        models = reconstruct(images, database, folder, job["enough"])
+        store(folder, models, agreement(models[0], database) if models else {})
+
+
+def say(folder: Path, doing: str) -> None:
+    """Leave word of the stage reached."""
+    (folder / "status").write_text(doing)
+
+
+def number(job: dict[str, Any], images: Path, database: Path) -> None:
+    """Give the photos their ids in the order of the job; photos of a group share a camera.
+
+    Features are stored by several threads as they come. Left to that, ids would differ from run to run, and with them
+    which of two photos is the first of a pair, the order of all pairs, and so every camera found.
+    """
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = job["camera_model"]
+    wanted = [name for names in job["groups"] for name in names]
+    with pycolmap.Database.open(database) as opened:
+        found = [image.name for image in sorted(opened.read_all_images(), key=lambda image: image.image_id)]
+    if found == wanted:
+        return
+    database.unlink()  # interrupted before all were in
+    pycolmap.Database.open(database).close()
+    for names in job["groups"]:
+        pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, names, reader)
+
+
+def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
+    """SIFT features of the photos that have none yet."""
+    say(folder, "finding features")
+    number(job, images, database)
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = job["features"]
+    options.sift.first_octave = job["first_octave"]
+    for names in job["groups"]:
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def match(job: dict[str, Any], database: Path, folder: Path) -> None:
+    """Verified matches of the pairs that have none yet."""
+    say(folder, "matching")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    if job["matching"] == "sequential":
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = SEQUENTIAL_OVERLAP
+        pycolmap.match_sequential(
+            database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+        )
+    else:
+        blocks = pycolmap.ExhaustivePairingOptions()
+        blocks.block_size = BLOCK
+        pycolmap.match_exhaustive(
+            database, pairing_options=blocks, verification_options=verification, device=pycolmap.Device.cpu
+        )
+
+
+def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list[pycolmap.Reconstruction]:
+    """All models found, the largest first: by the incremental mapper, or the global one where that registers more."""
+    say(folder, "finding cameras")
+    options = mapping()
+    registered = 0
+
+    def count() -> None:
+        nonlocal registered
+        registered += 1
+        say(folder, f"finding cameras {registered}")
+
+    output = folder / "models"
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    found = pycolmap.incremental_mapping(database, images, output, options, next_image_callback=count)
+    models = largest_first(found)
+    if models and models[0].num_reg_images() >= enough:
+        return models
+    say(folder, "finding cameras at once")
+    copy = folder / "global.db"
+    shutil.copyfile(database, copy)  # calibration rewrites the two-view geometries
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = SEED
+    pycolmap.calibrate_view_graph(copy, calibration)
+    at_once = pycolmap.GlobalPipelineOptions()
+    at_once.random_seed = at_once.mapper.random_seed = SEED
+    at_once.num_threads = at_once.mapper.num_threads = 1
+    (output / "global").mkdir()
+    others = largest_first(pycolmap.global_mapping(copy, images, output / "global", at_once))
+    copy.unlink()
+    if others and (not models or others[0].num_reg_images() > models[0].num_reg_images()):
+        for model in others:
+            model.extract_colors_for_all_images(images)
+        return others
+    return models
+
+
+def mapping() -> pycolmap.IncrementalPipelineOptions:
+    """Options of the incremental mapper."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    # Several threads of bundle adjustment sum up in any order, and the cameras would differ from run to run.
+    options.num_threads = options.mapper.num_threads = 1
+    options.min_model_size = 3
+    return options
+
+
+def largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """The models by the number of registered photos."""
+    return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.Reconstruction:
+    """A model without points.
+
+    Args:
+        cameras: Per photo ``width``, ``height``, COLMAP's ``model`` and ``params``, ``camera_from_world`` (3, 4).
+        database: Whose ids it takes.
+    """
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        images = opened.read_all_images()
+    for image in images:
+        if image.name not in cameras:
+            continue
+        known = cameras[image.name]
+        camera = pycolmap.Camera(
+            model=known["model"],
+            width=known["width"],
+            height=known["height"],
+            params=known["params"],
+            camera_id=image.camera_id,
+        )
+        model.add_camera_with_trivial_rig(camera)
+        placed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        pose = np.array(known["camera_from_world"])
+        model.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(pose))
+    return model
+
+
+def store(folder: Path, models: list[pycolmap.Reconstruction], shares: Mapping[str, float] | None = None) -> None:
+    """Write the first model with its :func:`agreement`, and which photos the others hold, as ``model.npz``."""
+    arrays: dict[str, Any] = {"elsewhere": sorted(names_of(models[1:]) - names_of(models[:1]))}
+    if models:
+        arrays |= model_arrays(models[0])
+        arrays["agreement"] = np.array([(shares or {}).get(name, 1.0) for name in arrays["names"]])
+    np.savez(folder / "model.npz", **arrays)
+
+
+def agreement(model: pycolmap.Reconstruction, database: Path) -> dict[str, float]:
+    """Share of each photo's verified matches with the other photos that the model's cameras explain.
+
+    Points only tell of the matches that a camera agrees with, so a photo that stands in a wrong place on a few of them
+    has small reprojection errors; here the others speak. The Sampson error (Hartley and Zisserman, 11.4.3) counts.
+    """
+    explained: dict[int, list[int]] = {index: [0, 0] for index in model.reg_image_ids()}
+    with pycolmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+        pixels = {index: opened.read_keypoints(index)[:, :2] for index in explained}
+    cameras = {index: model.camera(model.image(index).camera_id) for index in explained}
+    rays = {index: np.asarray(cameras[index].cam_from_img(pixels[index])) for index in explained}
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        ids = pycolmap.pair_id_to_image_pair(pair)
+        matches = np.asarray(geometry.inlier_matches)
+        if not len(matches) or not all(index in explained for index in ids):
+            continue
+        one, other = (model.image(index) for index in ids)
+        pose = other.cam_from_world() * one.cam_from_world().inverse()
+        x, y, z = pose.translation
+        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose.rotation.matrix()
+        a, b = (
+            np.column_stack([rays[index][matches[:, side]], np.ones(len(matches))]) for side, index in enumerate(ids)
+        )
+        lines_b, lines_a = a @ essential.T, b @ essential
+        spread = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+        errors = np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(spread, 1e-30))
+        focal = sum(cameras[index].mean_focal_length() for index in ids) / 2
+        good = int(np.count_nonzero(errors * focal < MAX_SAMPSON))
+        for index in ids:
+            explained[index][0] += good
+            explained[index][1] += len(matches)
+    return {model.image(index).name: good / total for index, (good, total) in explained.items() if total}
+
+
+def names_of(models: list[pycolmap.Reconstruction]) -> set[str]:
+    """Registered photos."""
+    return {model.image(index).name for model in models for index in model.reg_image_ids()}
+
+
+def model_arrays(model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """The model in arrays: photos sorted by name, parameters padded with NaN."""
+    ids = sorted(model.points3D)
+    row = {point: index for index, point in enumerate(ids)}
+    images = sorted((model.image(index) for index in model.reg_image_ids()), key=lambda image: image.name)
+    cameras = [model.camera(image.camera_id) for image in images]
+    seen = [sorted({row[point.point3D_id] for point in image.points2D if point.has_point3D()}) for image in images]
+    params = np.full((len(images), 32), np.nan)
+    for values, camera in zip(params, cameras, strict=True):
+        values[: len(camera.params)] = camera.params
+    return {
+        "names": [image.name for image in images],
+        "models": [camera.model_name for camera in cameras],
+        "sizes": np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2),
+        "params": params,
+        "poses": np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        "points": np.array([model.point3D(point).xyz for point in ids]).reshape(-1, 3),
+        "colours": np.array([model.point3D(point).color for point in ids], dtype=np.uint8).reshape(-1, 3),
+        "seen": np.array([index for indices in seen for index in indices], dtype=np.int32),
+        "seen_counts": np.array([len(indices) for indices in seen], dtype=np.int64),
+        "reprojection_error": model.compute_mean_reprojection_error() if ids else np.nan,
+    }
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    main(Path(sys.argv[1]))

@@ -1,0 +1,13 @@
+"""A folder of labelled frames that survives whatever ends it.
+
+In: a scene. Out: a dataset on disk, by any number of processes and machines, resumed or not, in shards or whole: the
+same bytes. Scenes that can come to nothing are refused before work starts (:mod:`.prospects`).
+"""
+
+from __future__ import annotations
+
+from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.dataset.write import DatasetSummary, write_dataset
+
+__all__ = ["DatasetSummary", "Shard", "merge_shards", "write_dataset"]

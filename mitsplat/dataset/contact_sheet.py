@@ -1,0 +1,72 @@
+"""A dataset's frames on one sheet, labels drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import ByteImage
+from mitsplat.files import Record, write_file
+from mitsplat.formats.coco import image_file
+from mitsplat.labels.labels import Labels
+from mitsplat.labels.overlay import draw_labels
+
+_COLUMNS = 4
+_TILE_WIDTH = 480
+_CAPTION = 24
+_GAP = 6
+
+
+def spread(total: int, count: int) -> set[int]:
+    """Up to ``count`` positions, evenly spread over ``total``."""
+    return {round(float(place)) for place in np.linspace(0, total - 1, min(count, total))}
+
+
+class ContactSheet:
+    """A picture of up to ``count`` frames, labels drawn, evenly spread over the ``total`` of a dataset in ``root``."""
+
+    def __init__(self, root: Path, total: int, *, count: int = 16) -> None:
+        self._root = root
+        self._chosen = spread(total, count)
+        self._heard = 0
+        self._tiles: list[ByteImage] = []
+
+    def add(self, record: Record) -> None:
+        """See the next frame.
+
+        Raises:
+            OSError: If its image cannot be read.
+        """
+        if self._heard in self._chosen:
+            self._tiles.append(_tile(self._root, record))
+        self._heard += 1
+
+    def write(self, path: Path) -> None:
+        """Write the picture as JPEG."""
+        tiles = self._tiles
+        height, width = max(tile.shape[0] for tile in tiles) + _GAP, _TILE_WIDTH + _GAP
+        columns = min(_COLUMNS, len(tiles))
+        sheet = np.full((-(-len(tiles) // columns) * height, columns * width - _GAP, 3), 32, dtype=np.uint8)
+        for i, tile in enumerate(tiles):
+            top, left = i // columns * height, i % columns * width
+            sheet[top : top + tile.shape[0], left : left + _TILE_WIDTH] = tile
+        _, data = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
+        write_file(path, lambda temporary: temporary.write_bytes(bytes(data)))
+
+
+def _tile(root: Path, record: Record) -> ByteImage:
+    file = root / image_file(record)
+    image = cv2.imread(str(file))
+    if image is None:
+        raise OSError(f"{file} cannot be read as an image")
+    rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    drawn = draw_labels(rgb, Labels.from_json(record["labels"]))
+    height = max(1, round(drawn.shape[0] * _TILE_WIDTH / drawn.shape[1]))
+    shrink = cv2.INTER_AREA if drawn.shape[1] > _TILE_WIDTH else cv2.INTER_LINEAR
+    tile = np.full((height + _CAPTION, _TILE_WIDTH, 3), 32, dtype=np.uint8)
+    tile[:height] = cv2.resize(drawn, (_TILE_WIDTH, height), interpolation=shrink)
+    caption = f"{record['index']:06d}  {record['split']}  {len(record['labels']['instances'])} instances"
+    cv2.putText(tile, caption, (6, height + 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (230, 230, 230), 1, cv2.LINE_AA)
+    return tile

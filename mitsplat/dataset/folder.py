@@ -1,0 +1,307 @@
+"""The folder of a dataset: who writes it, what is in it, and what may be there before."""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from mitsplat.dataset.contact_sheet import ContactSheet
+from mitsplat.dataset.inputs import describe_inputs
+from mitsplat.dataset.manifest import Manifest, cut_torn_line
+from mitsplat.errors import InputError, PartialResultError
+from mitsplat.files import Record, storage_errors, write_file, write_text
+from mitsplat.formats.registry import Catalogue, CollectionWriter
+
+if TYPE_CHECKING:
+    from mitsplat.scene.scene import Scene
+
+CONTENT = "dataset.json"
+MANIFEST = "manifest.jsonl"
+TIMINGS = "timings.jsonl"
+RUNS = "runs.jsonl"
+SHEET = "contact_sheet.jpg"
+SHARD = "shard.json"
+LOCK = ".lock"
+_UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
+"""Names of what may be in a folder before ``dataset.json`` is."""
+_ENTRIES = (
+    *("images", "labels", "layers", "annotations", "layouts", "scene"),
+    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "voc", "bop", "colmap"),
+    *("depth", "normals", "instances", "semantic", "flow", "report.html"),
+    *("data.yaml", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
+)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a dataset, made apart from the others.
+
+    Attributes:
+        number: From 1.
+        count: Of all shards.
+
+    Raises:
+        InputError: If there is no such part.
+    """
+
+    number: int
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.number <= self.count:
+            raise InputError(f"a shard must be I/N with I from 1 to N (got {self.number}/{self.count})")
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """The shard that a text such as ``2/8`` names."""
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal()):
+            raise InputError(f"a shard must be I/N, such as 2/8 (got {text})")
+        return cls(int(number), int(count))
+
+    def frames(self, total: int, views: int) -> range:
+        """Its frames of ``total``: neighbours, and whole layouts of ``views`` frames where there are enough of them.
+
+        Raises:
+            InputError: If there are fewer frames than shards.
+        """
+        if self.count > total:
+            raise InputError(f"there must not be more shards than frames, {total} (got {self.count})")
+        layouts = -(-total // views)
+        unit, units = (views, layouts) if layouts >= self.count else (1, total)
+        first, last = (unit * (units * part // self.count) for part in (self.number - 1, self.number))
+        return range(first, min(last, total))
+
+    def to_json(self, total: int) -> dict[str, int]:
+        """What ``shard.json`` says of this part of ``total`` frames."""
+        return {"shard": self.number, "of": self.count, "frames": total}
+
+
+@contextmanager
+def open_folder(
+    out: Path,
+    content: dict[str, Any],
+    scene_file: Path,
+    shard: dict[str, int] | None,
+    *,
+    resume: bool,
+    overwrite: bool,
+) -> Iterator[Manifest]:
+    """Lock and prepare the folder of a dataset; its manifest, without the frames that miss a file.
+
+    Args:
+        out: The folder, made if missing.
+        content: For ``dataset.json``.
+        scene_file: Kept in ``scene/``.
+        shard: For ``shard.json``, or None.
+        resume: Whether a dataset may be there already.
+        overwrite: Remove it first.
+
+    Raises:
+        InputError: If the folder cannot be written, is in use, or holds something else.
+        MissingResourceError: If the disk is full.
+    """
+    _check_own(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = (out / LOCK).open("a+")
+    except OSError as error:
+        raise InputError(f"cannot write into {out}: {error.strerror}") from error
+    with lock:
+        _take_lock(out, lock)
+        try:
+            with storage_errors(out):
+                lock.truncate(0)
+                lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+                lock.flush()
+                if overwrite:
+                    _remove_dataset(out)
+                _check_resumable(out, content, shard, resume=resume)
+                _prepare(out, scene_file, content, shard)
+                yield Manifest(out / MANIFEST, keep=lambda record: missing_file(out, record) is None)
+        finally:
+            _remove_partial(out)
+
+
+@contextmanager
+def open_finished(out: Path) -> Iterator[Manifest]:
+    """The manifest of a dataset that nobody is writing, and nobody is as long as this is open.
+
+    Raises:
+        InputError: If it is in use or damaged.
+    """
+    try:
+        lock = (out / LOCK).open("a+")
+    except OSError as error:
+        raise InputError(f"{out / LOCK}: {error.strerror}") from error
+    with lock:
+        _take_lock(out, lock)
+        yield Manifest(out / MANIFEST)
+
+
+def _take_lock(out: Path, lock: IO[str]) -> None:
+    """Refuse a folder that another run writes; the lock goes with the open file, however its process ends."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.seek(0)
+        raise InputError(f"{out} is being written by another run ({lock.read()})") from None
+
+
+def finish_folder(
+    out: Path,
+    manifest: Manifest,
+    content: dict[str, Any],
+    catalogue: Catalogue,
+    hear: Callable[[Record], object],
+) -> None:
+    """Sort the manifest and describe the whole dataset, all of whose frames are there, in one pass over its records.
+
+    Args:
+        out: The dataset.
+        manifest: Its records.
+        content: What ``dataset.json`` says.
+        catalogue: What the labels refer to.
+        hear: Is told every record.
+
+    Raises:
+        PartialResultError: If a file was removed in the meantime.
+    """
+
+    def check(missing: Path | None) -> None:
+        if missing is not None:
+            raise PartialResultError(f"{missing}: must not be removed while its dataset is written; run again")
+
+    def describe(record: Record) -> None:
+        check(missing_file(out, record))
+        collection.add(record)
+        sheet.add(record)
+        hear(record)
+
+    check(None if (out / CONTENT).is_file() else out / CONTENT)
+    sheet = ContactSheet(out, len(manifest))
+    with CollectionWriter(out, catalogue, content["scene"]["output"]["formats"]) as collection:
+        manifest.sort(describe)
+        collection.keep()
+    sheet.write(out / SHEET)
+
+
+def missing_file(out: Path, record: Record) -> Path | None:
+    """The first of a frame's files that is not there, or None."""
+    missing = next((file for file in record["files"] if not os.path.isfile(f"{out}/{file}")), None)  # noqa: PTH113
+    return None if missing is None else out / missing
+
+
+def _check_own(out: Path) -> None:
+    """Refuse a folder that holds something other than a dataset of mitsplat, which must not be mixed up or removed."""
+    try:
+        present = json.loads((out / CONTENT).read_bytes())
+        own = isinstance(present, dict) and "mitsplat" in present
+    except (FileNotFoundError, NotADirectoryError):
+        own = not out.is_dir() or all(_UNFINISHED.fullmatch(entry.name) for entry in out.iterdir())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{out / CONTENT} cannot be read ({error})") from error
+    if not own:
+        raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds other files)")
+
+
+def _check_resumable(out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool) -> None:
+    """Refuse to continue a dataset against the caller's will, or one that another scene began."""
+    if not (out / CONTENT).exists():
+        return
+    if not resume:
+        raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
+    present = json.loads((out / CONTENT).read_bytes())
+    if difference := first_difference({**present, "libraries": None}, {**content, "libraries": None}):
+        key, before, now = difference
+        raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
+    stored = read_shard(out)
+    if stored != shard:
+        before, now = (f"shard {part['shard']}/{part['of']}" if part else "a whole dataset" for part in (stored, shard))
+        raise InputError(f"{out} cannot be resumed: it was {before} and is {now}; overwrite it or choose another")
+
+
+def read_shard(out: Path) -> dict[str, int] | None:
+    """What ``shard.json`` says, None for a whole dataset.
+
+    Raises:
+        InputError: If it is damaged.
+    """
+    path = out / SHARD
+    try:
+        stored: dict[str, int] = json.loads(path.read_bytes())
+        Shard(stored["shard"], stored["of"]).frames(stored["frames"], 1)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: must say which shard this is ({error!r})") from error
+    return stored
+
+
+def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[str, int] | None) -> None:
+    """Make what describes the run, by which the folder is known for a dataset, then the rest; clear what is torn."""
+    _remove_partial(out)
+    if not (out / CONTENT).exists():
+        if shard is not None:
+            write_text(out / SHARD, json.dumps(shard) + "\n")
+        write_text(out / CONTENT, json.dumps(content, indent=1) + "\n")
+    (out / "layouts").mkdir(exist_ok=True)
+    if not (out / "scene" / scene_file.name).exists():
+        write_file(out / "scene" / scene_file.name, lambda temporary: shutil.copyfile(scene_file, temporary))
+    cut_torn_line(out / TIMINGS)
+    cut_torn_line(out / RUNS)
+
+
+def _remove_dataset(out: Path) -> None:
+    """Remove what mitsplat writes and nothing else; its mark last, so that an interruption can be repeated."""
+    for name in _ENTRIES:
+        entry = out / name
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        elif name not in (LOCK, CONTENT):
+            entry.unlink(missing_ok=True)
+    (out / CONTENT).unlink(missing_ok=True)
+
+
+def _remove_partial(out: Path) -> None:
+    for folder, _, names in os.walk(out):
+        for name in names:
+            if name.startswith(".") and name.endswith(".part"):
+                (Path(folder) / name).unlink(missing_ok=True)
+
+
+def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
+    """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
+    from mitsplat.version import __version__
+
+    libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
+    return {
+        "mitsplat": __version__,
+        "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
+        "classes": list(scene.class_names),
+        "keypoints": [list(names) for names in catalogue.keypoint_names],
+        "assets": list(catalogue.assets),
+        "inputs": describe_inputs(scene),
+        "libraries": {name: importlib.metadata.version(name) for name in libraries},
+    }
+
+
+def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
+    """Dotted key and the two values, as JSON, where two JSON values differ first."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in sorted({*before, *now}):
+            inner = first_difference(before.get(name), now.get(name), f"{key}.{name}" if key else name)
+            if inner is not None:
+                return inner
+        return None
+    return None if before == now else (key, json.dumps(before), json.dumps(now))

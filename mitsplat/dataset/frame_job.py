@@ -1,0 +1,178 @@
+"""The engine's unit of work: one frame rendered, and its files written here or brought home from another machine."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+import tempfile
+import time
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mitsplat.dataset.folder import LOCK
+from mitsplat.errors import PartialResultError
+from mitsplat.files import Record, link_file, storage_errors, write_file, write_text
+from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.progress import Note
+
+if TYPE_CHECKING:
+    from mitsplat.frames.frame import Frame
+    from mitsplat.scene.layout import Layout
+    from mitsplat.scene.scene import Scene
+
+Render = Callable[..., "Frame"]
+"""As :func:`mitsplat.frames.frame.render_frame`."""
+Settle = Callable[..., "Layout"]
+"""As :func:`mitsplat.physics.settle.settle_layout`."""
+
+
+@dataclass
+class FrameMaker:
+    """Renders one frame and writes its files; the unit of work of the engine."""
+
+    scene: Scene
+    catalogue: Catalogue
+    out: Path
+    render: Render
+    settle: Settle
+    _kept: Layout | None = None
+
+    def __call__(self, index: int, note: Note, /) -> tuple[Record, dict[str, float]]:
+        """Make frame ``index``; its record and the seconds of its stages."""
+        from mitsplat.scene.scene import layout_of
+
+        start = time.perf_counter()
+        layout = self._layout(layout_of(self.scene, index), note)
+        settled = time.perf_counter()
+        record, seconds = self.write(index, layout)
+        return record, {**seconds, "settle": round(settled - start, 4)}
+
+    def write(self, index: int, layout: Layout) -> tuple[Record, dict[str, float]]:
+        """Make the files of a frame; its record and the seconds of its stages."""
+        frame = self.render(self.scene, index, layout=layout)
+        rendered = time.perf_counter()
+        with storage_errors(self.out):
+            record = write_frame(frame, self.out, self.scene.spec, self.catalogue)
+        stages = {**frame.seconds, "write": time.perf_counter() - rendered}
+        return record, {stage: round(seconds, 4) for stage, seconds in stages.items()}
+
+    def settled(self, index: int, note: Note) -> str:
+        """A layout as JSON."""
+        note(f"settling layout {index}")
+        layout = self.settle(self.scene, index, progress=lambda text: note(f"layout {index}: {text}"))
+        return json.dumps(layout.to_json())
+
+    def _layout(self, index: int, note: Note) -> Layout:
+        """The layout from its file, settled by the first process that asks while others wait for it."""
+        if self._kept is not None and self._kept.index == index:
+            return self._kept
+        path = self.out / f"layouts/{index:04d}.json"
+        with storage_errors(self.out), (path.parent / LOCK).open("ab") as lock:
+            fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; freed with the file or the process
+            if not path.exists():
+                write_text(path, self.settled(index, note))
+            return self.keep(path.read_bytes())
+
+    def keep(self, text: str | bytes) -> Layout:
+        """The layout that JSON describes, the same object as before if it is the same.
+
+        It is always read back, so that a resumed run works with the very same numbers, and stays the same object from
+        view to view, by which the renderer knows that nothing moved.
+        """
+        from mitsplat.scene.layout import Layout
+
+        stored = json.loads(text)
+        if self._kept is None or self._kept.index != stored["index"]:
+            self._kept = Layout.from_json(stored)
+        return self._kept
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A frame that was made on another machine.
+
+    Attributes:
+        record: Its line in the manifest.
+        seconds: Of its stages.
+        contents: Contents of its files, by SHA-256.
+        layout: The layout that it shows, as JSON.
+    """
+
+    record: Record
+    seconds: dict[str, float]
+    contents: dict[str, bytes]
+    layout: str
+
+    def unpack(self, out: Path) -> Record:
+        """Write the files into a dataset's folder; equal ones are one file with several names.
+
+        Raises:
+            OSError: If they cannot be written.
+            PartialResultError: If they were damaged on their way.
+        """
+        layout = out / f"layouts/{self.record['layout']:04d}.json"
+        if not layout.exists():
+            write_text(layout, self.layout)
+        first: dict[str, Path] = {}
+        for file, digest in self.record["files"].items():
+            if digest in first:
+                found = write_file(out / file, partial(link_file, first[digest]))
+            else:
+                found = write_file(out / file, partial(_write_bytes, self.contents[digest]))
+            if found != digest:
+                raise PartialResultError(f"{out / file}: must have the SHA-256 {digest} (got {found}); run again")
+            first.setdefault(digest, out / file)
+        return self.record
+
+
+class RemoteFrames:
+    """Settles layouts and makes frames where no file of the caller is: what is made is returned instead.
+
+    Args:
+        maker: Makes the frames.
+    """
+
+    def __init__(self, maker: FrameMaker) -> None:
+        self.maker = maker
+        self._images = {name: (path.suffix, path.read_bytes()) for name, path in maker.scene.images.items()}
+        self._unpacked = False
+
+    def known(self, layout: int) -> str | None:
+        """A layout that the dataset's folder has already; asked where the folder is."""
+        path = self.maker.out / f"layouts/{layout:04d}.json"
+        return path.read_text() if path.exists() else None
+
+    def settle(self, layout: int) -> str:
+        """A layout as JSON."""
+        return self.maker.settled(layout, lambda text: None)
+
+    def make(self, index: int, layout: str) -> Parcel:
+        """Make frame ``index`` of a layout."""
+        self._unpack_images()
+        with tempfile.TemporaryDirectory(prefix="mitsplat-") as folder:
+            self.maker.out = Path(folder)
+            record, seconds = self.maker.write(index, self.maker.keep(layout))
+            contents = {digest: (Path(folder) / file).read_bytes() for file, digest in record["files"].items()}
+        return Parcel(record, seconds, contents, layout)
+
+    def _unpack_images(self) -> None:
+        """Write the images of lights, which Mitsuba reads from files, into a folder that goes with this object."""
+        if self._unpacked or not self._images:
+            return
+        folder = Path(tempfile.mkdtemp(prefix="mitsplat-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        images = {}
+        for number, (name, (suffix, content)) in enumerate(self._images.items()):
+            images[name] = folder / f"{number}{suffix}"
+            images[name].write_bytes(content)
+        self.maker.scene = replace(self.maker.scene, images=images)
+        self._unpacked = True
+
+
+def _write_bytes(content: bytes, path: Path) -> None:
+    path.write_bytes(content)

@@ -1,0 +1,72 @@
+"""What a scene read, for comparison when a dataset is resumed: by the place that reads it, never by a name.
+
+Names are the users' to give twice, and one asset differs from entry to entry by its size, scale and class.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+
+from mitsplat.splats import Splats
+
+if TYPE_CHECKING:
+    from mitsplat.asset import Asset
+    from mitsplat.scene.scene import Scene
+
+_NO_CONTENT = frozenset({"folder"})
+"""Fields of an asset that say where it is and not what."""
+
+
+def describe_inputs(scene: Scene) -> dict[str, Any]:
+    """What each entry of a scene file came to, by its key: ``objects[1]``, ``environment``, ``lights[0].image``.
+
+    Of assets all values, and SHA-256 of splats and meshes, with the entry's size, scale and class applied.
+    """
+    described = _Describer()
+    found: dict[str, Any] = {f"objects[{i}]": described.asset(asset) for i, asset in enumerate(scene.assets)}
+    if scene.environment is not None:
+        found["environment"] = described.asset(scene.environment)
+    for i, mesh in enumerate(scene.shape_meshes):
+        found[f"shapes[{i}]"] = described.value(mesh)
+    for i, light in enumerate(scene.spec.lights):
+        if image := getattr(light, "image", None):
+            found[f"lights[{i}].image"] = hashlib.sha256(scene.images[image].read_bytes()).hexdigest()
+    return found
+
+
+class _Describer:
+    """Describes assets; splats and meshes that several of them share are hashed once."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[object, str]] = {}
+
+    def asset(self, asset: Asset) -> dict[str, Any]:
+        """Every field, so that none which is added later is forgotten."""
+        return {f.name: self.value(getattr(asset, f.name)) for f in fields(asset) if f.name not in _NO_CONTENT}
+
+    def value(self, value: Any) -> Any:
+        """A field as JSON."""
+        if isinstance(value, Splats | trimesh.Trimesh):
+            if id(value) not in self._known:
+                columns = [f.name for f in fields(value)] if isinstance(value, Splats) else ["vertices", "faces"]
+                self._known[id(value)] = value, _hash(*[getattr(value, column) for column in columns])
+            return self._known[id(value)][1]
+        if isinstance(value, Mapping):
+            return {name: self.value(entry) for name, entry in value.items()}
+        if isinstance(value, tuple):
+            return [self.value(entry) for entry in value]
+        return value
+
+
+def _hash(*arrays: Any) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype} {np.shape(array)}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

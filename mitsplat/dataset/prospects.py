@@ -1,0 +1,357 @@
+"""What can be known of a scene before work starts: why a run could end in nothing, or in more than the machine holds.
+
+Each function yields the faults that it finds, as :class:`mitsplat.findings.Finding`; ``mitsplat check`` tells all of
+them, and commands refuse the first (:func:`refuse`). Only what is certain is a fault: bounds are generous everywhere,
+for a scene that is refused wrongly cannot be rendered at all.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.engine.resources import unused_memory
+from mitsplat.errors import InputError
+from mitsplat.findings import Finding
+from mitsplat.scene.scene import Scene, plan_frame
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds
+
+MOST_OBJECTS = 65535
+"""Instance ids have 16 bits."""
+MOST_FRAMES = 2**31 - 1
+MOST_STEPS = 1_000_000
+"""Of a simulation; 30 objects take a second for 250 or 1000 of them, as they are stepped."""
+VIEWS = 48
+"""Views that are looked at, spread over the run."""
+NARROWEST = 0.01
+"""Share of the smallest object that an image must show at least."""
+PIXEL_BYTES, PROCESS_GIB = 400, 0.5
+"""Least memory of a pixel at the peak of a frame, and of a process besides; the workcell takes 1.0 GiB at 640x360,
+2.6 at 2000x2000 and 8.4 at 4000x4000."""
+FRAME_BYTES = 8192
+"""Least room on the disk of a frame: an image and a label, a block each."""
+_CELLS = 24  # of a region along each axis, in which is looked for room
+_PAIRS = 1_000_000  # of a point and a triangle that are looked at together
+
+
+def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
+    """Refuse a scene for the first of its faults.
+
+    Raises:
+        InputError: If there is one.
+    """
+    for fault in faults:
+        raise InputError(f"{scene.path}: {fault.text}; {fault.remedy}")
+
+
+def run_faults(
+    scene: Scene,
+    frames: Sequence[int] | None = None,
+    *,
+    out: Path | None = None,
+    workers: int | None = None,
+    elsewhere: bool = False,
+) -> Iterator[Finding]:
+    """Everything that stands against making a dataset.
+
+    Args:
+        scene: What to render.
+        frames: Which of its frames; all if None.
+        out: Where to write them; here if None.
+        workers: Processes that make them.
+        elsewhere: Whether they are made on other machines.
+    """
+    yield from count_faults(scene)
+    yield from layout_faults(scene)
+    if not elsewhere:
+        yield from image_faults(scene, workers)
+    frames = range(min(scene.num_frames, MOST_FRAMES)) if frames is None else frames
+    yield from label_faults(scene, frames)
+    yield from disk_faults(len(frames), out)
+
+
+def count_faults(scene: Scene) -> Iterator[Finding]:
+    """More objects or images than have numbers."""
+    most = sum(len(entry.poses) or entry.count[1] for entry in scene.spec.objects)
+    if most > MOST_OBJECTS:
+        text = f"objects: a layout must have at most {MOST_OBJECTS} objects, as many as there are ids (got {most})"
+        yield Finding("count", False, text, "lower objects[].count")
+    if scene.num_frames > MOST_FRAMES:
+        text = f"output: layouts x views must be at most {MOST_FRAMES} images (got {scene.num_frames})"
+        yield Finding("frames", False, text, "lower output.layouts or output.views")
+
+
+def layout_faults(scene: Scene) -> Iterator[Finding]:
+    """Why no layout can come to rest."""
+    settle, region = scene.spec.settle, scene.spec.region
+    if settle.max_time / settle.timestep > MOST_STEPS:
+        yield Finding(
+            "time",
+            False,
+            f"settle: max_time / timestep must be at most {MOST_STEPS} steps "
+            f"(got {settle.max_time:g} s / {settle.timestep:g} s)",
+            "lower settle.max_time",
+        )
+    dropped = [i for i, entry in enumerate(scene.spec.objects) if not entry.poses]
+    if not dropped:
+        return
+    low, high = np.array(region.min), np.array(region.max)
+    supports = [mesh.bounds for name, mesh in _colliders(scene) if not name.startswith(ENCLOSURE)]
+    if supports and not any(
+        (box[0, :2] < high[:2]).all() and (box[1, :2] > low[:2]).all() and box[0, 2] < high[2] for box in supports
+    ):
+        text = "region: nothing that collides is below it, so that all objects fall for ever"
+        yield Finding("support", False, text, "move region above the table, or the table below it")
+        return
+    if scene.spec.settle.arrangement == "pile":
+        high[2] += PILE_HEIGHT
+    yield from _room_faults(scene, dropped, low, high)
+
+
+def _room_faults(scene: Scene, dropped: Sequence[int], low: Float64Array, high: Float64Array) -> Iterator[Finding]:
+    """Whether there is room for the objects in a region: of what is in the way, and of their number."""
+    meshes = [mesh for i in dropped if (mesh := scene.assets[i].mesh) is not None]
+    finest = min(float(mesh.extents.min()) for mesh in meshes) / 2
+    cells = np.clip(np.ceil((high - low) / finest), 5, _CELLS).astype(int)
+    axes = [start + (end - start) * (np.arange(n) + 0.5) / n for start, end, n in zip(low, high, cells, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    taken = np.zeros(len(points), dtype=bool)
+    in_way = []
+    for name, mesh in _colliders(scene):
+        inside = points_inside(mesh, points)
+        if inside.any():
+            in_way.append(repr(name))
+        taken |= inside
+    if taken.all():
+        text = f"region: lies inside of what collides with objects, {' and '.join(in_way)}"
+        yield Finding("region", False, text, "move region above it")
+        return
+    volume = float(np.prod(high - low)) * float((~taken).mean())
+    hulls = {id(mesh): float(mesh.convex_hull.volume) for mesh in meshes}
+    numbers = [scene.spec.objects[i].count[1] for i in dropped]
+    need = float(np.dot(numbers, [hulls[id(mesh)] for mesh in meshes]))
+    if need > volume:
+        yield Finding(
+            "room",
+            False,
+            f"region: at most {sum(numbers)} objects of {1e3 * need:.3g} l must start in it at once "
+            f"(it has {1e3 * volume:.3g} l)",
+            "lower objects[].count or make region larger",
+        )
+
+
+def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
+    """Images, or workers that make them, that this machine has no memory for."""
+    output, free = scene.spec.output, unused_memory()
+    need = PROCESS_GIB + output.width * output.height * PIXEL_BYTES / 2**30
+    size = f"an image of {output.width}x{output.height} px"
+    if need > free:
+        text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
+        yield Finding("memory", False, text, "lower output.width and height")
+    elif workers is not None and workers * need > free:
+        text = f"workers: {workers} that each make {size} take at least {workers * need:.0f} GiB of memory"
+        yield Finding("memory", False, f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
+
+
+def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
+    """More images than the disk can hold."""
+    place = (out or Path.cwd()).absolute()
+    while not place.is_dir():
+        place = place.parent
+    free, need = shutil.disk_usage(place).free, frames * FRAME_BYTES
+    if need > free:
+        text = (
+            f"output: {frames} images take at least {need / 2**30:.1f} GiB ({free / 2**30:.1f} GiB are free at {place})"
+        )
+        yield Finding("disk", False, text, "lower output.layouts or views, give --frames, or write to another disk")
+
+
+def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
+    """Why no image can have a label: cameras do not see where objects can be, or not as large as labels must be."""
+    spec, least = scene.spec, scene.spec.labels.min_pixels
+    meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
+    if not meshes or not len(frames):
+        return
+    pixels = spec.output.width * spec.output.height
+    if pixels < least:
+        text = f"output: an image of {pixels} px cannot show labels.min_pixels = {least}"
+        yield Finding("labels", False, text, "make output.width and height larger")
+        return
+    cameras = _cameras(scene, frames)
+    hidden = [name for camera in cameras if (name := _solid_around(scene, camera.centre))]
+    if len(hidden) == len(cameras):
+        text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
+        yield Finding("sight", False, text, "move camera out of it")
+        return
+    low, high = _reach(scene)
+    if not any(sees(camera, low, high) for camera in cameras):
+        yield _blind(cameras, low, high)
+        return
+    depths = [_depths(camera, low, high) for camera in cameras]
+    across = [far * c.width / c.fx for c, (_, far) in zip(cameras, depths, strict=True)]
+    smallest = min(float(mesh.extents.max()) for mesh in meshes)
+    if max(across) < NARROWEST * smallest:
+        text = (
+            f"camera.intrinsics: an image shows at most {max(across):.2g} m (the smallest object has {smallest:.2g} m)"
+        )
+        yield Finding("lens", False, text, "fx and fy are focal lengths in pixels")
+    largest = max(float(np.linalg.norm(mesh.extents)) for mesh in meshes)
+    shown = max(_most_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
+    if shown < least:
+        text = f"camera: no object covers more than {shown:.2g} px in any view (labels.min_pixels is {least})"
+        yield Finding("labels", False, text, "move camera nearer, or make fx or the image larger")
+
+
+def doubts(scene: Scene) -> Iterator[Finding]:
+    """What a run survives but was hardly meant: some views from inside of solids, lights inside of them, small bins."""
+    spec = scene.spec
+    cameras = _cameras(scene, range(min(scene.num_frames, MOST_FRAMES)))
+    inside = [name for camera in cameras if (name := _solid_around(scene, camera.centre))]
+    low, high = _reach(scene)
+    blind = sum(not sees(camera, low, high) for camera in cameras)
+    yield Finding(
+        "views",
+        not inside and not blind,
+        f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
+        "move camera, its keys or its ranges: such images have no labels",
+    )
+    for number, light in enumerate(spec.lights):
+        position = getattr(light, "position", None)
+        if position is not None and (name := _solid_around(scene, np.array(position))):
+            text = f"lights[{number}] is inside of shape {name!r}"
+            yield Finding("lights", False, text, "move it out: it lights nothing")
+    for shape in spec.shapes:
+        if shape.bin is None:
+            continue
+        opening = np.sort(shape.bin.size[:2])
+        for asset in {asset.name: asset for asset in scene.assets}.values():
+            if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
+                text = f"{asset.name!r} does not fit into {shape.name!r}"
+                yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
+
+
+def points_inside(mesh: trimesh.Trimesh, points: Float64Array) -> BoolArray:
+    """Which of some points (N, 3) are inside a mesh: around which it winds, as often as not (Jacobson et al. 2013).
+
+    The solid angles of its triangles are those of Van Oosterom and Strackee (1983).
+    :class:`mitsplat.mesh_distance.Surface` finds the same faster, once physics has been started, for which no check
+    should wait.
+    """
+    low, high = mesh.bounds
+    inside = ((points > low) & (points < high)).all(axis=1)
+    triangles = np.asarray(mesh.triangles, dtype=np.float64)
+    nearby = np.flatnonzero(inside)
+    for chunk in np.array_split(nearby, math.ceil(len(nearby) * len(triangles) / _PAIRS) or 1):
+        corners = triangles[None] - points[chunk][:, None, None]
+        a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]
+        la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+        volume = np.einsum("pti,pti->pt", a, np.cross(b, c))
+        ab, bc, ca = (np.einsum("pti,pti->pt", *sides) for sides in ((a, b), (b, c), (c, a)))
+        angles = 2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+        inside[chunk] = np.abs(angles.sum(axis=1)) > 2 * np.pi
+    return np.asarray(inside)
+
+
+def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
+    """Whether a camera sees anything of a box, as far as nothing is in the way.
+
+    A box that is small in the image is met by points of it, one that is large by rays: one of both is dense.
+    """
+    grid = np.stack(np.meshgrid(*([np.linspace(0, 1, 9)] * 3), indexing="ij"), axis=-1).reshape(-1, 3)
+    pixels, depth = camera.project(low + grid * (high - low))
+    with np.errstate(invalid="ignore"):
+        shown = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (depth > camera.near)
+    if shown.any():
+        return True
+    across = np.stack(np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)), axis=-1)
+    slopes = camera.ray_slopes(across.reshape(-1, 2))
+    # Rays of depth 1 for every unit of length, so that their parameter is the depth.
+    rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([(low - camera.centre) / rays, (high - camera.centre) / rays])
+    first, last = np.nanmax(ends.min(axis=0), axis=1), np.nanmin(ends.max(axis=0), axis=1)
+    return bool((np.maximum(first, camera.near) < last).any())
+
+
+def _blind(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> Finding:
+    """Why no camera sees a box."""
+    touching = [replace(camera, near=1e-9) for camera in cameras]
+    if any(sees(camera, low, high) for camera in touching):
+        far = max(_depths(camera, low, high)[1] for camera in touching)
+        text = (
+            f"camera.intrinsics.near: must be nearer than what objects can reach, {far:.3g} m (got {cameras[0].near:g})"
+        )
+        return Finding("sight", False, text, "lower it")
+    text = f"camera: no view shows any place that objects can reach ({len(cameras)} looked at)"
+    return Finding("sight", False, text, "turn camera to region: `mitsplat preview` shows where it looks")
+
+
+def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:
+    """Cameras of some of the frames."""
+    chosen = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
+    return [plan_frame(scene, frames[position]).camera for position in sorted(chosen)]
+
+
+def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
+    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+        if shape.collider:
+            yield shape.name, mesh
+    around = scene.environment
+    if scene.spec.environment_collides and around is not None and around.mesh is not None:
+        yield around.name, around.mesh
+
+
+def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
+    """Corners of a box [m] that no point of any object leaves before its layout is drawn again."""
+    region = scene.spec.region
+    colliders = list(_colliders(scene))
+    boxes = [np.asarray(mesh.bounds) for _, mesh in colliders] or [np.array([region.min, region.max])]
+    walls = [
+        position
+        for position, (shape, _) in enumerate(
+            pair for pair in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if pair[0].collider
+        )
+        if not (shape.visible or shape.proxy)
+    ]
+    low, high = enclosed_bounds(region, boxes, walls)
+    if scene.spec.settle.arrangement == "pile":
+        high[2] += PILE_HEIGHT
+    beyond = max(
+        (float(np.linalg.norm(asset.mesh.extents)) for asset in scene.assets if asset.mesh is not None), default=0.0
+    )
+    return low - beyond, high + beyond
+
+
+def _depths(camera: Camera, low: Float64Array, high: Float64Array) -> tuple[float, float]:
+    """Least and largest depth of a box that a camera shows [m]."""
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
+    depth = (corners - camera.centre) @ camera.world_from_camera[:3, 2]
+    return max(camera.near, float(depth.min())), max(camera.near, float(depth.max()))
+
+
+def _most_pixels(camera: Camera, size: float, depth: float) -> float:
+    """Most pixels that an object of a size [m] covers from a depth on [m], towards the corners of the image too.
+
+    The disc of a small ball is stretched by 1 / cos^3 of its angle to the axis; distortion may stretch it further.
+    """
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=np.float64)
+    steepest = float(np.linalg.norm(camera.ray_slopes(corners), axis=1).max())
+    stretch = (1 + steepest**2) ** 1.5 * (4.0 if camera.distortion else 1.0)
+    return float(stretch * np.pi / 4 * camera.fx * camera.fy * (size / depth) ** 2)
+
+
+def _solid_around(scene: Scene, point: Float64Array) -> str:
+    """Name of a visible shape that a point is in and the region is not, or empty."""
+    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
+    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+        if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
+            return shape.name
+    return ""

@@ -1,0 +1,246 @@
+"""What a dataset says about itself, read back: ``dataset.json``, and the lines of ``manifest.jsonl``.
+
+Nothing that a file states is trusted before it is checked, so that what works on it can rely on types, sizes and masks.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pycocotools import mask as coco_mask
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mitsplat.camera import Camera, Lens
+from mitsplat.dataset.manifest import parse_line
+from mitsplat.errors import InputError
+from mitsplat.files import Record
+from mitsplat.scene.spec import CameraSpec, Labelling, Output
+
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+Pixels = Annotated[int, Field(ge=1, lt=2**31)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Bounds = tuple[int, int, int, int]
+Point = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Pose = tuple[Row, Row, Row, Row]
+
+_INDEX = re.compile(rb'\{"index":([0-9]{1,10}),')
+
+
+class _Stored(BaseModel):
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class _Scene(_Stored):
+    name: str
+    seed: Count
+    camera: CameraSpec
+    labels: Labelling
+    output: Output
+
+
+class _Content(_Stored):
+    mitsplat: str
+    scene: _Scene
+    classes: list[str]
+    keypoints: list[list[str]]
+    assets: list[str]
+    libraries: dict[str, str]
+
+
+class _Camera(_Stored):
+    width: Pixels
+    height: Pixels
+    intrinsics: tuple[Point, Point, Point]
+    distortion: list[float]
+    lens: Lens
+    aperture_radius: Annotated[float, Field(ge=0)]
+    focus_distance: Annotated[float, Field(gt=0)]
+    world_from_camera: Pose
+
+
+class _Instance(_Stored):
+    id: Annotated[int, Field(ge=1, le=65535)]
+    asset: Count
+    class_index: Count
+    class_name: Annotated[str, Field(alias="class")]
+    box: Bounds
+    area: Pixels
+    amodal_box: Bounds
+    amodal_area: Pixels
+    silhouette_box: Bounds
+    silhouette_area: Pixels
+    depth_area: Count
+    visible_fraction: Share
+    truncation: Share
+    polygon_iou: Share
+    agreement: Share
+    boundary_f1: Share
+    marks: list[str]
+    keypoints: list[Point]
+    world_from_object: Pose
+    rle: str
+    amodal_rle: str
+
+
+class _Labels(_Stored):
+    size: tuple[Pixels, Pixels]
+    instances: list[_Instance]
+    dropped: dict[str, Count]
+
+
+class _Environment(_Stored):
+    id: Annotated[int, Field(ge=1, le=65536)]
+    area: Pixels
+    box: Bounds
+
+
+class _Record(_Stored):
+    index: Count
+    layout: Count
+    view: Count
+    split: Literal["train", "val"]
+    files: dict[str, str]
+    camera: _Camera
+    labels: _Labels
+    environment: _Environment | None = None
+    depth_scale: Annotated[float, Field(gt=0)] | None = None
+
+
+def read_content(root: Path) -> dict[str, Any]:
+    """What decides a dataset's bytes, ``dataset.json``.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat, or one of a version before labels were audited.
+    """
+    try:
+        data = (root / "dataset.json").read_bytes()
+        content: dict[str, Any] = json.loads(data)
+        checked = _Content.model_validate_json(data)
+    except ValidationError as error:
+        reason = f"dataset.json: {_first(error)}"
+        raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
+    except OSError as error:
+        reason = f"dataset.json: {error.strerror}" if root.is_dir() else "no such folder"
+        raise InputError(f"{root} must be a dataset of mitsplat ({reason})") from error
+    except ValueError as error:
+        raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
+    if len(content["keypoints"]) != len(content["classes"]):
+        raise InputError(
+            f"{root / 'dataset.json'}: keypoints must be named for every class "
+            f"(got {len(content['keypoints'])} lists for {len(content['classes'])} classes)"
+        )
+    if not (root / "manifest.jsonl").is_file():
+        raise InputError(f"{root} must be a dataset of mitsplat (it has no manifest.jsonl)")
+    content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "labels", "output"})
+    return content
+
+
+class Records:
+    """The frames' records that can be read, by ascending index; where the lines are takes 16 bytes of memory a frame.
+
+    Attributes:
+        violations: What is wrong with the other lines, once they were read.
+    """
+
+    def __init__(self, root: Path, content: dict[str, Any]) -> None:
+        self._path, self._content = root / "manifest.jsonl", content
+        self.violations: list[tuple[str, str]] = []
+        indices, places, place = array("q"), array("q"), 0
+        with self._path.open("rb") as file:
+            for line in file:
+                found = _INDEX.match(line)
+                indices.append(int(found[1]) if found else -1)
+                places.append(place)
+                place += len(line)
+        self._places = np.array(places, dtype=np.int64)
+        self._order = np.argsort(np.array(indices, dtype=np.int64), kind="stable")
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __iter__(self) -> Iterator[Record]:
+        self.violations = []
+        yield from self._read(self._order)
+
+    def some(self, count: int) -> Iterator[Record]:
+        """Up to ``count`` of them, evenly spread; fewer, if lines among those cannot be read."""
+        places = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
+        yield from self._read(self._order[places])
+
+    def _read(self, numbers: npt.NDArray[np.intp]) -> Iterator[Record]:
+        with self._path.open("rb") as file:
+            end = 0
+            for number in map(int, numbers):
+                if self._places[number] != end:
+                    file.seek(self._places[number])
+                line = file.readline()
+                end = self._places[number] + len(line)
+                try:
+                    _Record.model_validate_json(line)
+                    record = parse_line(line)
+                    _check_record(record, self._content)
+                except ValidationError as error:
+                    self._blame(number, _first(error))
+                except ValueError as error:
+                    self._blame(number, str(error))
+                else:
+                    yield record
+
+    def _blame(self, number: int, text: str) -> None:
+        self.violations.append(("manifest.jsonl", f"line {number + 1} is not the record of a frame ({text})"))
+
+
+def _check_record(record: Record, content: dict[str, Any]) -> None:
+    """Refuse what no type tells: an image that is not listed, positions beyond their lists, masks beyond their boxes.
+
+    Raises:
+        ValueError: With the reason.
+    """
+    if not any(file.startswith("images/") for file in record["files"]):
+        raise ValueError("files must list the frame's image")
+    camera = record["camera"]
+    lens = {key: camera[key] for key in ("lens", "aperture_radius", "focus_distance")}
+    ((fx, _, cx), (_, fy, cy), _) = camera["intrinsics"]
+    pose, distortion = np.array(camera["world_from_camera"]), tuple(camera["distortion"])
+    Camera(camera["width"], camera["height"], fx, fy, cx, cy, pose, distortion, **lens)  # refuses what is none
+    if record["labels"]["size"] != [camera["width"], camera["height"]]:
+        raise ValueError(f"labels.size must be the camera's (got {record['labels']['size']})")
+    if record.get("environment", ()) is None:
+        raise ValueError("environment must be a segment or absent (got null)")
+    if record.get("depth_scale") is None and {"bop", "depth"} & set(content["scene"]["output"]["formats"]):
+        raise ValueError("depth_scale must be stated")
+    for label in record["labels"]["instances"]:
+        name = f"instance {label['id']}"
+        for key, among in (("class_index", content["classes"]), ("asset", content["assets"])):
+            if label[key] >= len(among):
+                raise ValueError(f"{name}: {key} must be below {len(among)} (got {label[key]})")
+        if len(label["keypoints"]) not in (0, len(content["keypoints"][label["class_index"]])):
+            raise ValueError(f"{name}: keypoints must be those of its class (got {len(label['keypoints'])})")
+        for code, box in (("rle", "box"), ("amodal_rle", "amodal_box")):
+            try:
+                _check_mask(label[code], label[box], *record["labels"]["size"])
+            except ValueError as error:
+                raise ValueError(f"{name}: {code}: {error}") from error
+
+
+def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
+    x0, y0, x1, y1 = box
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+        raise ValueError(f"its box must lie in the image (got {box})")
+    mask = coco_mask.decode({"size": [height, width], "counts": code})
+    # Decoding leaves what no run covers as the memory was; only a whole code is what its mask encodes to.
+    if not mask[y0:y1, x0:x1].any() or coco_mask.encode(mask)["counts"].decode() != code:
+        raise ValueError(f"must be the code of a mask in its box (got {code[:20]!r} for {box})")
+
+
+def _first(error: ValidationError) -> str:
+    found = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, found['loc']))}: {found['msg']}"

@@ -1,0 +1,177 @@
+"""Shards of a dataset, made apart, joined into the dataset that one run would have made."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mitsplat.dataset.folder import (
+    RUNS,
+    TIMINGS,
+    finish_folder,
+    first_difference,
+    open_finished,
+    open_folder,
+    read_shard,
+)
+from mitsplat.dataset.manifest import Manifest
+from mitsplat.dataset.schema import read_content
+from mitsplat.dataset.write import DatasetSummary, FrameCounts
+from mitsplat.errors import InputError
+from mitsplat.files import Record, file_inside, link_file, write_file
+from mitsplat.formats.registry import Catalogue
+from mitsplat.progress import Progress
+
+
+def merge_shards(
+    shards: Sequence[str | Path], out: str | Path, *, overwrite: bool = False, progress: Progress | None = None
+) -> DatasetSummary:
+    """Join datasets that differ only in their frames; every file is checked against its SHA-256 on the way.
+
+    Files become further names of the shards' own where both are on one file system. Runs again where it stopped.
+
+    Args:
+        shards: Folders of finished datasets, in any order: all shards of one dataset.
+        out: Folder of the whole, made if missing.
+        overwrite: Remove a dataset that is there first.
+        progress: Hears of every frame.
+
+    Raises:
+        InputError: If the shards are not of one dataset, one is missing, unfinished or damaged, or two hold the same
+            frame; nothing is written then, but for files whose content turns out not to be what was written.
+    """
+    folders, out = [Path(shard) for shard in shards], Path(out)
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError(f"each shard must be given once (got {', '.join(map(str, folders))})")
+    if out.resolve() in [folder.resolve() for folder in folders]:
+        raise InputError(f"{out}: must not be one of the shards")
+    content = _common_content(folders)
+    stated = _check_complete(folders)
+    with ExitStack() as stack:
+        manifests = {folder: stack.enter_context(open_finished(folder)) for folder in folders}
+        total = _check_frames(manifests, stated)
+        catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], ())
+        scene_file = next((folders[0] / "scene").iterdir())
+        _check_layouts(folders)
+        manifest = stack.enter_context(open_folder(out, content, scene_file, None, resume=True, overwrite=overwrite))
+        for folder, part in manifests.items():
+            for record in part:
+                index = record["index"]
+                if index not in manifest:
+                    _take_files(folder, out, record)
+                    manifest.append(record)
+                if progress is not None:
+                    progress(len(manifest), total, f"frame {index}")
+        for folder in folders:
+            for layout in sorted((folder / "layouts").glob("*.json")):
+                write_file(out / "layouts" / layout.name, partial(link_file, layout))
+        for name in (TIMINGS, RUNS):
+            write_file(out / name, partial(_join_lines, [folder / name for folder in folders]))
+        counts = FrameCounts()
+        finish_folder(out, manifest, content, catalogue, counts.add)
+        if (models := folders[0] / "bop/models").is_dir():
+            for model in sorted(models.iterdir()):
+                write_file(out / "bop/models" / model.name, partial(shutil.copyfile, model))
+        return counts.summary(out, rendered=0)
+
+
+def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
+    """What decides the bytes of all shards, which must be the same."""
+    contents: list[dict[str, Any]] = []
+    for folder in folders:
+        read_content(folder)  # checks what the file itself, read next, says
+        contents.append(json.loads((folder / "dataset.json").read_bytes()))
+        if difference := first_difference(contents[0], contents[-1]):
+            key, one, other = difference
+            raise InputError(
+                f"{folders[0]} and {folder} are not of one dataset: {key} is {one} in the first, {other} in the second"
+            )
+    if not contents:
+        raise InputError("at least one shard is needed (got none)")
+    return contents[0]
+
+
+def _check_complete(folders: Sequence[Path]) -> int | None:
+    """Frames of the whole dataset as its shards have it, None where all are whole datasets."""
+    said = {folder: read_shard(folder) for folder in folders}
+    parts = {folder: part for folder, part in said.items() if part is not None}
+    if not parts:
+        return None
+    sizes = {(part["of"], part["frames"]) for part in parts.values()}
+    if len(parts) < len(said) or len(sizes) > 1:
+        raise InputError(
+            "shards must be of one division of one dataset (got "
+            + ", ".join(f"{folder}: {'whole' if part is None else _named(part)}" for folder, part in said.items())
+            + ")"
+        )
+    count, frames = next(iter(sizes))
+    missing = set(range(1, count + 1)) - {part["shard"] for part in parts.values()}
+    if missing or len(parts) > count:
+        raise InputError(f"each of the {count} shards must be given once (missing: {sorted(missing) or 'none'})")
+    return frames
+
+
+def _named(part: dict[str, int]) -> str:
+    return f"{part['shard']}/{part['of']} of {part['frames']} frames"
+
+
+def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int:
+    """How many frames all shards have together, of which none may be missing, nor be in two."""
+    found = [((index, folder) for index in manifest.indices) for folder, manifest in manifests.items()]
+    last, place = -1, Path()
+    missing, first = 0, 0
+    for index, folder in heapq.merge(*found):
+        if index == last:
+            raise InputError(f"frame {index} is in both {place} and {folder}")
+        if index > last + 1 and not missing:
+            first = last + 1
+        missing += index - last - 1
+        last, place = index, folder
+    count = last + 1 if stated is None else stated
+    if count > last + 1 and not missing:
+        first = last + 1
+    missing += max(0, count - last - 1)
+    if missing:
+        raise InputError(f"{missing} of {count} frames are in no shard, the first is {first}: finish the shards first")
+    return sum(map(len, manifests.values()))
+
+
+def _join_lines(files: Sequence[Path], whole: Path) -> None:
+    """Write the lines of several files that may be missing, and may end in a torn line."""
+    with whole.open("wb") as out:
+        for file in files:
+            with suppress(FileNotFoundError), file.open("rb") as lines:
+                out.writelines(line for line in lines if line.endswith(b"\n"))
+
+
+def _check_layouts(folders: Sequence[Path]) -> None:
+    """A layout that two shards show must be the same in both."""
+    seen: dict[str, Path] = {}
+    for folder in folders:
+        for layout in sorted((folder / "layouts").glob("*.json")):
+            other = seen.setdefault(layout.name, layout)
+            if other.read_bytes() != layout.read_bytes():
+                raise InputError(f"{other} and {layout} must be the same: one layout was settled in two ways")
+
+
+def _take_files(folder: Path, out: Path, record: Record) -> None:
+    for file, digest in record["files"].items():
+        try:
+            if ".." in Path(file).parts:  # inside one folder may be outside of the other
+                raise InputError(f"files must not be named by .. (got {file})")
+            source = file_inside(folder, file)
+        except InputError as error:
+            raise InputError(f"{folder}: frame {record['index']}: {error}; render that shard again") from error
+        found = write_file(out / file, partial(link_file, source))
+        if found != digest:
+            (out / file).unlink()
+            raise InputError(
+                f"{source}: must have the SHA-256 {digest}, as its manifest states (got {found}); remove it and render "
+                "that shard again"
+            )

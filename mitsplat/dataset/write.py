@@ -1,0 +1,219 @@
+"""A dataset folder: written frame by frame, never half, resumable.
+
+::
+
+    images/train/000000.png     labels/train/000000.txt     layers/train/000000.exr      (and the same for val)
+    annotations/instances_train.json, instances_val.json    data.yaml    contact_sheet.jpg
+    manifest.jsonl    one line per frame: files and their SHA-256, camera, draws, labels with masks and poses
+    timings.jsonl     seconds per stage; apart, so that equal datasets have equal manifests
+    runs.jsonl        the command of every run that made frames
+    dataset.json      what decides the content: effective scene, hashes of its inputs, version
+    shard.json        which part of the dataset this is, if it is one of several
+    scene/            the scene file as it was given
+    layouts/0000.json where the objects came to rest
+
+A file gets its name when it is complete and on disk, and a frame its line in the manifest when all its files are.
+Shards are datasets of their own that share everything but their frames; :mod:`mitsplat.dataset.shards` joins them.
+``data.yaml`` is the only YAML file at the top, because Ultralytics, given the folder, takes the one it finds there.
+"""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mitsplat.dataset.folder import RUNS, SHEET, TIMINGS, Shard, content_of, finish_folder, open_folder
+from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle
+from mitsplat.dataset.manifest import append_line
+from mitsplat.engine.pool import run_frames
+from mitsplat.engine.resources import TYPICAL
+from mitsplat.errors import InputError
+from mitsplat.files import SPLITS, Record, storage_errors
+from mitsplat.formats.registry import FORMATS, Catalogue
+from mitsplat.frames.budget import worker_memory
+from mitsplat.progress import Note, Progress
+
+if TYPE_CHECKING:
+    from mitsplat.engine.ray import Cluster
+    from mitsplat.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class DatasetSummary:
+    """What a call of :func:`write_dataset` left behind.
+
+    Attributes:
+        path: The dataset's folder.
+        frames: Frames in it.
+        rendered: Frames that this call made; the others were there before.
+        images: Images by split.
+        instances: Labelled instances by class.
+        dropped: What was not labelled, by the reasons of :class:`mitsplat.labels.labels.Labels`.
+        marked: Labelled instances below a threshold, by the marks of :class:`mitsplat.labels.labels.InstanceLabel`.
+        contact_sheet: Picture of some frames with their labels drawn.
+        unlabelled: Whether there are objects, but no image has a label.
+    """
+
+    path: Path
+    frames: int
+    rendered: int
+    images: dict[str, int]
+    instances: dict[str, int]
+    dropped: dict[str, int]
+    marked: dict[str, int]
+    contact_sheet: Path
+    unlabelled: bool = False
+
+
+def write_dataset(
+    scene: Scene,
+    out: str | Path,
+    *,
+    frames: int | None = None,
+    shard: Shard | None = None,
+    workers: int | None = 1,
+    cluster: Cluster | None = None,
+    resume: bool = True,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    render: Render | None = None,
+    settle: Settle | None = None,
+) -> DatasetSummary:
+    """Render the first ``frames`` frames of a scene (default: all) into the dataset folder ``out``.
+
+    Frames that are already there are kept if ``resume`` is set and they come from the same scene. The bytes of images,
+    labels and manifest do not depend on ``workers``, ``cluster`` or interruptions, and those of all shards merged not
+    on their number.
+
+    Args:
+        scene: What to render; sizes, formats and the seed are in ``scene.spec``.
+        out: Folder, made if missing. It must be empty or a dataset.
+        frames: How many frames the dataset should have, all its shards together.
+        shard: Which part of it to make here; all of it if None.
+        workers: Processes that make frames, see :func:`mitsplat.engine.pool.run_frames`; None is as many as pay, or as
+            fit into the cluster.
+        cluster: Where frames are made, if not in processes of this machine.
+        resume: Continue a dataset that is there; otherwise its presence is an error.
+        overwrite: Remove a dataset that is there first.
+        progress: Hears of every finished frame and of slow steps.
+        render: What to use instead of :func:`mitsplat.frames.frame.render_frame`.
+        settle: What to use instead of :func:`mitsplat.physics.settle.settle_layout`.
+
+    Raises:
+        InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
+            :mod:`mitsplat.dataset.prospects`), the folder cannot be written, is in use, holds something else, or holds
+            a dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else.
+        MissingResourceError: If the disk is full.
+        PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
+    """
+    from mitsplat.dataset.prospects import refuse, run_faults
+    from mitsplat.scene.scene import layout_of
+
+    out = Path(out)
+    count = scene.num_frames if frames is None else frames
+    if not 1 <= count <= scene.num_frames:
+        raise InputError(
+            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
+        )
+    formats = scene.spec.output.formats
+    if unknown := set(formats) - set(FORMATS):
+        raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
+    catalogue = Catalogue.of(scene)
+    wanted = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
+    if render is None and settle is None:
+        refuse(scene, run_faults(scene, wanted, out=out, workers=workers, elsewhere=cluster is not None))
+    content = content_of(scene, catalogue)
+    part = None if shard is None else shard.to_json(count)
+    with open_folder(out, content, scene.path, part, resume=resume, overwrite=overwrite) as manifest:
+        layouts: dict[int, list[int]] = {}
+        for index in wanted:
+            if index not in manifest:
+                layouts.setdefault(layout_of(scene, index), []).append(index)
+
+        def note(text: str) -> None:
+            if progress is not None:
+                progress(len(manifest), max(len(wanted), len(manifest)), text)
+
+        note("starting")
+        if layouts:
+            command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+            append_line(out / RUNS, {"command": command, "python": platform.python_version(), "workers": workers})
+        make = FrameMaker(scene, catalogue, out, render or _default_render(), settle or _default_settle())
+        with closing(_results(make, layouts, workers, cluster, note)) as results:
+            for record, seconds in results:
+                append_line(out / TIMINGS, {"index": record["index"], **seconds})
+                manifest.append(record)
+                note(f"frame {record['index']}")
+        counts = FrameCounts()
+        finish_folder(out, manifest, content, catalogue, counts.add)
+        return counts.summary(out, rendered=sum(map(len, layouts.values())))
+
+
+def _results(
+    make: FrameMaker, layouts: dict[int, list[int]], workers: int | None, cluster: Cluster | None, note: Note
+) -> Generator[tuple[Record, dict[str, float]]]:
+    """Records of frames whose files are in the folder, and the seconds of their stages."""
+    if cluster is None:
+        memory = TYPICAL if workers is not None else worker_memory(make.scene)
+        with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory)) as made:
+            yield from made
+        return
+    from mitsplat.engine.ray import run_on_ray
+
+    with closing(run_on_ray(RemoteFrames(make), layouts, cluster, workers=workers, note=note)) as parcels:
+        for parcel in parcels:
+            with storage_errors(make.out):
+                yield parcel.unpack(make.out), parcel.seconds
+
+
+def _default_render() -> Render:
+    from mitsplat.frames.frame import render_frame
+
+    return render_frame
+
+
+def _default_settle() -> Settle:
+    from mitsplat.physics.settle import settle_layout
+
+    return settle_layout
+
+
+@dataclass
+class FrameCounts:
+    """What is counted while a dataset's records are read once."""
+
+    images: Counter[str] = field(default_factory=Counter)
+    instances: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    marked: Counter[str] = field(default_factory=Counter)
+    placed: bool = False
+
+    def add(self, record: Record) -> None:
+        """Count a frame."""
+        labels = record["labels"]
+        self.images[record["split"]] += 1
+        self.instances.update(label["class"] for label in labels["instances"])
+        self.dropped.update(labels["dropped"])
+        self.placed |= bool(labels["instances"] or any(labels["dropped"].values()))
+        self.marked.update(mark for label in labels["instances"] for mark in label["marks"])
+
+    def summary(self, out: Path, rendered: int) -> DatasetSummary:
+        """What is in a finished dataset, ``rendered`` frames of it new."""
+        return DatasetSummary(
+            path=out,
+            frames=self.images.total(),
+            rendered=rendered,
+            images={split: self.images[split] for split in SPLITS},
+            instances=dict(sorted(self.instances.items())),
+            dropped=dict(self.dropped),
+            marked=dict(sorted(self.marked.items())),
+            contact_sheet=out / SHEET,
+            unlabelled=self.placed and not self.instances,
+        )

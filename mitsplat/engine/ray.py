@@ -1,0 +1,247 @@
+"""Frames on a Ray cluster, or on this machine through Ray: the same bytes as :mod:`mitsplat.engine.pool` makes.
+
+The scene goes into Ray's object store once, a worker takes it from there once, and a layout that one worker settled is
+handed to every other that needs it. Files come back to the caller, who alone writes: no file system has to be shared.
+Workers must have the same mitsplat installed, and open no other file of the caller's. A machine that is lost costs its
+workers' frames in hand, which others make again; one that joins gets workers too.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections import OrderedDict
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, run_pool
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.progress import Note
+
+Result = TypeVar("Result")
+Made = TypeVar("Made", covariant=True)
+
+_LOOK = 3.0
+"""How often to look for machines that joined, at most [s]."""
+
+_PATIENCE = 60.0
+"""How long to wait for a machine when none is left [s]."""
+
+_KEPT_LAYOUTS = 64
+"""Layouts held in the object store; any other is settled, or found in a cache, again."""
+
+
+class ClusterJob(Protocol[Made]):
+    """Settles layouts and makes their frames; picklable."""
+
+    def known(self, layout: int) -> str | None:
+        """A layout that is settled already; asked by the caller, not on the cluster."""
+
+    def settle(self, layout: int) -> str:
+        """Settle a layout."""
+
+    def make(self, index: int, layout: str) -> Made:
+        """Make a frame of a settled layout."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where to find Ray, and what a worker takes of it.
+
+    Attributes:
+        address: As of ``ray.init``: None starts Ray on this machine, "auto" finds the one that runs here.
+        resources: Amounts that each worker reserves, by Ray's names: CPU, GPU, memory [bytes] or a resource that some
+            nodes declare. A worker with a GPU renders on it (``cuda_ad_rgb``), any other on its CPUs.
+    """
+
+    address: str | None = None
+    resources: Mapping[str, float] = field(default_factory=lambda: {"CPU": 2.0})
+
+    @staticmethod
+    def parse_resources(text: str) -> dict[str, float]:
+        """Amounts from a text such as ``CPU=4,GPU=1``.
+
+        Raises:
+            InputError: If it is another kind of text.
+        """
+        found = {}
+        for part in text.split(","):
+            name, _, amount = part.strip().partition("=")
+            try:
+                found[name] = float(amount)
+            except ValueError:
+                found[name] = 0.0
+            if not name or not 0 < found[name] < float("inf"):
+                raise InputError(f"resources must be NAME=AMOUNT,..., such as CPU=4,GPU=1 (got {text})")
+        return found
+
+
+def run_on_ray(
+    job: ClusterJob[Result],
+    layouts: Mapping[int, Sequence[int]],
+    cluster: Cluster,
+    *,
+    workers: int | None = None,
+    note: Note,
+) -> Generator[Result]:
+    """Results of ``job.make`` for every frame, in the order in which they are finished.
+
+    Args:
+        job: What to do.
+        layouts: The frames to make, by layout.
+        cluster: Where.
+        workers: How many; as many as the cluster has resources for if None.
+        note: Hears what is being done.
+
+    Raises:
+        MissingResourceError: If Ray is not installed or not found, or has no room for one worker.
+        InputError, FrameError, LostWorkersError: As :func:`mitsplat.engine.pool.run_frames`.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1 (got {workers})")
+    if not any(layouts.values()):
+        return
+    with closing(_Actors(job, cluster, workers)) as pool, closing(run_pool(pool, layouts, pool.room, note)) as results:
+        yield from results
+
+
+class _Actors(Generic[Result]):
+    """Workers that are Ray actors.
+
+    Attributes:
+        room: How many there can be at the start.
+    """
+
+    def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
+        try:
+            import ray
+        except ImportError:
+            raise MissingResourceError("the engine ray needs Ray: pip install 'mitsplat[cluster]'") from None
+        self._ray = ray
+        self._started = not ray.is_initialized()
+        if self._started:
+            where: dict[str, Any] = {"include_dashboard": False} if cluster.address is None else {}
+            try:
+                # What a worker prints is in its answers, or in Ray's logs.
+                ray.init(address=cluster.address or "local", log_to_driver=False, logging_level=logging.ERROR, **where)
+            except (ConnectionError, ValueError, RuntimeError) as error:
+                raise MissingResourceError(
+                    f"no Ray cluster at {cluster.address!r}: {str(error).splitlines()[0]}"
+                ) from error
+        self._wanted, self._most = cluster.resources, sys.maxsize if most is None else most
+        self._actors: dict[int, Any] = {}
+        room = self._room()
+        self._nodes, self.room = set(room), min(self._most, sum(room.values()))
+        self._looked = self._last_room = time.monotonic()
+        if not self.room:
+            self.close()
+            raise MissingResourceError(self._no_room())
+        amounts = dict(cluster.resources)
+        options: dict[str, Any] = {"num_cpus": amounts.pop("CPU", 0), "num_gpus": amounts.pop("GPU", 0)}
+        if "memory" in amounts:
+            options["memory"] = amounts.pop("memory")
+        self._actor = ray.remote(_Actor).options(**options, resources=amounts, max_restarts=0)
+        self._gpu = bool(options["num_gpus"])
+        self._job = job
+        self._stored = ray.put(job)
+        self._answers: dict[Any, tuple[int, int, int]] = {}
+        self._layouts: OrderedDict[int, tuple[Any, int | None]] = OrderedDict()
+        self._hired = 0
+
+    def _room(self) -> dict[str, int]:
+        """Workers that fit on each node."""
+        nodes = [(node["NodeID"], node["Resources"]) for node in self._ray.nodes() if node["Alive"]]
+        return {
+            node: int(min(resources.get(name, 0.0) / amount for name, amount in self._wanted.items()))
+            for node, resources in nodes
+        }
+
+    def _no_room(self) -> str:
+        wanted = ", ".join(f"{name}={amount:g}" for name, amount in self._wanted.items())
+        return f"no node of the Ray cluster has {wanted} for a worker"
+
+    def openings(self) -> int:
+        now = time.monotonic()
+        if now < self._looked + _LOOK:
+            return 0
+        room, known, self._looked = self._room(), self._nodes, now
+        self._nodes = set(room)
+        if any(room.values()):
+            self._last_room = now
+        elif now > self._last_room + _PATIENCE:
+            raise LostWorkersError(f"{self._no_room()} any more; finished frames are kept")
+        joined = sum(count for node, count in room.items() if node not in known)
+        return max(0, min(joined, self._most - len(self._actors)))
+
+    def hire(self) -> int:
+        worker, self._hired = self._hired, self._hired + 1
+        self._actors[worker] = self._actor.remote([self._stored], self._gpu)
+        return worker
+
+    def dismiss(self, worker: int) -> None:
+        self._ray.kill(self._actors.pop(worker))
+
+    def give(self, worker: int, frame: int, layout: int) -> None:
+        actor = self._actors[worker]
+        if layout not in self._layouts:
+            known = self._job.known(layout)
+            # Its settler is the worker that needs it first; Ray hands the result on to the others.
+            self._layouts[layout] = (
+                (actor.settle.remote(layout), worker) if known is None else (self._ray.put(known), None)
+            )
+            while len(self._layouts) > _KEPT_LAYOUTS:
+                self._layouts.popitem(last=False)
+        self._answers[actor.make.remote(frame, self._layouts[layout][0])] = worker, frame, layout
+
+    def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
+        ready, _ = self._ray.wait(list(self._answers), num_returns=1, timeout=_LOOK)
+        for reference in ready:
+            worker, frame, layout = self._answers.pop(reference)
+            try:
+                yield worker, self._ray.get(reference)
+            except self._ray.exceptions.RayError as error:
+                _, settler = self._layouts.pop(layout, (None, None))
+                if settler not in (None, worker):
+                    self.give(worker, frame, layout)  # what was lost may be the worker that settled the layout
+                    continue
+                self.dismiss(worker)
+                yield worker, Lost(f"was lost ({str(error).strip().splitlines()[0]})")
+
+    def close(self) -> None:
+        for worker in list(self._actors):
+            self.dismiss(worker)
+        if self._started:
+            self._ray.shutdown()
+
+
+class _Actor:
+    """A worker on the cluster."""
+
+    def __init__(self, stored: list[Any], gpu: bool) -> None:
+        import ray
+
+        import mitsplat  # before Mitsuba
+
+        if gpu:
+            import mitsuba as mi
+
+            mi.set_variant("cuda_ad_rgb")
+        self._version = mitsplat.__version__
+        self._job = ray.get(stored[0])
+
+    def settle(self, layout: int) -> Failure | str:
+        try:
+            return self._job.settle(layout)  # type: ignore[no-any-return]
+        except Exception as error:  # noqa: BLE001 - the caller raises it
+            return Failure.of(error)
+
+    def make(self, frame: int, layout: Failure | str) -> Failure | Finished[Any]:
+        if isinstance(layout, Failure):
+            return layout
+        try:
+            return Finished(self._job.make(frame, layout))
+        except Exception as error:  # noqa: BLE001 - the caller raises it
+            return Failure.of(error)

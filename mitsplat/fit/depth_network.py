@@ -1,0 +1,149 @@
+"""Depth maps of photos by a network of the user's: Depth Anything v2 (Yang et al. 2024), or one like it, in ONNX."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import Float32Array
+from mitsplat.capture.capture import Photo, stored_name
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.files import write_file
+from mitsplat.fit.depth_priors import DepthKind, DepthMaps
+from mitsplat.progress import Progress
+from mitsplat.version import __version__
+
+FloatImage = Float32Array
+
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of ImageNet's pixels, display-encoded: red, green, blue."""
+_EDGE = 518
+"""Shorter edge of what the network sees where it leaves that open [px], as in Depth Anything's own code."""
+_PATCH = 14
+"""Edges are multiples of its patches [px]."""
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+def model_maps(
+    photos: Sequence[Photo],
+    model: Path,
+    folder: Path,
+    kind: DepthKind = "inverse",
+    *,
+    progress: Progress | None = None,
+) -> DepthMaps:
+    """Depth maps of photos by a network, kept in a folder until the photo, the network or this package changes.
+
+    Args:
+        photos: Whose maps to make.
+        model: The network, an ONNX file.
+        folder: Where the maps are kept.
+        kind: What the network returns.
+        progress: Told the photos done.
+
+    Raises:
+        InputError: If the file does not exist or is no such network.
+        MissingResourceError: If onnxruntime is not installed.
+    """
+    if not model.is_file():
+        raise InputError(f"{model}: no such file")
+    with model.open("rb") as opened:
+        weights = __version__.encode() + hashlib.file_digest(opened, "sha256").digest()
+    files: dict[str, Path] = {}
+    network = None
+    for done, photo in enumerate(photos, start=1):
+        key = hashlib.sha256(weights + photo.file.read_bytes()).hexdigest()[:16]
+        file = folder / f"{key}_{stored_name(photo.name, '.npy')}"
+        if not file.exists():
+            network = network or DepthNetwork(open_session(model), model)
+            write_file(file, partial(_save, network.depths(photo.picture()[0])))
+        files[photo.name] = file
+        if progress is not None:
+            progress(done, len(photos), "depths")
+    return DepthMaps(files, kind)
+
+
+def open_session(model: Path) -> Any:
+    """A session of onnxruntime with a network, on the CPU.
+
+    Raises:
+        InputError: If the file is no network.
+        MissingResourceError: If onnxruntime is not installed.
+    """
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MissingResourceError(
+            f"depths by a model need onnxruntime: pip install 'mitsplat[depth]' ({error})"
+        ) from error
+    try:
+        return onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no other base
+        raise InputError(f"{model}: not a network in ONNX ({' '.join(str(error).split())})") from error
+
+
+class DepthNetwork:
+    """A network from a picture to its depths or inverse depths.
+
+    Args:
+        session: As onnxruntime has it.
+        path: Of the network, for what is said of it.
+
+    Raises:
+        InputError: If it takes something else than one picture of floats, shape (1, 3, H, W).
+    """
+
+    def __init__(self, session: Any, path: Path) -> None:
+        self._session, self._path = session, path
+        inputs = session.get_inputs()
+        shape, kind = list(inputs[0].shape), inputs[0].type
+        fits = len(inputs) == 1 and len(shape) == 4 and (shape[1] == 3 or not isinstance(shape[1], int))
+        if not fits or kind not in _TYPES:
+            given = ", ".join(f"{i.name}: {i.type} {list(i.shape)}" for i in inputs)
+            raise InputError(f"{path}: must take one picture of floats, shape (1, 3, H, W) (got {given})")
+        self._name, self._type = inputs[0].name, _TYPES[kind]
+        self._height, self._width = (edge if isinstance(edge, int) and edge > 0 else None for edge in shape[2:])
+
+    def depths(self, rgb: FloatImage) -> FloatImage:
+        """What the network finds in a picture (H, W, 3), display-encoded in [0, 1]; of its shape, but no finer.
+
+        Raises:
+            InputError: If the network fails, or returns something else than one finite number per pixel.
+        """
+        height, width = rgb.shape[:2]
+        scale = _EDGE / min(height, width)
+        size = (self._width or _multiple(scale * width), self._height or _multiple(scale * height))
+        picture = (cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC) - _MEAN) / _DEVIATION
+        batch = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=self._type)
+        try:
+            found = np.asarray(self._session.run(None, {self._name: batch})[0], dtype=np.float32)
+        except Exception as error:  # its errors have no other base
+            raise InputError(
+                f"{self._path}: fails on {size[0]}x{size[1]} px ({' '.join(str(error).split())})"
+            ) from error
+        values = (
+            found.reshape(found.shape[-2:]) if found.ndim >= 2 and found.size == np.prod(found.shape[-2:]) else found
+        )
+        if values.ndim != 2 or min(values.shape) < 2 or not np.isfinite(values).all():
+            raise InputError(
+                f"{self._path}: must return one finite number per pixel, shape (1, H, W) (got shape {found.shape}, "
+                f"{np.count_nonzero(~np.isfinite(found))} not finite)"
+            )
+        shrink = min(1.0, max(values.shape) / max(height, width))
+        kept = (max(1, round(shrink * width)), max(1, round(shrink * height)))
+        return np.asarray(cv2.resize(values, kept, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _multiple(edge: float) -> int:
+    return max(1, round(edge / _PATCH)) * _PATCH
+
+
+def _save(values: FloatImage, path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, values)

@@ -1,0 +1,224 @@
+"""Depth maps of photos, from a network or a sensor, brought to the scale of a capture by the points that photos see.
+
+Networks such as Depth Anything v2 (Yang et al. 2024) give inverse depth up to a scale and a shift that differ from
+photo to photo (Ranftl et al. 2022); as in "A Hierarchical 3D Gaussian Representation" (Kerbl et al. 2024) both are
+found for each photo from the points of structure from motion.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.capture.capture import Photo
+from mitsplat.capture.masks import shapes_differ
+from mitsplat.errors import InputError
+from mitsplat.files import IMAGE_ERRORS
+
+DepthMap = Float32Array
+"""Inverse depths along z [1/m] of a photo's pixels, shape (H, W) of its aspect, NaN where unknown."""
+DepthKind = Literal["inverse", "metric"]
+
+SUFFIXES = (".png", ".npy", ".exr", ".tiff", ".tif")
+POINTS_MIN = 10
+"""Points that a photo must see for its map to be used."""
+_TRIALS = 500
+_UNEXPLAINED = 0.5
+"""Median difference of a map from the points in it, in that of the points from their own median, from which it says
+nothing of them."""
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Files of depth maps, one per photo, known up to what the capture's points can tell.
+
+    Attributes:
+        files: The maps, by the names of their photos.
+        kind: ``inverse``: of inverse depth, up to a scale and a shift, as networks give it; ``metric``: of depth along
+            the camera's z axis in any unit, 0 where it is not known, as sensors and renderers give it.
+    """
+
+    files: Mapping[str, Path]
+    kind: DepthKind = "inverse"
+
+
+def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse") -> DepthMaps:
+    """The maps in a folder that have the names of photos, or of their files in a capture, but for the suffix.
+
+    That is .png, .npy, .exr, .tiff or .tif; other files do not matter.
+
+    Raises:
+        InputError: If the folder does not exist or has no map of any photo.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of depth maps")
+    files = {}
+    for photo in photos:
+        names = (photo.name, photo.file.name)
+        candidates = ((folder / name).with_suffix(suffix) for name in names for suffix in SUFFIXES)
+        path = next((path for path in candidates if path.is_file()), None)
+        if path is not None:
+            files[photo.name] = path
+    if not files:
+        example = Path(photos[0].name).with_suffix(".png") if photos else "PHOTO.png"
+        raise InputError(f"{folder}: must hold a depth map of one photo at least, such as {example} (got none)")
+    return DepthMaps(files, kind)
+
+
+def read_map(path: Path) -> Float32Array:
+    """The values of a depth map, shape (H, W), whatever they mean.
+
+    Raises:
+        InputError: If the file cannot be read, has several channels, or a value is not finite.
+    """
+    try:
+        if path.suffix.lower() == ".npy":
+            values = np.load(path, allow_pickle=False)
+        elif path.suffix.lower() == ".exr":
+            values = _read_exr(path)
+        else:
+            with Image.open(path) as image:
+                values = np.asarray(image)
+        with np.errstate(over="ignore"):
+            values = np.asarray(values, dtype=np.float32)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (*IMAGE_ERRORS, RuntimeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a readable depth map ({error})") from error
+    if values.ndim != 2 or values.size == 0:
+        raise InputError(f"{path}: a depth map must have one channel, shape (H, W) (got shape {values.shape})")
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: depths must be finite (got {np.count_nonzero(~np.isfinite(values))} that are not)")
+    return values
+
+
+def _read_exr(path: Path) -> Float32Array:
+    """The only channel of an OpenEXR file, or the one that is named Z."""
+    import OpenEXR
+
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    if len(channels) > 1 and "Z" not in channels:
+        raise ValueError(f"it must have one channel, or one named Z, got {', '.join(sorted(channels))}")
+    return np.array(channels.get("Z", next(iter(channels.values()))), dtype=np.float32)
+
+
+def align_maps(
+    photos: Sequence[Photo], points: Float64Array, maps: DepthMaps, size: int
+) -> tuple[dict[str, DepthMap], tuple[str, ...]]:
+    """The maps of photos as inverse depths in the unit of the points (N, 3), and sentences on the photos without.
+
+    Args:
+        photos: Whose maps are wanted.
+        points: Those of the capture.
+        maps: Their files.
+        size: Longest edge of what is kept of a map [px].
+
+    Raises:
+        InputError: If a map cannot be read, or is not of its photo, or none is of use.
+    """
+    found: dict[str, DepthMap] = {}
+    without: dict[str, list[str]] = {}
+    for photo in photos:
+        path = maps.files.get(photo.name)
+        if path is None:
+            without.setdefault("photos without a depth map", []).append(photo.name)
+            continue
+        values = read_map(path)
+        try:
+            inverse = align_map(photo, points, values, maps.kind)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        if isinstance(inverse, str):
+            without.setdefault(f"depth maps that are left out, because {inverse}", []).append(photo.name)
+        else:
+            height, width = inverse.shape
+            scale = min(1.0, size / max(width, height))
+            found[photo.name] = resize_map(inverse, max(1, round(scale * width)), max(1, round(scale * height)))
+    warnings = tuple(f"{what}: {', '.join(names)}" for what, names in without.items())
+    if not found:
+        raise InputError(f"no depth map is of use: {'; '.join(warnings)}")
+    return found, warnings
+
+
+def align_map(photo: Photo, points: Float64Array, values: Float32Array, kind: DepthKind) -> DepthMap | str:
+    """The values of a photo's map as inverse depths in the capture's unit, or why maps like it are of no use.
+
+    Args:
+        photo: Whose map it is.
+        points: Those of the capture, shape (N, 3).
+        values: Of the map, shape (H, W), of any size.
+        kind: What they mean.
+
+    Raises:
+        InputError: With the rule alone, if the map is not of the photo's shape, or a depth is negative.
+    """
+    size, shape = (photo.camera.width, photo.camera.height), values.shape[::-1]
+    if shapes_differ(shape, size):
+        raise InputError(f"must have the shape of its photo, {size[0]}x{size[1]} px (got {shape[0]}x{shape[1]})")
+    if kind == "metric":
+        if values.min() < 0:
+            raise InputError(f"depths must be >= 0 (got {values.min():g})")
+        with np.errstate(divide="ignore", over="ignore"):
+            values = np.where(values > 0, 1 / values, np.float32(np.nan))
+    pixels, depth = photo.camera.project(points[photo.seen])
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
+    column, row = (pixels[inside] * np.divide(shape, size) - 0.5).T
+    # Between pixels, for on planes inverse depth is linear in the image; unknown beside what is unknown.
+    found = map_coordinates(values.astype(np.float64), (row, column), order=1, mode="nearest")
+    known = np.isfinite(found)
+    if known.sum() < POINTS_MIN:
+        return f"fewer than {POINTS_MIN} of the capture's points are in them"
+    found, wanted = found[known], 1 / depth[inside][known]
+    scale, shift = fit_line(found, wanted, shift=kind == "inverse")
+    left = np.median(np.abs(scale * found + shift - wanted))
+    if not scale > 0 or left > _UNEXPLAINED * np.median(np.abs(wanted - np.median(wanted))):
+        return f"their values as {kind} depths do not agree with the points in them"
+    return np.asarray(np.maximum(scale * values + shift, 0), dtype=np.float32)
+
+
+def fit_line(values: Float64Array, wanted: Float64Array, *, shift: bool) -> tuple[float, float]:
+    """Scale and shift by which most of the values are as wanted, those that are far from it left out.
+
+    Least median of squares, which up to half of the values cannot mislead, then least squares over what is within 2.5
+    standard deviations of it (Rousseeuw 1984).
+
+    Args:
+        values: Shape (N,), N at least 3.
+        wanted: Shape (N,).
+        shift: Whether there is one; else it is 0.
+    """
+    middle = float(np.median(values)) if shift else 0.0  # so that equal values have scale 0
+    design = np.column_stack([values - middle, np.ones_like(values)][: 1 + shift])
+    rng = np.random.default_rng(0)
+    picks = rng.integers(len(values), size=(_TRIALS, design.shape[1]))
+    trials = (np.linalg.pinv(design[picks]) @ wanted[picks][..., None])[..., 0]
+    misses = np.abs(design @ trials.T - wanted[:, None])
+    medians = np.median(misses, axis=0)
+    best = int(medians.argmin())
+    deviation = 1.4826 * (1 + 5 / (len(values) - design.shape[1])) * medians[best]
+    near = misses[:, best] <= 2.5 * deviation
+    scale, *rest = np.linalg.lstsq(design[near], wanted[near])[0]
+    return float(scale), float(sum(rest) - scale * middle)
+
+
+def resize_map(inverse: DepthMap, width: int, height: int) -> DepthMap:
+    """A map in another size: means of what is known over the area of a pixel; unknown where that is less than half."""
+    if inverse.shape == (height, width):
+        return inverse
+    way = cv2.INTER_AREA if width <= inverse.shape[1] else cv2.INTER_LINEAR
+    known = np.isfinite(inverse)
+    share = cv2.resize(known.astype(np.float32), (width, height), interpolation=way)
+    total = cv2.resize(np.where(known, inverse, np.float32(0)), (width, height), interpolation=way)
+    return np.where(share >= 0.5, total / np.maximum(share, 0.5), np.float32(np.nan)).astype(np.float32)

@@ -1,0 +1,93 @@
+"""Points at which a fit starts: those of the capture, or random ones where it has too few."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import Float32Array, Float64Array, Int32Array
+from mitsplat.camera import Camera
+
+Mask = Float32Array
+
+_ENOUGH = 500
+_RANDOM = 3000
+_TRIES = 100_000
+
+
+def seed_points(
+    points: Float64Array,
+    colours: npt.NDArray[np.uint8],
+    cameras: Sequence[Camera],
+    seen: Sequence[Int32Array],
+    masks: Sequence[Mask] | None,
+    rng: np.random.Generator,
+    most: int,
+) -> tuple[Float64Array, Float64Array]:
+    """Points (N, 3) and their display-encoded colours in [0, 1], (N, 3).
+
+    With masks, points that most of the photos which see them show outside the object are left out. Where fewer than 500
+    are left, grey points are added, from all of the space that the cameras look at, or from the masks' visual hull.
+
+    Args:
+        points: Those of the capture, shape (M, 3).
+        colours: Theirs, 8-bit, shape (M, 3).
+        cameras: Of the training photos.
+        seen: Indices of the points that each of them sees; none if that is not known.
+        masks: Share of the pixels of each that the object covers, or None.
+        rng: Draws points.
+        most: Largest number.
+    """
+    tints = colours / 255.0
+    if masks is not None and len(points):
+        votes, voters = np.zeros(len(points)), np.zeros(len(points))
+        for camera, indices, mask in zip(cameras, seen, masks, strict=True):
+            own = indices if len(indices) else np.arange(len(points))
+            shown = _covered(camera, mask, points[own])
+            known = shown >= 0
+            np.add.at(votes, own[known], shown[known] > 0.5)
+            np.add.at(voters, own[known], 1)
+        kept = 2 * votes > voters
+        points, tints = points[kept], tints[kept]
+    if len(points) < _ENOUGH:
+        extra = _random_points(cameras, masks, rng)
+        points = np.concatenate([points, extra])
+        tints = np.concatenate([tints, np.full(extra.shape, 0.5)])
+    if len(points) > most:
+        chosen = np.sort(rng.choice(len(points), most, replace=False))
+        points, tints = points[chosen], tints[chosen]
+    return points, tints
+
+
+def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng: np.random.Generator) -> Float64Array:
+    """Points in a ball around what the cameras look at, or in the part of it that hardly a mask excludes."""
+    centres = np.array([camera.centre for camera in cameras])
+    axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
+    # The point nearest to all optical axes; a little weight on the cameras' own middle decides if these are parallel.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    weight = 1e-3 * len(centres)
+    normal = across.sum(axis=0) + weight * np.eye(3)
+    focus = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres) + weight * centres.mean(axis=0))
+    reach = float(np.median(np.linalg.norm(centres - focus, axis=1))) or 1.0
+    ball = rng.normal(size=(_RANDOM if masks is None else _TRIES, 3))
+    ball *= rng.random((len(ball), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = focus + 0.9 * reach * ball
+    if masks is None:
+        return ball
+    inside = np.zeros(len(ball))
+    for camera, mask in zip(cameras, masks, strict=True):
+        inside += _covered(camera, mask, ball) > 0.5
+    hull: Float64Array = ball[inside >= max(1.0, 0.9 * inside.max())]
+    return hull[:_RANDOM]
+
+
+def _covered(camera: Camera, mask: Mask, points: Float64Array) -> Float64Array:
+    """Share of the pixel of each point that the object covers; -1 outside of the picture."""
+    pixels, depth = camera.project(points)
+    x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(int).T
+    inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    result = np.full(len(points), -1.0)
+    result[inside] = mask[y[inside], x[inside]]
+    return result

@@ -1,0 +1,453 @@
+"""Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
+
+Gaussians start at the capture's points and are densified (:mod:`mitsplat.fit.strategy_mcmc`). A fit lives in a folder,
+see :mod:`mitsplat.fit.folder`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo
+from mitsplat.errors import InputError
+from mitsplat.files import add_content
+from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps
+from mitsplat.fit.folder import FitFolder, FitResult
+from mitsplat.fit.initial_points import seed_points
+from mitsplat.fit.optimizer import Adam, Model
+from mitsplat.fit.strategy_classic import Classic
+from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
+from mitsplat.fit.training_view import HeldOut, Sight
+from mitsplat.image_metrics import psnr_of
+from mitsplat.quality import Quality
+from mitsplat.render.layers import ensure_variant
+from mitsplat.version import __version__
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a capture is fitted. Rates are those published for 3DGS, regularisation is that of its MCMC densification.
+
+    Attributes:
+        gaussians: Most Gaussians; with MCMC their number grows to this by the middle of the fit.
+        densification: ``mcmc`` puts Gaussians where others are opaque (Kheradmand et al. 2024); ``classic`` where the
+            photos pull at them (Kerbl et al. 2023), in as many as that takes.
+        iterations: Optimiser steps; each takes one photo, all photos in turn.
+        budget: Time [s] in which the schedule of the iterations runs off even if it must leave some out; then the
+            result depends on the machine.
+        target_psnr: Mean PSNR [dB] at which the fit ends early: of one in eight of the training photos, which are then
+            set aside for that. Held-out photos take part in no decision.
+        size: Longest edge of the pictures [px]; photos are made smaller, never larger.
+        sh_degree: Degree of the spherical harmonics, 0 to 3; a degree more every fifth of the fit.
+        masks: ``alpha``: only what masks show is fitted, and they supervise alpha; ``ignore``: what they leave out may
+            look like anything; ``off``: they are not read.
+        background: Behind splats and mask: a random colour in every step, or black.
+        ssim_share: Weight of D-SSIM against L1.
+        alpha_weight: Weight of the difference between alpha and mask.
+        depth_weight: Weight of the difference between inverse depths of the splats and of the points a photo sees, or
+            of its depth map, relative to the inverse of the fit's length unit, in every fourth step; 0 leaves depths
+            out. Without it, Gaussians inside and behind an object explain its photos as well as those on its surface.
+            The weight of maps falls to a hundredth exponentially, as published: they are smooth and may be bent.
+        opacity_weight: Weight of the mean opacity. MCMC's authors have 0.01 in fits ten times as long; in short ones it
+            leaves surfaces that are seen through.
+        scale_weight: Weight of the mean scale in units of the cameras' extent; by default 0.01 with MCMC, as published,
+            and 0 with classic densification, which removes what is large.
+        exposure: Whether every photo has an affine colour correction of its own (3 x 4). Their mean stays the identity,
+            because photos alone do not say whether splats are bright or corrections are.
+        coarse: Share of the fit that sees pictures of half the size.
+        refine_every: Steps between removals or moves of dead Gaussians and additions of new ones.
+        rate_means: Learning rate at the start in units of the cameras' extent; falls to a hundredth exponentially.
+        rate_quats: Learning rate of the quaternions' components.
+        rate_scales: Learning rate of the logarithms of the scales.
+        rate_opacities: Learning rate of the logits of the opacities.
+        rate_sh: Learning rate of the constant SH coefficients; the others have a twentieth.
+        rate_exposure: Learning rate of the colour corrections at the start; falls to a tenth exponentially.
+        seed: Decides every random number.
+    """
+
+    gaussians: int = 30_000
+    densification: Literal["mcmc", "classic"] = "mcmc"
+    iterations: int = 3000
+    budget: float | None = None
+    target_psnr: float | None = None
+    size: int = 800
+    sh_degree: int = 3
+    masks: Literal["alpha", "ignore", "off"] = "alpha"
+    background: Literal["random", "black"] = "random"
+    ssim_share: float = 0.2
+    alpha_weight: float = 0.1
+    depth_weight: float = 0.5
+    opacity_weight: float = 0.0
+    scale_weight: float | None = None
+    exposure: bool = False
+    coarse: float = 0.25
+    refine_every: int = 100
+    rate_means: float = 1.6e-4
+    rate_quats: float = 1e-3
+    rate_scales: float = 5e-3
+    rate_opacities: float = 5e-2
+    rate_sh: float = 2.5e-3
+    rate_exposure: float = 1e-2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("gaussians", 2), ("iterations", 1), ("size", 64), ("refine_every", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
+        if self.budget is not None and not self.budget > 0:
+            raise InputError(f"budget must be > 0 s (got {self.budget})")
+        for name, kinds in (
+            ("densification", ("mcmc", "classic")),
+            ("masks", ("alpha", "ignore", "off")),
+            ("background", ("random", "black")),
+        ):
+            if getattr(self, name) not in kinds:
+                raise InputError(f"{name} must be {', '.join(kinds[:-1])} or {kinds[-1]} (got {getattr(self, name)})")
+        for name in ("ssim_share", "coarse"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} must be in [0, 1] (got {getattr(self, name)})")
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """Where a fit stands.
+
+    Attributes:
+        step: Steps made.
+        fraction: Share of the schedule that has run off.
+        psnr: Of the photos of the last steps [dB].
+        validation: Mean over the photos that the target is for, when they were last looked at [dB], if they were.
+        gaussians: Number of Gaussians.
+    """
+
+    step: int
+    fraction: float
+    psnr: float
+    validation: float | None
+    gaussians: int
+
+
+QUALITY = Quality(transmittance_min=1e-3)
+_EVERY = 25
+"""Steps between reports: reading a loss waits for the device."""
+_EXTENT = 1.1
+_CHECKPOINT_SECONDS = 60.0
+_LOOK_EVERY = 0.05
+"""Share of the schedule between looks at the photos that the target is for."""
+_DEPTH_EVERY = 4
+"""Steps between looks at depth, which double the time of a step."""
+_MAPS_FALL_TO = 0.01
+"""What is left at the end of the weight of depth maps (Kerbl et al. 2024, as published for 3DGS)."""
+
+
+def fit_capture(
+    capture: Capture,
+    out: str | Path,
+    settings: FitSettings = FitSettings(),
+    *,
+    depths: DepthMaps | None = None,
+    overwrite: bool = False,
+    progress: Callable[[FitProgress], None] | None = None,
+) -> FitResult:
+    """Fit splats to the training photos of a capture, or go on with a fit that was interrupted.
+
+    Runs of the same inputs give the same splats on the same device, resumed or not, unless ``settings.budget`` is set.
+
+    Args:
+        capture: Photos, cameras, points.
+        out: Folder of the fit.
+        settings: How to fit.
+        depths: Depth maps of photos, which take the place of the points that these see in the loss.
+        overwrite: Whether what the folder holds of other inputs, or damaged, is replaced.
+        progress: Told every few steps where the fit stands.
+
+    Raises:
+        InputError: If there are too few photos, a photo or a depth map cannot be read, or the folder holds another fit.
+    """
+    training, held_out = _usable(capture.training, settings), _usable(capture.held_out, settings)
+    if not (training and held_out):
+        raise InputError(
+            "a fit needs a photo to learn from and a held-out one, with masks if any has one "
+            f"(got {len(training)} of {len(capture.training)} and {len(held_out)} of {len(capture.held_out)})"
+        )
+    validation: tuple[Photo, ...] = ()
+    if settings.target_psnr is not None:
+        training, validation = _set_aside(training)
+    ensure_variant()
+    folder = FitFolder(Path(out), _digest(capture, settings, depths))
+    done = folder.finished(overwrite=overwrite)
+    if done is not None:
+        return done
+    state = folder.checkpoint(overwrite=overwrite)
+    maps, warnings = ({}, ()) if depths is None else align_maps(training, capture.points, depths, settings.size)
+    fit = _Fit(capture, training, validation, settings, maps)
+    if state is not None:
+        fit.restore(state)
+    held = [_sight(photo, settings) for photo in held_out]
+    folder.begin(goes_on=state is not None)
+    saved = time.monotonic()
+    while fit.fraction < 1:
+        fit.step()
+        if fit.steps % _EVERY == 0 or fit.fraction >= 1:
+            now = fit.report()
+            if progress is not None:
+                progress(now)
+            if settings.target_psnr is not None and (now.validation or 0) >= settings.target_psnr:
+                break
+            if time.monotonic() - saved > _CHECKPOINT_SECONDS:
+                folder.save_checkpoint(fit.state())
+                saved = time.monotonic()
+    seconds = fit.elapsed
+    result = FitResult(
+        fit.model.splats(),
+        fit.steps,
+        seconds,
+        fit.check(held, folder.held_out),
+        folder.inputs,
+        warnings,
+        fit.check(fit.validation, None),
+    )
+    folder.save(result, {"units": capture.units, "variant": mi.variant(), "settings": asdict(settings)})
+    return result
+
+
+class _Fit:
+    """A fit between two steps."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        training: tuple[Photo, ...],
+        validation: tuple[Photo, ...],
+        settings: FitSettings,
+        maps: Mapping[str, DepthMap],
+    ) -> None:
+        self.settings, self.points = settings, capture.points
+        self.photos = [_sight(photo, settings, maps.get(photo.name)) for photo in training]
+        self.validation = [_sight(photo, settings) for photo in validation]
+        centres = np.array([photo.camera.centre for photo in training])
+        self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
+        rng = np.random.default_rng([settings.seed, 0])
+        subject = settings.masks == "alpha" and any(photo.masked for photo in self.photos)
+        masks = [photo.mask for photo in self.photos] if subject else None
+        cameras = [photo.camera for photo in self.photos]
+        seen = [photo.seen for photo in training]
+        points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
+        self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
+        self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
+        self.densification = _densification(settings, self.model.count)
+        self.scale_weight = self.densification.scale_weight if settings.scale_weight is None else settings.scale_weight
+        self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
+        self.steps, self.seconds = 0, 0.0
+        self.errors: list[Any] = []
+        self.began = time.monotonic()
+        self.looked, self.validated = 0.0, float("nan")
+
+    @property
+    def elapsed(self) -> float:
+        """Time [s] spent, over all runs."""
+        return self.seconds + time.monotonic() - self.began
+
+    @property
+    def fraction(self) -> float:
+        """Share of the schedule that has run off."""
+        s = self.settings
+        spent = self.elapsed / s.budget if s.budget else 0.0
+        return min(1.0, max(self.steps / s.iterations, spent))
+
+    def step(self) -> None:
+        s, fraction = self.settings, self.fraction
+        epoch, turn = divmod(self.steps, len(self.photos))
+        number = int(np.random.default_rng([s.seed, 1, epoch]).permutation(len(self.photos))[turn])
+        rng = np.random.default_rng([s.seed, 2, self.steps])
+        sight = self.photos[number].half if fraction < s.coarse else self.photos[number]
+        degree = min(s.sh_degree, int(5 * fraction))
+        self.model.track()
+        loss, error = self._loss(sight, number, replace(QUALITY, sh_degree=degree), fraction, rng)
+        dr.backward(loss)
+        self.densification.look(self.model, sight.camera)
+        rate = s.rate_means * 0.01**fraction
+        self.model.update(
+            {
+                "means": rate,
+                "quats": s.rate_quats,
+                "scales": s.rate_scales,
+                "opacities": s.rate_opacities,
+                "sh": self.model.sh_rates(s.rate_sh, s.rate_sh / 20),
+            }
+        )
+        if s.exposure:
+            self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
+            self.exposure.values["exposure"] = _centred(self.exposure.values["exposure"], len(self.photos))
+        self.steps += 1
+        self.densification.refine(self.model, self.steps, fraction, rate, rng)
+        self.errors.append(error)
+
+    def _depth_weight(self, sight: Sight, fraction: float) -> float:
+        """Weight of the depths of a photo in this step."""
+        if self.steps % _DEPTH_EVERY:
+            return 0.0
+        return self.settings.depth_weight * (1 if sight.inverse_depth is None else _MAPS_FALL_TO**fraction)
+
+    def _loss(
+        self, sight: Sight, number: int, quality: Quality, fraction: float, rng: np.random.Generator
+    ) -> tuple[Any, Any]:
+        """The loss, and the mean squared error alone."""
+        from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
+        from mitsplat.plugins.photometric import photometric_loss
+
+        s = self.settings
+        loss = mi.Float(0)
+        weight = self._depth_weight(sight, fraction)
+        depths = sight.depths(self.points) if weight > 0 else ()
+        if depths and dr.width(depths[0]):
+            rgb, alpha, moment = render_depth_differentiable(self.model.cloud(), sight.view, quality)
+            loss += dr.opaque(mi.Float, weight * self.extent) * _depth_error(alpha, moment, *depths)
+        else:
+            rgb, alpha = render_differentiable(self.model.cloud(), sight.view, quality)
+        target, mask = sight.pixels()
+        if s.exposure:
+            self.exposure.track()
+            rgb = _exposed(rgb, alpha, self.exposure.values["exposure"], number, len(self.photos))
+        if s.masks == "ignore":
+            rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
+        if s.background == "random":
+            behind = [dr.opaque(mi.Float, float(value)) for value in rng.random(3)]
+            rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
+            target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
+        camera = sight.camera
+        loss += photometric_loss(rgb, target, camera.width, camera.height, s.ssim_share)
+        if s.masks == "alpha" and sight.masked:
+            loss += s.alpha_weight * dr.mean(dr.abs(alpha - mask))
+        _, _, scales, opacities, _ = self.model.activated()
+        # Means by opaque counts: a literal one would compile the kernels anew whenever Gaussians are added.
+        loss += dr.sum(opacities) * dr.opaque(mi.Float, s.opacity_weight / self.model.count)
+        loss += dr.sum(scales) * dr.opaque(mi.Float, self.scale_weight / (3 * self.model.count * self.extent))
+        error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
+        dr.schedule(error)
+        return loss, error
+
+    def report(self) -> FitProgress:
+        """Where the fit stands; looks now and then at the photos that the target is for."""
+        error = float(np.mean([e.numpy()[0] for e in self.errors]))
+        self.errors = []
+        fraction = self.fraction
+        if self.validation and (fraction >= self.looked + _LOOK_EVERY or fraction >= 1):
+            self.looked = fraction
+            self.validated = float(np.mean([photo.psnr for photo in self.check(self.validation, None)]))
+        validated = None if np.isnan(self.validated) else self.validated
+        return FitProgress(self.steps, fraction, psnr_of(error), validated, self.model.count)
+
+    def check(self, photos: Sequence[Sight], folder: Path | None) -> tuple[HeldOut, ...]:
+        """Photos that are not fitted, with a picture of each in the folder."""
+        quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
+        found = []
+        for sight in photos:
+            seen, _ = sight.render(self.model, quality)
+            if self.settings.masks == "ignore":
+                seen = seen * sight.mask[..., None]
+            found.append(sight.compare(seen, folder))
+        return tuple(found)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that decides how the fit goes on after a report, as arrays that :meth:`restore` takes."""
+        own = {"steps": self.steps, "seconds": self.elapsed, "looked": self.looked, "validated": self.validated}
+        return own | {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what :meth:`state` gave."""
+        self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
+        self.looked, self.validated = float(state["looked"]), float(state["validated"])
+        for name, part in self._parts.items():
+            part.restore({k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")})
+
+    @property
+    def _parts(self) -> dict[str, Adam | Densification]:
+        """What changes from step to step, by its name in checkpoints."""
+        return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
+
+
+def _densification(settings: FitSettings, start: int) -> Densification:
+    """The strategy that is asked for, of so many Gaussians at the start."""
+    s = settings
+    if s.densification == "classic":
+        return Classic(s.gaussians, s.refine_every)
+    return Mcmc(s.gaussians, start, s.refine_every, s.seed)
+
+
+def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:
+    """Mean difference between inverse depths [1/m] at pixels, all different, as splats have them and should have."""
+    cover, depth = (dr.gather(mi.Float, layer, pixel, mode=dr.ReduceMode.NoConflicts) for layer in (alpha, moment))
+    seen = (cover > 0.1) & (depth > 0)
+    found = dr.select(seen, cover / dr.select(seen, depth, 1), inverse)
+    return dr.sum(dr.abs(found - inverse)) * dr.opaque(mi.Float, 1 / dr.width(pixel))
+
+
+def _exposed(rgb: list[Any], alpha: Any, table: Any, number: int, photos: int) -> list[Any]:
+    """Premultiplied colours after the affine correction of a photo; the table has its twelve entries photo by photo."""
+    place = dr.opaque(mi.UInt32, number)
+    m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
+    return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
+
+
+def _centred(table: Any, photos: int) -> Any:
+    """The table of corrections, shifted so that their mean is the identity."""
+    entry = dr.arange(mi.UInt32, 12 * photos) // photos
+    mean = dr.block_sum(table, photos) * dr.opaque(mi.Float, 1 / photos)
+    centred = table - dr.gather(mi.Float, mean, entry) + dr.select(entry % 5 == 0, 1, 0)
+    dr.eval(centred)
+    return centred
+
+
+def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:
+    """The photos, but none without mask where others have one: it shows what is not to be fitted."""
+    masked = tuple(photo for photo in photos if photo.mask is not None)
+    return photos if settings.masks == "off" or not masked else masked
+
+
+def _set_aside(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    """The photos to learn from and those that a target is for: the middle one of every eight, or the last.
+
+    Raises:
+        InputError: If there is only one.
+    """
+    if len(training) < 2:
+        raise InputError(f"a target takes at least two photos besides the held-out ones (got {len(training)})")
+    validation = training[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or training[-1:]
+    return tuple(photo for photo in training if photo not in validation), validation
+
+
+def _sight(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None) -> Sight:
+    scale = min(1.0, settings.size / max(photo.camera.width, photo.camera.height))
+    return Sight(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth)
+
+
+def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
+    """SHA-256 of everything that decides a fit."""
+    digest = hashlib.sha256(json.dumps([__version__, asdict(settings)], sort_keys=True).encode())
+    for photo in capture.photos:
+        camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
+        digest.update(json.dumps([photo.name, camera]).encode())
+        digest.update(np.ascontiguousarray(photo.seen).tobytes())
+        for file in (photo.file, photo.mask):
+            digest.update(b"-" if file is None else file.read_bytes())
+    digest.update(capture.points.tobytes() + capture.colours.tobytes())
+    if depths is not None:
+        digest.update(depths.kind.encode())
+        for name, file in sorted(depths.files.items()):
+            digest.update(name.encode())
+            add_content(digest, file)
+    return digest.hexdigest()

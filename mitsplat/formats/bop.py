@@ -1,0 +1,181 @@
+"""BOP datasets (Benchmark for 6D Object Pose estimation), one scene for each layout.
+
+::
+
+    bop/models/obj_000001.ply, models_info.json      proxy meshes [mm]; object ids are positions in ``objects`` + 1
+    bop/<split>/000000/scene_camera.json, scene_gt.json, scene_gt_info.json
+    bop/<split>/000000/rgb/000003.png, depth/000003.png, mask/000003_000000.png, mask_visib/000003_000000.png
+
+Definitions are those of the BOP toolkit (``docs/bop_datasets_format.md``, ``scripts/calc_gt_info.py``): the silhouette
+is counted up to one image beyond each border, boxes are (x, y, x_max - x_min, y_max - y_min), pixel centres are whole
+numbers. The one difference: what is visible is known exactly, where the toolkit compares depths within 15 mm.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
+
+from mitsplat.camera import Camera
+from mitsplat.files import GrowingFile, Record, write_file, write_text
+from mitsplat.formats.coco import camera_of
+from mitsplat.formats.maps import encode_mask_png
+from mitsplat.json_stream import EntriesFile
+from mitsplat.labels.labels import Labels
+
+MILLIMETRES = 1000.0
+_TOGETHER, _WAITING = 768, 32
+"""Files, and how many of them are waited for at a time."""
+
+
+def scene_folder(record: Record) -> str:
+    """Folder of the frame's scene, relative to the dataset."""
+    return f"bop/{record['split']}/{record['layout']:06d}"
+
+
+def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
+    """(folder, position of the instance, PNG of 0 and 255) of every mask of a frame."""
+    size = labels.width, labels.height
+    for position, label in enumerate(labels.instances):
+        yield "mask", position, encode_mask_png(label.amodal.mask, label.amodal.box, size)
+        yield "mask_visib", position, encode_mask_png(label.mask, label.box, size)
+
+
+class ScenesWriter:
+    """Writes the annotations of all scenes: frames come by layout.
+
+    Files of scenes are put on disk side by side, as many as :data:`_TOGETHER`: a million images have 300,000, and
+    waiting for one after the other would take longer than all the rest.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._folder, self._layout = "", -1
+        self._files: dict[str, EntriesFile] = {}
+        self._ended: list[GrowingFile] = []
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        folder = scene_folder(record)
+        if folder != self._folder:
+            if record["layout"] <= self._layout:
+                raise ValueError(f"frames must come by layout (got {record['layout']} after {self._layout})")
+            self._end_scene()
+            if len(self._ended) >= _TOGETHER:
+                self._name_ended()
+            self._folder, self._layout = folder, record["layout"]
+            self._files = {
+                part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
+            }
+        index, camera = str(record["index"]), camera_of(record)
+        self._files["camera"].append(index, camera_entry(record, camera))
+        self._files["gt"].append(index, pose_entries(record, camera))
+        self._files["gt_info"].append(index, info_entries(record))
+
+    def _end_scene(self) -> None:
+        self._ended += (file.end() for file in self._files.values())
+        self._files = {}
+
+    def _name_ended(self) -> None:
+        with ThreadPoolExecutor(_WAITING) as pool:
+            list(pool.map(GrowingFile.sync, self._ended))
+        for file in self._ended:
+            file.name()
+        self._ended = []
+
+    def keep(self) -> None:
+        """Give the files of the last scenes their names."""
+        self._end_scene()
+        self._name_ended()
+
+    def discard(self) -> None:
+        """Remove what was not kept."""
+        for open_file in self._files.values():
+            open_file.discard()
+        for file in self._ended:
+            file.discard()
+
+
+def write_models(root: Path, meshes: Sequence[trimesh.Trimesh]) -> None:
+    """Write the objects' meshes, and their bounds and diameters."""
+    info = {}
+    for number, mesh in enumerate(meshes, start=1):
+        scaled = mesh.copy()
+        scaled.apply_scale(MILLIMETRES)
+        info[str(number)] = model_info(scaled)
+        data = trimesh.exchange.ply.export_ply(scaled, encoding="ascii", vertex_normal=True)
+        write_file(root / f"bop/models/obj_{number:06d}.ply", lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
+    write_text(root / "bop/models/models_info.json", json.dumps(info, indent=1))
+
+
+def model_info(mesh: trimesh.Trimesh) -> dict[str, float]:
+    """Diameter, lower corner and extents of a mesh, in its units."""
+    return {
+        "diameter": diameter(mesh),
+        **{f"min_{axis}": float(value) for axis, value in zip("xyz", mesh.bounds[0], strict=True)},
+        **{f"size_{axis}": float(value) for axis, value in zip("xyz", mesh.extents, strict=True)},
+    }
+
+
+def diameter(mesh: trimesh.Trimesh) -> float:
+    """Largest distance of two vertices."""
+    points = mesh.vertices
+    corners = points[ConvexHull(points).vertices]
+    return float(pdist(corners).max())
+
+
+def camera_entry(record: Record, camera: Camera) -> dict[str, Any]:
+    """The frame in ``scene_camera.json``."""
+    intrinsics = camera.intrinsics
+    intrinsics[:2, 2] -= 0.5
+    pose = camera.camera_from_world
+    return {
+        "cam_K": intrinsics.ravel().tolist(),
+        "depth_scale": record["depth_scale"],
+        "cam_R_w2c": pose[:3, :3].ravel().tolist(),
+        "cam_t_w2c": (MILLIMETRES * pose[:3, 3]).tolist(),
+    }
+
+
+def pose_entries(record: Record, camera: Camera) -> list[dict[str, Any]]:
+    """The frame in ``scene_gt.json``."""
+    camera_from_world = camera.camera_from_world
+    entries = []
+    for label in record["labels"]["instances"]:
+        pose = camera_from_world @ np.array(label["world_from_object"])
+        entries.append(
+            {
+                "cam_R_m2c": pose[:3, :3].ravel().tolist(),
+                "cam_t_m2c": (MILLIMETRES * pose[:3, 3]).tolist(),
+                "obj_id": label["asset"] + 1,
+            }
+        )
+    return entries
+
+
+def info_entries(record: Record) -> list[dict[str, Any]]:
+    """The frame in ``scene_gt_info.json``."""
+
+    def box(bounds: Sequence[int]) -> list[int]:
+        x0, y0, x1, y1 = bounds
+        return [x0, y0, x1 - 1 - x0, y1 - 1 - y0]
+
+    return [
+        {
+            "bbox_obj": box(label["silhouette_box"]),
+            "bbox_visib": box(label["box"]),
+            "px_count_all": label["silhouette_area"],
+            "px_count_valid": label["depth_area"],
+            "px_count_visib": label["area"],
+            "visib_fract": label["area"] / label["silhouette_area"],
+        }
+        for label in record["labels"]["instances"]
+    ]

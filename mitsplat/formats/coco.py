@@ -1,0 +1,190 @@
+"""COCO annotations from the records of a dataset's frames; image ids are frame indices, category ids class indices + 1.
+
+``annotations/instances_<split>.json``
+    Boxes, areas and run-length masks of what is visible, with the keypoints of assets that name some.
+``annotations/amodal_<split>.json``
+    The same instances with all that they cover, hidden pixels included; ``visible_segmentation`` is what is seen.
+``annotations/panoptic_<split>.json`` and ``panoptic/<split>/NNNNNN.png``
+    Every pixel's segment, id = R + 256 G + 256² B; the environment is a segment of stuff, and what belongs to an
+    instance without a label is void (id 0).
+``annotations/poses_<split>.json``
+    Cameras, and the rigid transforms of the instances, in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.camera import Camera
+from mitsplat.files import Record
+from mitsplat.json_stream import ListsFile
+from mitsplat.labels.labels import UNLABELLED, Labels
+
+ENVIRONMENT = "environment"
+"""Name of the panoptic category of what is no instance."""
+
+
+def annotations_of(
+    record: Record, keypoint_names: Sequence[Sequence[str]], *, first: int, amodal: bool
+) -> Iterator[dict[str, Any]]:
+    """Annotations of a frame's instances, of what is visible or of all that they cover, with ids from ``first`` on."""
+    width, height = record["labels"]["size"]
+    for number, label in enumerate(record["labels"]["instances"], start=first):
+        visible = {"size": [height, width], "counts": label["rle"]}
+        x0, y0, x1, y1 = label["amodal_box" if amodal else "box"]
+        annotation = {
+            "id": number,
+            "image_id": record["index"],
+            "category_id": label["class_index"] + 1,
+            "bbox": [x0, y0, x1 - x0, y1 - y0],
+            "area": label["amodal_area" if amodal else "area"],
+            "iscrowd": 0,
+            "segmentation": {"size": [height, width], "counts": label["amodal_rle"]} if amodal else visible,
+            "visible_fraction": label["visible_fraction"],
+            "truncation": label["truncation"],
+            "marks": label["marks"],
+        }
+        if amodal:
+            annotation["visible_segmentation"] = visible
+        if keypoint_names[label["class_index"]]:
+            annotation["keypoints"] = [value for point in label["keypoints"] for value in point]
+            annotation["num_keypoints"] = sum(point[2] > UNLABELLED for point in label["keypoints"])
+        yield annotation
+
+
+def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
+    """Segments of a frame's picture, which is that of :func:`panoptic_image`."""
+    segments = [
+        {
+            "id": label["id"],
+            "category_id": label["class_index"] + 1,
+            "area": label["area"],
+            "bbox": [*label["box"][:2], label["box"][2] - label["box"][0], label["box"][3] - label["box"][1]],
+            "iscrowd": 0,
+        }
+        for label in record["labels"]["instances"]
+    ]
+    if "environment" in record:
+        area, (x0, y0, x1, y1) = record["environment"]["area"], record["environment"]["box"]
+        box = [x0, y0, x1 - x0, y1 - y0]
+        segments.append(
+            {"id": record["environment"]["id"], "category_id": num_classes + 1, "area": area, "bbox": box, "iscrowd": 0}
+        )
+    return {"image_id": record["index"], "file_name": f"{record['index']:06d}.png", "segments_info": segments}
+
+
+def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
+    """Camera and 6-DoF poses of a frame."""
+    camera_from_world = camera_of(record).camera_from_world
+    return {
+        **_image(record),
+        "camera": record["camera"],
+        "instances": [
+            {
+                "id": label["id"],
+                "class": label["class"],
+                "asset": assets[label["asset"]],
+                "camera_from_object": (camera_from_world @ np.array(label["world_from_object"])).tolist(),
+                "world_from_object": label["world_from_object"],
+            }
+            for label in record["labels"]["instances"]
+        ],
+    }
+
+
+class InstancesWriter:
+    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``."""
+
+    def __init__(
+        self, path: Path, class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]], *, amodal: bool
+    ) -> None:
+        self.file = ListsFile(
+            path, ("images", "annotations"), after={"categories": _categories(class_names, keypoint_names)}
+        )
+        self._keypoint_names, self._amodal = keypoint_names, amodal
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        self.file.append("images", _image(record))
+        first = self.file.count("annotations") + 1
+        for annotation in annotations_of(record, self._keypoint_names, first=first, amodal=self._amodal):
+            self.file.append("annotations", annotation)
+
+
+class PanopticWriter:
+    """Writes ``panoptic_<split>.json``."""
+
+    def __init__(self, path: Path, class_names: Sequence[str]) -> None:
+        self._stuff = len(class_names)
+        categories = [{**category, "isthing": 1} for category in _categories(class_names, [()] * len(class_names))]
+        categories.append({"id": self._stuff + 1, "name": ENVIRONMENT, "supercategory": ENVIRONMENT, "isthing": 0})
+        self.file = ListsFile(path, ("images", "annotations"), after={"categories": categories})
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        self.file.append("images", _image(record))
+        self.file.append("annotations", panoptic_annotation(record, self._stuff))
+
+
+class PosesWriter:
+    """Writes ``poses_<split>.json``."""
+
+    def __init__(self, path: Path, class_names: Sequence[str], assets: Sequence[str]) -> None:
+        self.file = ListsFile(path, ("frames",), before={"classes": list(class_names)})
+        self._assets = assets
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        self.file.append("frames", pose_entry(record, self._assets))
+
+
+def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> dict[str, Any] | None:
+    """The segment of the pixels where an id map holds 0: its id, area and box; None if there are none."""
+    ys, xs = np.nonzero(ids == 0)
+    if not len(ys):
+        return None
+    number = max([0, *(label.id for label in labels.instances)]) + 1
+    box = [int(xs.min()), int(ys.min()), int(xs.max()) + 1, int(ys.max()) + 1]
+    return {"id": number, "area": len(ys), "box": box}
+
+
+def panoptic_image(
+    labelled: npt.NDArray[np.uint16], ids: npt.NDArray[np.integer[Any]], environment: Mapping[str, Any] | None
+) -> npt.NDArray[np.uint8]:
+    """RGB picture of segment ids, (H, W, 3), from the labelled ids and all ids (H, W)."""
+    segments = labelled.astype(np.uint32)
+    if environment is not None:
+        segments[ids == 0] = environment["id"]
+    return np.stack([segments & 255, segments >> 8 & 255, segments >> 16], axis=-1).astype(np.uint8)
+
+
+def camera_of(record: Record) -> Camera:
+    """The camera that a record states."""
+    stored = record["camera"]
+    ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
+    pose, distortion = np.array(stored["world_from_camera"]), tuple(stored["distortion"])
+    lens = {key: stored[key] for key in ("lens", "aperture_radius", "focus_distance")}
+    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, distortion, **lens)
+
+
+def image_file(record: Record) -> str:
+    """The frame's image, relative to the dataset."""
+    return str(next(file for file in record["files"] if file.startswith("images/")))
+
+
+def _image(record: Record) -> dict[str, Any]:
+    width, height = record["labels"]["size"]
+    return {"id": record["index"], "file_name": Path(image_file(record)).name, "width": width, "height": height}
+
+
+def _categories(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
+    return [
+        {"id": i, "name": name, "supercategory": "object"}
+        | ({"keypoints": list(points), "skeleton": []} if points else {})
+        for i, (name, points) in enumerate(zip(class_names, keypoint_names, strict=True), start=1)
+    ]

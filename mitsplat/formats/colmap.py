@@ -1,0 +1,65 @@
+"""Cameras of a dataset as COLMAP's text model: ``colmap/cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
+
+Positions are in pixels with centres at +0.5, as in COLMAP; poses are camera_from_world, quaternions scalar first. Image
+names are relative to ``images/``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scipy.spatial.transform import Rotation
+
+from mitsplat.camera import Camera
+from mitsplat.files import GrowingFile, Record
+from mitsplat.formats.coco import camera_of, image_file
+
+
+class ModelWriter:
+    """Writes the three files."""
+
+    def __init__(self, root: Path) -> None:
+        self._cameras, self._images, self._points = (
+            GrowingFile(root / f"colmap/{name}.txt") for name in ("cameras", "images", "points3D")
+        )
+        self._models: dict[str, int] = {}
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        camera = camera_of(record)
+        model = camera_model(camera)
+        if model not in self._models:
+            self._models[model] = len(self._models) + 1
+            self._cameras.write(f"{self._models[model]} {model}\n")
+        pose = camera.camera_from_world
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        values = " ".join(repr(float(value)) for value in (w, x, y, z, *pose[:3, 3]))
+        name = image_file(record).removeprefix("images/")
+        self._images.write(f"{record['index'] + 1} {values} {self._models[model]} {name}\n\n")
+
+    def keep(self) -> None:
+        """Give the files their names."""
+        for file in (self._cameras, self._images, self._points):
+            file.keep()
+
+    def discard(self) -> None:
+        """Remove what was written, unless it was kept."""
+        for file in (self._cameras, self._images, self._points):
+            file.discard()
+
+
+def camera_model(camera: Camera) -> str:
+    """Model, size and parameters: PINHOLE, OPENCV (k1 k2 p1 p2), FULL_OPENCV (and k3 k4 k5 k6), OPENCV_FISHEYE."""
+    values = [camera.fx, camera.fy, camera.cx, camera.cy]
+    if not camera.distortion:
+        model = "PINHOLE"
+    elif camera.lens == "fisheye":
+        model = "OPENCV_FISHEYE"
+        values += camera.distortion
+    elif len(camera.distortion) == 4:
+        model = "OPENCV"
+        values += camera.distortion
+    else:
+        model = "FULL_OPENCV"
+        values += (*camera.distortion, *(0.0,) * (8 - len(camera.distortion)))
+    return f"{model} {camera.width} {camera.height} {' '.join(repr(float(value)) for value in values)}"

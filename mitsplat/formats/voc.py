@@ -1,0 +1,86 @@
+"""Boxes as in Pascal VOC: one XML file per image, read by CVAT, FiftyOne and detectors of every age.
+
+::
+
+    voc/Annotations/000003.xml, voc/JPEGImages/000003.jpg, voc/ImageSets/Main/train.txt, val.txt, voc/labelmap.txt
+
+``labelmap.txt`` names the classes to CVAT, which knows VOC's own twenty otherwise. Pixels count from 1, and boxes
+include their last (VOC2012 development kit, ``VOCevaldet``). The flags follow the 2009 annotation guidelines: an object
+is *truncated* if more than 15 % of it lies outside the box of what is visible, *occluded* if more than 5 % of what lies
+in that box is hidden. Both are exact here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from xml.etree import ElementTree
+
+from mitsplat.files import SPLITS, GrowingFile, Record
+from mitsplat.labels.labels import InstanceLabel, Labels
+
+TRUNCATED, OCCLUDED = 0.15, 0.05
+"""Shares of an object above which its flags are set."""
+
+
+def annotation(labels: Labels, image: str) -> str:
+    """The XML file of an image by that name."""
+    root = ElementTree.Element("annotation")
+    size = {"width": labels.width, "height": labels.height, "depth": 3}
+    for name, value in {"folder": "JPEGImages", "filename": image, "size": size, "segmented": 0}.items():
+        _add(root, name, value)
+    for label in labels.instances:
+        x0, y0, x1, y1 = label.box
+        truncated, occluded = flags(label)
+        entry = {
+            "name": label.class_name,
+            "pose": "Unspecified",
+            "truncated": int(truncated),
+            "difficult": 0,
+            "occluded": int(occluded),
+            "bndbox": {"xmin": x0 + 1, "ymin": y0 + 1, "xmax": x1, "ymax": y1},
+        }
+        _add(root, "object", entry)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def flags(label: InstanceLabel) -> tuple[bool, bool]:
+    """Whether an instance is truncated, and whether it is occluded."""
+    x0, y0, x1, y1 = label.box
+    left, top = label.amodal.box[:2]
+    boxed = int(label.amodal.mask[y0 - top : y1 - top, x0 - left : x1 - left].sum())
+    return 1 - boxed / label.silhouette_area > TRUNCATED, 1 - label.area / boxed > OCCLUDED
+
+
+class SetsWriter:
+    """Writes which images belong to which split, and what classes there are."""
+
+    def __init__(self, root: Path, class_names: Iterable[str]) -> None:
+        self._files = {split: GrowingFile(root / f"voc/ImageSets/Main/{split}.txt") for split in SPLITS}
+        self._classes = GrowingFile(root / "voc/labelmap.txt")
+        lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in ("background", *class_names))]
+        self._classes.write("".join(lines))
+
+    def add(self, record: Record) -> None:
+        """Describe a frame."""
+        self._files[record["split"]].write(f"{record['index']:06d}\n")
+
+    def keep(self) -> None:
+        """Give the files their names."""
+        for file in (*self._files.values(), self._classes):
+            file.keep()
+
+    def discard(self) -> None:
+        """Remove what was written, unless it was kept."""
+        for file in (*self._files.values(), self._classes):
+            file.discard()
+
+
+def _add(parent: ElementTree.Element, name: str, value: object) -> None:
+    child = ElementTree.SubElement(parent, name)
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _add(child, key, inner)
+    else:
+        child.text = str(value)

@@ -1,0 +1,107 @@
+"""YOLO labels as Ultralytics reads them: one text file per image, one line per instance, positions in [0, 1].
+
+=========== =============================== ==================================================================
+format      folder                          numbers of a line after the class index
+=========== =============================== ==================================================================
+yolo        ``labels/``                     x y of the outline of :func:`mitsplat.labels.polygons.outline`
+yolo-detect ``yolo-detect/labels/``         x y of the box's middle, width, height
+yolo-obb    ``yolo-obb/labels/``            x y of the four corners of the smallest rotated rectangle
+yolo-pose   ``yolo-pose/labels/``           the box, then x y v of every keypoint: 2 visible, 1 hidden, 0 outside
+=========== =============================== ==================================================================
+
+Ultralytics finds a label by the image's path, so each task but the first has a folder of its own with the images under
+second names. All classes share one number of keypoints, the largest; a class with fewer ends in zeros.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import Float64Array
+from mitsplat.files import SPLITS
+from mitsplat.labels.labels import UNLABELLED, InstanceLabel, Labels
+
+
+@dataclass(frozen=True)
+class Task:
+    """One of Ultralytics' tasks: the folder of its dataset, and the numbers of an instance's line [px]."""
+
+    folder: str
+    numbers: Callable[[InstanceLabel], Float64Array]
+
+
+def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> str:
+    """Lines of a label file.
+
+    Args:
+        labels: What the image shows.
+        task: A key of :data:`TASKS`.
+        num_keypoints: Keypoints on each line of ``yolo-pose``.
+    """
+    size = np.array((labels.width, labels.height), dtype=np.float64)
+    lines = []
+    for label in labels.instances:
+        points = (TASKS[task].numbers(label).reshape(-1, 2) / size).ravel()
+        text = [str(label.class_index), *(f"{value:.6f}" for value in points)]
+        if task == "yolo-pose":
+            missing = np.zeros((num_keypoints - len(label.keypoints), 3))
+            for x, y, visibility in np.concatenate([label.keypoints, missing]):
+                text += [f"{x / size[0]:.6f}", f"{y / size[1]:.6f}", str(int(visibility) if visibility else UNLABELLED)]
+        lines.append(" ".join(text) + "\n")
+    return "".join(lines)
+
+
+def data_yaml(
+    class_names: Sequence[str], splits: Iterable[str], keypoint_names: Sequence[Sequence[str]] | None = None
+) -> str:
+    """Description of a dataset for Ultralytics; ``keypoint_names`` of every class for ``yolo-pose``.
+
+    It has no ``path``: Ultralytics then resolves the splits against the file's own folder, wherever it is run.
+    """
+    present = [split for split in SPLITS if split in splits]
+    lines = ["# Paths are relative to this file."]
+    for split in SPLITS:
+        if split in present or not present:
+            lines.append(f"{split}: images/{split}")
+        else:
+            lines.append(f"{split}: images/{present[0]} # there are no images for {split}; Ultralytics wants some")
+    lines += ["names:", *(f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names))]
+    if keypoint_names is not None:
+        count = max(map(len, keypoint_names), default=0)
+        lines += [f"kpt_shape: [{count}, 3]", "kpt_names:"]
+        for i, names in enumerate(keypoint_names):
+            padded = [*names, *(f"unused_{k}" for k in range(len(names), count))]
+            lines.append(f"  {i}: {json.dumps(padded, ensure_ascii=False)}")
+    return "\n".join(lines) + "\n"
+
+
+def rotated_box(label: InstanceLabel) -> Float64Array:
+    """Corners of the smallest rectangle around the mask's pixels, whole pixels included [px], shape (4, 2)."""
+    x0, y0 = label.box[:2]
+    ys, xs = np.nonzero(label.mask)
+    pixels = np.concatenate([np.stack([xs + dx, ys + dy], axis=1) for dx in (0, 1) for dy in (0, 1)])
+    rectangle = cv2.minAreaRect(cv2.convexHull(pixels.astype(np.int32)).astype(np.float32))
+    corners = np.asarray(cv2.boxPoints(rectangle), dtype=np.float64)
+    return np.add(corners, (x0, y0), dtype=np.float64)
+
+
+def _outline(label: InstanceLabel) -> Float64Array:
+    return label.polygon
+
+
+def _centred_box(label: InstanceLabel) -> Float64Array:
+    x0, y0, x1, y1 = label.box
+    return np.array([(x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0], dtype=np.float64)
+
+
+TASKS = {
+    "yolo": Task("", _outline),
+    "yolo-detect": Task("yolo-detect/", _centred_box),
+    "yolo-obb": Task("yolo-obb/", rotated_box),
+    "yolo-pose": Task("yolo-pose/", _centred_box),
+}

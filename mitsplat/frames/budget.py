@@ -1,0 +1,100 @@
+"""How much memory a process that makes frames of a scene takes at most, by which their number is chosen.
+
+``python -m benchmarks.scale.workers budget`` measured the coefficients, and sets them beside peaks; they hold for the
+variant ``llvm_ad_rgb``, where the device's memory is the process's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mitsplat.engine.resources import WorkerMemory
+from mitsplat.quality import resolve_quality
+
+if TYPE_CHECKING:
+    from mitsplat.camera import Camera
+    from mitsplat.scene.scene import Scene
+    from mitsplat.splats import Splats
+
+BASE = 2**30
+"""Python, libraries, compiled kernels and the simulation of a layout [bytes]."""
+
+PER_PLACED = 160
+"""For every Gaussian of every instance: what of it is in view, and its place in the lists of tiles [bytes]."""
+
+COPIES = 2
+"""Copies of a Gaussian's numbers on the device: as uploaded, and beside all others."""
+
+PER_PAIR = 40
+"""For every pair of a Gaussian and a tile that it covers [bytes]."""
+
+PER_RAY = 400
+"""For every ray through the image, all layers of a pixel and what lights them [bytes]."""
+
+PER_OBJECT = 12 * 2**20
+"""For every object of a layout: its simulation, and what rays meet of it [bytes]."""
+
+PER_SEEN = 2.25
+"""For every pixel and instance: which of them are seen alone, in tiles up to an image beyond each border [bytes]."""
+
+_VIEWS = 5
+_SAMPLE = 50_000
+"""Gaussians of an asset that are looked at, of which the others are taken to be alike."""
+_REACH = 3.33
+"""Standard deviations to where an opaque Gaussian falls below 1/255."""
+
+
+def worker_memory(scene: Scene) -> WorkerMemory:
+    """The most that workers take for frames of a scene.
+
+    The sum of terms in the Gaussians of assets, those of all instances, the tiles that they cover as seen from some of
+    the scene's cameras (in the middle of the region, where they are dropped), rays, objects, and objects times pixels.
+    """
+    from mitsplat.plugins.tiles import PAIRS_MAX
+    from mitsplat.scene.scene import plan_frame
+
+    spec = scene.spec
+    most = [max(entry.count[1], len(entry.poses)) for entry in spec.objects]
+    placed = [(asset.splats, count) for asset, count in zip(scene.assets, most, strict=True)]
+    middle = np.add(spec.region.min, spec.region.max) / 2
+    static = [] if scene.environment is None else [scene.environment.splats]
+    splats = {id(one): one for one in (*static, *(one for one, _ in placed))}.values()
+    stored = sum(getattr(one, f.name).nbytes for one in splats for f in fields(one))
+    count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
+    samples = {**vars(resolve_quality(spec.quality)), **spec.rendering.model_dump()}["samples"]
+    pixels = spec.output.width * spec.output.height
+    cameras = [plan_frame(scene, int(i)).camera for i in np.linspace(0, scene.num_frames - 1, _VIEWS)]
+    pairs = max(
+        sum(_pairs(one, camera, samples) for one in static)
+        + sum(number * _pairs(one, camera, samples, at=middle) for one, number in placed)
+        for camera in cameras
+    )
+    return WorkerMemory(
+        own=BASE
+        + COPIES * stored
+        + PER_PLACED * count
+        + PER_PAIR * min(pairs, PAIRS_MAX)
+        + PER_RAY * pixels * samples**2
+        + (PER_OBJECT + PER_SEEN * pixels) * sum(most),
+        shared=stored,
+    )
+
+
+def _pairs(splats: Splats, camera: Camera, samples: int, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:
+    """About how many tiles of 4 x 4 rays Gaussians cover together, no fewer, of an asset that stands at a place [m]."""
+    step = 1 + len(splats) // _SAMPLE
+    means = splats.means[::step] + np.asarray(tuple(at), dtype=np.float32)
+    pixel, depth = camera.project(means)
+    seen = depth > camera.near
+    slope = samples * max(camera.fx, camera.fy) / np.maximum(depth[seen], 1e-6)
+    axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:]  # of the widest outline that it can show
+    tiles = np.prod(2 * _REACH * axes * slope[:, None] / 4 + 1, axis=1)
+    across = samples * np.array([camera.width, camera.height]) / 4
+    reach = _REACH * axes[:, 1] * slope / samples
+    x, y = pixel[seen].T
+    inside = (x > -reach) & (x < camera.width + reach) & (y > -reach) & (y < camera.height + reach)
+    return step * float(np.minimum(tiles, np.prod(across + 1))[inside].sum())

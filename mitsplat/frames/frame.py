@@ -1,0 +1,317 @@
+"""One frame of a scene, from its plan to picture and labels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.asset import Asset
+from mitsplat.camera import Camera
+from mitsplat.colour import decode_srgb
+from mitsplat.frames.camera_response import develop, light_image
+from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
+from mitsplat.masks import Silhouette
+from mitsplat.physics.settle import settle_layout
+from mitsplat.plugins.device import plain_mesh
+from mitsplat.quality import Quality, resolve_quality
+from mitsplat.render.emitters import emitter_dict
+from mitsplat.render.layers import (
+    Layers,
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_silhouettes,
+)
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
+from mitsplat.scene.spec import EnvironmentLight, LightSpec
+from mitsplat.splats import Splats
+from mitsplat.variant import ensure_variant, one_at_a_time
+
+KEPT_LAYOUTS = 4
+"""Settled layouts that a renderer keeps for further views of them."""
+
+NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
+"""Splats of a proxy that only receives and casts shadows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A labelled picture of H x W pixels with everything that it was made from. In a notebook it shows itself.
+
+    Attributes:
+        index: Index of the frame in its scene.
+        plan: Camera, lights and random draws.
+        layout: Where the objects came to rest.
+        image: Display-encoded picture, (H, W, 3) uint8.
+        rgb: Linear picture before the camera's development, (H, W, 3) float32.
+        depth: Depth along the optical axis [m], 0 where nothing is, (H, W) float32.
+        instance: Instance id per pixel, 0 for the environment, (H, W) uint16.
+        proxy_instance: The same from the proxy meshes, (H, W) uint16.
+        normal: World-space normal of the proxies, (H, W, 3) float32.
+        light: Factor of light and shadow on the linear colour, (H, W, 3) float32.
+        camera: Same as ``plan.camera``.
+        labels: Labels of the visible instances.
+        draws: Same as ``plan.draws``.
+        seconds: Time per stage [s].
+        layers: Further layers for EXR files, by name.
+    """
+
+    index: int
+    plan: FramePlan
+    layout: Layout
+    image: npt.NDArray[np.uint8]
+    rgb: Float32Array
+    depth: Float32Array
+    instance: npt.NDArray[np.uint16]
+    proxy_instance: npt.NDArray[np.uint16]
+    normal: Float32Array
+    light: Float32Array
+    camera: Camera
+    labels: Labels
+    draws: Mapping[str, float]
+    seconds: Mapping[str, float]
+    layers: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict, repr=False)
+
+    def _repr_png_(self) -> bytes:
+        import cv2
+
+        _, data = cv2.imencode(".png", cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR))
+        return bytes(data)
+
+
+def render_frame(
+    scene: Scene, index: int, *, quality: str | Quality | None = None, layout: Layout | None = None
+) -> Frame:
+    """Render and label one frame, by a :class:`Renderer` that is kept for the next one of the scene.
+
+    Args:
+        scene: A scene of :func:`mitsplat.load_scene`.
+        index: Frame index, below ``scene.num_frames``.
+        quality: Preset of the splat renderer, which the scene file's ``rendering`` refines, or all its values; the
+            preset of the scene file by default.
+        layout: The frame's settled layout; settled here when not given.
+
+    Raises:
+        InputError: If the index is out of range, or the layout cannot be settled.
+    """
+    plan_frame(scene, index)  # a wrong index costs nothing
+    ensure_variant()
+    return _kept_renderer(scene, quality, str(mi.variant())).render(index, layout=layout)
+
+
+@one_at_a_time
+@lru_cache(maxsize=2)
+def _kept_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -> Renderer:
+    return Renderer(scene, quality=quality)
+
+
+def _frame(
+    index: int,
+    plan: FramePlan,
+    layout: Layout,
+    image: npt.NDArray[np.uint8],
+    rgb: Float32Array,
+    layers: Layers,
+    labels: Labels,
+    seconds: dict[str, float],
+) -> Frame:
+    return Frame(
+        index=index,
+        plan=plan,
+        layout=layout,
+        image=image,
+        rgb=rgb,
+        depth=layers.depth,
+        instance=layers.instance,
+        proxy_instance=layers.proxy_instance,
+        normal=layers.normal,
+        light=layers.light,
+        camera=plan.camera,
+        labels=labels,
+        draws=plan.draws,
+        seconds=seconds,
+        layers={"alpha": layers.alpha, "captured": layers.captured, "highlight": layers.highlight},
+    )
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
+
+
+class Renderer:
+    """Renders the frames of one scene, and holds what they share: uploads, and the layout's shapes.
+
+    Used with ``with``, it lets go of that at the end::
+
+        with ms.Renderer(scene, quality="balanced") as renderer:
+            frames = [renderer.render(index) for index in range(12)]
+
+    Attributes:
+        scene: The scene.
+        quality: All values of the splat renderer.
+        integrator: Mitsuba's integrator ``splat_proxy``, lit as the scene file says.
+
+    Args:
+        scene: A scene of :func:`mitsplat.load_scene`.
+        quality: As in :func:`render_frame`.
+
+    Raises:
+        InputError: If there is no such preset, or a Mitsuba variant was chosen that cannot run the plugins.
+    """
+
+    def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
+        if not isinstance(quality, Quality):
+            quality = replace(resolve_quality(quality or scene.spec.quality), **scene.spec.rendering.model_dump())
+        ensure_variant()
+        self.scene = scene
+        self.quality = quality
+        self.integrator = make_integrator(quality=quality, **light_properties(scene))
+        self._static = self._static_shapes()
+        self._placed: tuple[Layout, dict[str, Any]] | None = None
+        self._settled: dict[int, Layout] = {}
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.integrator, self._static, self._placed = None, {}, None
+        self._settled.clear()
+
+    @one_at_a_time
+    def render(self, index: int, *, layout: Layout | None = None) -> Frame:
+        """Render and label one frame; see :func:`render_frame`."""
+        seconds: dict[str, float] = {}
+        plan = plan_frame(self.scene, index)
+        if layout is None:
+            with _timed(seconds, "settle"):
+                layout = self._settle(layout_of(self.scene, index))
+        with _timed(seconds, "place"):
+            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights))
+        with _timed(seconds, "render"):
+            layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
+        with _timed(seconds, "composite"):
+            composite = self.scene.spec.composite
+            rgb = light_image(layers, composite)
+            image = develop(rgb, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed)
+        with _timed(seconds, "silhouettes"):
+            source = self.scene.spec.labels.source
+            silhouettes = render_silhouettes(self.integrator, mitsuba_scene, plan.camera, source=source)
+        with _timed(seconds, "label"):
+            labels = self._label(layers, silhouettes, layout, plan.camera)
+        return _frame(index, plan, layout, image, rgb, layers, labels, seconds)
+
+    def _settle(self, index: int) -> Layout:
+        """A layout, kept for the next views of it."""
+        if index not in self._settled:
+            while len(self._settled) >= KEPT_LAYOUTS:
+                del self._settled[next(iter(self._settled))]
+            self._settled[index] = settle_layout(self.scene, index)
+        return self._settled[index]
+
+    def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera) -> Labels:
+        scene, rules = self.scene, self.scene.spec.labels
+        maps = [(layers.instance, layers.depth), (layers.proxy_instance, layers.proxy_depth)]
+        (ids, depth), (second, _) = maps if rules.source == "splats" else reversed(maps)
+        return label_instances(
+            Truth(ids, second, silhouettes, depth),
+            layout.instances,
+            scene.class_names,
+            LabelRules(**rules.model_dump(exclude={"source"})),
+            camera=camera,
+            keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
+        )
+
+    def describe(self, layout: Layout, lights: tuple[LightSpec, ...]) -> dict[str, Any]:
+        """Mitsuba's dictionary of a layout under some lights. Shapes stay the same objects while the layout does."""
+        if self._placed is None or self._placed[0] is not layout:
+            objects = {}
+            for instance in layout.instances:
+                asset = self.scene.assets[instance.asset]
+                objects[f"instance_{instance.id}"] = _asset_shape(asset, instance.world_from_object, instance.id)
+            self._placed = layout, objects
+        emitters = {f"light_{i}": self._emitter(light) for i, light in enumerate(lights)}
+        return {"type": "scene", **self._static, **self._placed[1], **emitters}
+
+    def _emitter(self, light: LightSpec) -> dict[str, Any]:
+        if isinstance(light, EnvironmentLight) and light.image is not None:
+            light = light.model_copy(update={"image": str(self.scene.images[light.image])})
+        return emitter_dict(light)
+
+    def _static_shapes(self) -> dict[str, Any]:
+        shapes: dict[str, Any] = {}
+        if self.scene.environment is not None:
+            shapes["environment"] = _asset_shape(self.scene.environment, np.eye(4), 0)
+        for i, (shape, mesh) in enumerate(zip(self.scene.spec.shapes, self.scene.shape_meshes, strict=True)):
+            if shape.visible:
+                shapes[f"shape_{i}"] = _visible_shape(shape.colour, mesh)
+            elif shape.proxy:
+                shapes[f"shape_{i}"] = make_splats_shape(NOTHING, proxy=mesh)
+        return shapes
+
+
+def _asset_shape(asset: Asset, world_from_asset: Float64Array, instance: int) -> Any:
+    return make_splats_shape(
+        asset.splats,
+        world_from_asset,
+        asset.mesh,
+        instance=instance,
+        capture_light=asset.capture_light,
+        roughness=float(asset.roughness),
+        specular=float(asset.specular) if instance else 0.0,
+    )
+
+
+def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) -> Any:
+    """A plain diffuse mesh; its colour is display-encoded, as in the scene file."""
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(
+        {"type": "diffuse", "reflectance": {"type": "rgb", "value": decode_srgb(colour).tolist()}}
+    )
+    return plain_mesh(mesh, props)
+
+
+def light_properties(scene: Scene) -> dict[str, Any]:
+    """Properties of the integrator ``splat_proxy`` by which it lights a scene as its file says."""
+    composite = scene.spec.composite
+    return {
+        "shadow": "none" if composite.shadow == "none" else "traced",
+        "shadow_error": composite.shadow_error,
+        "occluders": composite.occluders,
+        "bounce": composite.bounce,
+        "highlight": composite.highlight,
+        "reference": list(reference_point(scene)),
+        "white": white_irradiance(scene),
+        # What no splat covers is the grey of mitsplat.frames.camera_response, which draws no light source.
+        "hide_emitters": True,
+    }
+
+
+def white_irradiance(scene: Scene) -> float:
+    """Irradiance [W/m^2] of display white in the surroundings, or 0 where it is unknown or of no matter.
+
+    The image-space shadow only looks at light relative to its brightest.
+    """
+    if scene.environment is None or scene.spec.composite.shadow == "image":
+        return 0.0
+    return scene.environment.white or 0.0
+
+
+def reference_point(scene: Scene) -> tuple[float, float, float]:
+    """Where uniformly captured colours are shown unchanged [m]: below the middle of the drop region."""
+    low, high = np.array(scene.spec.region.min), np.array(scene.spec.region.max)
+    x, y = (low + high)[:2] / 2
+    return float(x), float(y), float(low[2])

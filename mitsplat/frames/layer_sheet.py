@@ -1,0 +1,59 @@
+"""A frame's layers side by side, to check it by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import ByteImage
+from mitsplat.frames.frame import Frame
+from mitsplat.labels.overlay import class_colour, draw_labels
+
+_CAPTION = 24
+_GAP = 6
+
+
+def layer_sheet(frame: Frame) -> ByteImage:
+    """A frame's picture, labels, ids, depth, light and highlight side by side, each with a caption, RGB."""
+    known = frame.depth[frame.depth > 0]
+    near, far = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    share = np.clip((frame.depth - near) / max(far - near, 1e-9), 0, 1)
+    depth = cv2.applyColorMap(np.rint(255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    tiles = {
+        "picture": frame.image,
+        f"labels: {len(frame.labels.instances)} instances": draw_labels(frame.image, frame.labels),
+        "ids by splats": _id_colours(frame.instance),
+        f"depth: {near:.3g} to {far:.3g} m": np.where(frame.depth[..., None] > 0, depth, 0).astype(np.uint8),
+        "light: black 0, grey 1 (as captured), white 2": _grey(frame.light / 2),
+        "highlight: white 1, square root": _grey(np.sqrt(np.maximum(frame.layers["highlight"], 0))),
+    }
+    height, width = frame.image.shape[:2]
+    sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)
+    for i, (caption, tile) in enumerate(tiles.items()):
+        top, left = i // 3 * (height + _CAPTION + _GAP), i % 3 * (width + _GAP)
+        sheet[top : top + height, left : left + width] = tile
+        cv2.putText(
+            sheet,
+            caption,
+            (left + 6, top + height + 17),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.5,
+            (230, 230, 230),
+            1,
+            cv2.LINE_AA,
+        )
+    return sheet
+
+
+def _id_colours(ids: npt.NDArray[np.uint16]) -> ByteImage:
+    """Ids as the colours of as many classes, 0 as black, (H, W, 3)."""
+    present, position = np.unique(ids, return_inverse=True)
+    colours = np.array([class_colour(int(i)) if i else (0, 0, 0) for i in present], dtype=np.uint8)
+    return np.asarray(colours[position].reshape(*ids.shape, 3))
+
+
+def _grey(values: npt.NDArray[np.floating[Any]]) -> ByteImage:
+    return np.asarray(np.rint(255 * np.clip(values, 0, 1)), dtype=np.uint8)

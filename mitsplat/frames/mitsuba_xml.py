@@ -1,0 +1,232 @@
+"""Mitsuba scene files: one frame written as XML to be edited by hand, and XML scenes rendered to a picture."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.asset import Asset
+from mitsplat.colour import decode_srgb
+from mitsplat.engine.pool import LostWorkersError, run_apart
+from mitsplat.errors import InputError
+from mitsplat.frames.camera_response import develop
+from mitsplat.frames.frame import light_properties
+from mitsplat.physics.settle import settle_layout
+from mitsplat.progress import Note
+from mitsplat.render.emitters import emitter_dict
+from mitsplat.render.layers import describe_sensor, ensure_variant
+from mitsplat.scene.scene import Scene, layout_of, plan_frame
+from mitsplat.scene.spec import Shape
+from mitsplat.scene.untrusted_xml import check_xml
+
+
+def export_xml(scene: Scene, index: int, path: str | Path) -> None:
+    """Write one frame as a Mitsuba scene, with its splats and meshes in a folder beside it.
+
+    The scene shows what the frame's layers hold; exposure, tone and noise are not part of it.
+
+    Raises:
+        InputError: If the index is out of range, or the layout cannot be settled.
+        OSError: If the files cannot be written.
+    """
+    ensure_variant()
+    path = Path(path)
+    files = path.with_name(f"{path.stem}_files")
+    plan = plan_frame(scene, index)
+    layout = settle_layout(scene, layout_of(scene, index))
+    files.mkdir(parents=True, exist_ok=True)
+    shapes: dict[str, Any] = {}
+    if scene.environment is not None:
+        stem = _write_asset(scene.environment, files / "environment")
+        shapes["environment"] = _describe_asset(scene.environment, stem, np.eye(4), 0)
+    # Named by place: names of assets need be neither distinct nor those of files.
+    stems = {i: _write_asset(scene.assets[i], files / f"object_{i}") for i in {one.asset for one in layout.instances}}
+    for one in layout.instances:
+        description = _describe_asset(scene.assets[one.asset], stems[one.asset], one.world_from_object, one.id)
+        shapes[f"instance_{one.id}"] = description
+    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
+        if shape.visible:
+            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, files / f"shape_{number}.ply")
+    lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
+    description = {
+        "type": "scene",
+        "embree_use_robust_intersections": True,  # for other integrators than this one
+        "integrator": {
+            "type": "splat_proxy",
+            "quality": scene.spec.quality,
+            **scene.spec.rendering.model_dump(),
+            **light_properties(scene),
+        },
+        "sensor": describe_sensor(plan.camera),
+        **shapes,
+        **lights,
+    }
+    _teach_writer()
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), description)
+    mi.parser.write_file(state, str(path))
+
+
+def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:
+    """Render a Mitsuba scene with the integrator, sensor and size that it states.
+
+    Args:
+        path: The ``.xml`` file.
+        out: Picture to write (``.png``, ``.jpg`` or ``.exr``), or a folder, which gets ``picture.png``.
+        allow_outside: Whether it may name files outside of its folder, see :mod:`mitsplat.scene.untrusted_xml`.
+
+    Returns:
+        Path of the picture.
+
+    Raises:
+        InputError: If the file is missing or Mitsuba refuses it.
+    """
+    ensure_variant()
+    path, out = Path(path), Path(out)
+    check_xml(path, allow_outside=allow_outside)
+    picture = out if out.suffix.lower() in (".png", ".jpg", ".exr") else out / "picture.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        scene = mi.load_file(str(path.resolve()))
+        image = np.array(_render(path, scene))
+    except RuntimeError as error:
+        raise InputError(one_sentence(path, str(error))) from error
+    if picture.suffix.lower() == ".exr":
+        mi.Bitmap(image[..., :3]).write(str(picture))
+        return picture
+    mi.Bitmap(develop(image[..., :3], {})).write(str(picture))
+    return picture
+
+
+def render_apart(path: Path, out: Path, *, allow_outside: bool = False) -> Path:
+    """As :func:`render_xml`, in a process of its own: a damaged mesh or image can end the one that Mitsuba runs in.
+
+    Raises:
+        InputError: Also if that process is ended.
+    """
+    job = _RenderOne(path, out, allow_outside)
+    with closing(run_apart(job)) as results:
+        try:
+            return next(results)
+        except LostWorkersError as error:
+            raise InputError(f"{path}: something that it names ends Mitsuba's process ({error})") from error
+
+
+@dataclass(frozen=True)
+class _RenderOne:
+    path: Path
+    out: Path
+    allow_outside: bool
+
+    def __call__(self, index: int, note: Note, /) -> Path:
+        return render_xml(self.path, self.out, allow_outside=self.allow_outside)
+
+
+def _render(path: Path, scene: Any) -> Any:
+    from mitsplat.plugins.sensors import view_of
+    from mitsplat.plugins.splat_proxy import SplatProxyIntegrator
+
+    if not scene.sensors():
+        raise InputError(f"{path}: the scene has no sensor")
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    if isinstance(integrator, SplatProxyIntegrator):
+        try:
+            view_of(sensor)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+    elif any(hasattr(shape, "world_from_splats") for shape in scene.shapes()):
+        raise InputError(f"{path}: shape 'splats' is only seen by the integrator 'splat_proxy'")
+    # Not by mi.render, which says "see above" in place of what is wrong.
+    return integrator.render(scene, sensor)
+
+
+_PLACE = re.compile(r"(?:[Ww]hile loading|At) (?P<file>.+?) \(line (?P<line>\d+), col \d+\):\s*")
+_UNKNOWN = re.compile(r'unreferenced propert\w+ in (?P<kind>\w+) plugin of type "(?P<type>[^"]+)"')
+_PROPERTY = re.compile(r'- \S+ "(?P<name>[^"]+)"')
+
+
+def one_sentence(path: Path, message: str) -> str:
+    """What Mitsuba says of a scene, as place, rule and value, without the stack that it went through."""
+    place = str(path)
+    found = _PLACE.search(message)
+    if found:
+        file = Path(found["file"])
+        # As the user has named it, where it is that file.
+        place = f"{path if file == path.resolve() else file}:{found['line']}"
+    unknown = _UNKNOWN.search(message)
+    if unknown:
+        names = ", ".join(repr(name) for name in _PROPERTY.findall(message[unknown.end() :]))
+        known = f"; it takes {', '.join(documented)}" if (documented := _documented(unknown["type"])) else ""
+        return f"{place}: {unknown['kind']} {unknown['type']!r} takes no {names}{known}"
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    last = lines[-1] if lines else "Mitsuba refuses it without a reason"
+    last = last.removeprefix(f"{InputError.__name__}: ")
+    last = re.sub(r"^\[\w+\.cpp:\d+\] ", "", last)
+    last = _PLACE.sub("", last.removeprefix("Error "))
+    last = re.sub(r"\[\w+\] (Error while \w+ing )?", "", last)
+    return last if last.startswith(place) else f"{place}: {last}"
+
+
+def _documented(plugin: str) -> list[str]:
+    """Properties that one of our plugins takes."""
+    from mitsplat.plugins import opencv_camera, splat_proxy, splats
+
+    classes = {
+        "splats": splats.SplatsShape,
+        "opencv_camera": opencv_camera.OpenCVCamera,
+        "splat_proxy": splat_proxy.SplatProxyIntegrator,
+    }
+    text = classes[plugin].__doc__ if plugin in classes else None
+    rows = re.findall(r"\* - ([\w, ]+)\n\s+- \|", text or "")
+    return [name for row in rows for name in row.split(", ")]
+
+
+def _write_asset(asset: Asset, stem: Path) -> Path:
+    """Write splats and mesh as ``stem.ply`` and ``stem_proxy.ply``; ``stem``."""
+    asset.splats.save(stem.with_suffix(".ply"))
+    if asset.mesh is not None:
+        asset.mesh.export(stem.with_name(f"{stem.name}_proxy.ply"))
+    return stem
+
+
+def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, instance: int) -> dict[str, Any]:
+    relative = f"{stem.parent.name}/{stem.name}"
+    return {
+        "type": "splats",
+        "filename": f"{relative}.ply",
+        "instance": instance,
+        "capture_light": asset.capture_light,
+        "roughness": float(asset.roughness),
+        "specular": float(asset.specular) if instance else 0.0,
+        "to_world": mi.ScalarTransform4f(world_from_asset),
+        **({"proxy": f"{relative}_proxy.ply"} if asset.mesh is not None else {}),
+    }
+
+
+def _describe_shape(shape: Shape, mesh: trimesh.Trimesh, path: Path) -> dict[str, Any]:
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+    return {
+        "type": "ply",
+        "filename": f"{path.parent.name}/{path.name}",
+        "face_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": decode_srgb(shape.colour).tolist()}},
+    }
+
+
+def _teach_writer() -> None:
+    """Tell Mitsuba's XML writer of what kind our plugins are: it looks them up in a scalar variant."""
+    scalar = importlib.import_module("mitsuba.scalar_rgb")
+
+    def refuse(props: Any) -> Any:
+        raise RuntimeError(f"plugin {props.plugin_name()!r} needs an llvm or cuda variant")
+
+    scalar.register_integrator("splat_proxy", refuse)
+    scalar.register_sensor("opencv_camera", refuse)
+    scalar.register_shape("splats", refuse)

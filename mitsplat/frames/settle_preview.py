@@ -1,0 +1,66 @@
+"""Settled layouts to look at: certificates as a table, a drop as a moving picture."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PIL import Image
+
+from mitsplat.errors import InputError
+from mitsplat.frames.frame import render_frame
+from mitsplat.physics.settle import replay_layout
+from mitsplat.scene.layout import Layout
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mitsplat.scene.scene import Scene
+
+_INTERVAL = 0.04  # between pictures of a drop [s]; GIF counts in hundredths
+_PAUSE = 1500  # on the last picture [ms]
+
+
+def certificate_table(layouts: Iterable[Layout]) -> Table:
+    """The rest certificates of layouts, a row each."""
+    from rich.table import Table
+
+    table = Table()
+    for title in ("layout", "objects", "rest [s]", "speed [mm/s]", "spin [rad/s]", "motion in 1 s [mm]"):
+        table.add_column(title, justify="right")
+    for title in ("in colliders [mm]", "in objects [mm]", "gap [mm]", "draws"):
+        table.add_column(title, justify="right")
+    table.add_column("refused")
+    for layout in layouts:
+        found = layout.certificate
+        lengths = (found.surface_motion, found.collider_penetration, found.pair_penetration, found.support_gap)
+        motion, in_collider, in_object, gap = (f"{length * 1e3:.3f}" for length in lengths)
+        table.add_row(
+            *(str(layout.index), str(len(layout.instances)), f"{found.time_to_rest:.2f}"),
+            *(f"{found.max_speed * 1e3:.3f}", f"{found.max_spin:.4f}", motion),
+            *(in_collider, in_object, gap, str(found.attempts)),
+            ", ".join(f"{count} x {reason}" for reason, count in Counter(found.refused).items()),
+        )
+    return table
+
+
+def write_preview(scene: Scene, layout: Layout, path: Path) -> int:
+    """Write the drop of a layout, seen as in its first frame, as an animated GIF; returns the number of pictures.
+
+    Raises:
+        InputError: If the file cannot be written.
+    """
+    frame = layout.index * scene.spec.output.views
+    pictures = [
+        Image.fromarray(render_frame(scene, frame, layout=moment, quality="fast").image)
+        for moment in replay_layout(scene, layout, interval=_INTERVAL)
+    ]
+    step = round(_INTERVAL * 1000)
+    durations = [step] * (len(pictures) - 1) + [_PAUSE]
+    try:
+        pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, format="GIF")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    return len(pictures)

@@ -1,0 +1,348 @@
+"""Speed against accuracy: the same pictures by every preset and by cheaper models of light, beside the exact ones.
+
+Every step runs in a process of its own, so that its time and memory are its own. Pictures are compared display-encoded,
+before the camera's development, whose noise would hide the differences.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import multiprocessing
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import Float32Array
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.progress import Progress
+from mitsplat.quality import PRESETS, Quality
+from mitsplat.splats import Splats
+
+INSTANCE_MIN = 50
+"""Instances of fewer pixels [px] count in no mask IoU."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One way to make the pictures: what the splat renderer computes, and changes to the scene file by key.
+
+    Without a quality, Mitsuba's own ``ellipsoids`` and ``volprim_rf_basic`` render a file of splats.
+    """
+
+    name: str
+    quality: Quality | None
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+_FAST = PRESETS["fast"]
+STEPS = (
+    *(Step(name, quality) for name, quality in PRESETS.items()),
+    Step("fast, EWA response", replace(_FAST, response="ewa")),
+    Step("fast, cut at 1/255, SH 1", replace(_FAST, alpha_min=1 / 255, sh_degree=1)),
+)
+SPLATS_STEPS = (Step("Mitsuba's volprim_rf_basic", None),)
+LIGHT_STEPS = (
+    Step("fast, shadow error 0.1", _FAST, {"composite.shadow_error": 0.1}),
+    Step("fast, shadows of splats", _FAST, {"composite.occluders": "splats"}),
+    Step("fast, no bounce", _FAST, {"composite.bounce": False}),
+    Step("fast, image shadow", _FAST, {"composite.shadow": "image"}),
+    Step("fast, no shadow", _FAST, {"composite.shadow": "none"}),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one step costs and misses, over all pictures.
+
+    Attributes:
+        name: Name of the step.
+        seconds: Median time of one image, without settling and writing [s].
+        rmse: Root mean square error of display-encoded colours in [0, 1], against ``exact``.
+        psnr: The same in dB; infinite for ``exact``.
+        largest: Largest error of a channel.
+        ssim: Mean structural similarity (Wang et al. 2004).
+        mask_iou: Mean IoU of the instances' pixels; NaN without instances, and where the step tells none.
+        memory: Peak memory of the process [GiB].
+    """
+
+    name: str
+    seconds: float
+    rmse: float
+    psnr: float
+    largest: float
+    ssim: float
+    mask_iou: float
+    memory: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Shots:
+    """Pictures (K, H, W, 3) and instances (K, H, W) of one step, their median time [s] and peak memory [GiB]."""
+
+    pictures: Float32Array
+    instances: npt.NDArray[np.uint16] | None
+    seconds: float
+    memory: float
+
+
+def measure_steps(
+    path: str | Path,
+    steps: Sequence[Step] | None = None,
+    *,
+    frames: int = 3,
+    overrides: Mapping[str, Any] | None = None,
+    allow_outside: bool = False,
+    note: Progress | None = None,
+) -> list[Row]:
+    """Measure steps against the preset ``exact``.
+
+    Args:
+        path: Scene file, or a file of splats, which is looked at from around.
+        steps: What to measure; all that apply to the file by default.
+        frames: Pictures to compare, spread evenly over the scene's.
+        overrides: Changes to the scene file by key, such as ``output.width``.
+        allow_outside: Whether the scene may name files outside of its folder.
+        note: Hears (steps done, steps, name of the next).
+
+    Raises:
+        InputError: If the file is not as it should be, or ``frames`` is below 1.
+        MissingResourceError: If a step's process dies, as it does when memory runs out.
+    """
+    path = Path(path)
+    if frames < 1:
+        raise InputError(f"frames must be at least 1 (got {frames})")
+    if steps is None:
+        steps = STEPS + (SPLATS_STEPS if _is_splats(path) else LIGHT_STEPS)
+    exact = Step("exact", PRESETS["exact"])
+    plan = [exact, *(step for step in steps if step != exact)]
+    rows: dict[str, Row] = {}
+    truth: _Shots | None = None
+    for i, step in enumerate(plan):
+        if note is not None:
+            note(i, len(plan), step.name)
+        shots = _run_alone(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
+        truth = truth or shots
+        rows[step.name] = _compare(step.name, shots, truth)
+    return [rows[step.name] for step in steps]
+
+
+def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
+    """The fastest preset whose error [RMSE] is within the tolerance; rows of all presets must be among ``rows``.
+
+    Raises:
+        InputError: If the tolerance is negative.
+    """
+    check_tolerance(tolerance)
+    within = [row for row in rows if row.name in PRESETS and row.rmse <= tolerance]
+    return min(within, key=lambda row: row.seconds)
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Refuse what no error can be within.
+
+    Raises:
+        InputError: If it is negative or not a number.
+    """
+    if not tolerance >= 0:
+        raise InputError(f"tolerance must be at least 0 (got {tolerance})")
+
+
+def choose_preset(
+    path: str | Path,
+    tolerance: float,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    allow_outside: bool = False,
+    note: Progress | None = None,
+) -> Row:
+    """The cheapest preset for a scene, from two of its frames; see :func:`measure_steps`.
+
+    Raises:
+        InputError: If the tolerance is negative, or the scene file is not as it should be.
+    """
+    check_tolerance(tolerance)
+    steps = STEPS[: len(PRESETS)]
+    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, note=note)
+    return cheapest(rows, tolerance)
+
+
+def _is_splats(path: Path) -> bool:
+    return path.suffix.lower() not in (".yaml", ".yml")
+
+
+def _run_alone(path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool) -> _Shots:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(_shoot, path, step.quality, frames, dict(overrides), allow_outside).result()
+        except BrokenProcessPool as error:
+            raise MissingResourceError(f"{path}: the process of '{step.name}' died; is there enough memory?") from error
+
+
+def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool) -> _Shots:
+    """Make the pictures; the first one twice, because it compiles or loads kernels."""
+    if quality is None:
+        shoot = _volprim_shooter(path, frames, overrides)
+    elif _is_splats(path):
+        shoot = _splats_shooter(path, quality, frames, overrides)
+    else:
+        shoot = _scene_shooter(path, quality, frames, overrides, allow_outside)
+    shots = [shoot(i) for i in (0, *range(frames))][1:]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return _Shots(
+        np.stack([picture for picture, _, _ in shots]),
+        None if quality is None else np.stack([instance for _, instance, _ in shots]),
+        statistics.median(seconds for _, _, seconds in shots),
+        peak / 2 ** (30 if sys.platform == "darwin" else 20),
+    )
+
+
+Shot = tuple[Float32Array, npt.NDArray[np.uint16], float]
+
+
+def _scene_shooter(
+    path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
+) -> Callable[[int], Shot]:
+    from mitsplat.colour import encode_srgb
+    from mitsplat.frames.frame import render_frame
+    from mitsplat.scene.scene import load_scene
+
+    scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
+    drawn = scene.spec.rendering
+    quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings)
+    indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
+
+    def shoot(i: int) -> Shot:
+        frame = render_frame(scene, int(indices[i]), quality=quality)
+        seconds = sum(value for stage, value in frame.seconds.items() if stage != "settle")
+        return encode_srgb(np.clip(frame.rgb, 0, 1)).astype(np.float32), frame.instance, seconds
+
+    return shoot
+
+
+def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+    from mitsplat.colour import encode_srgb
+    from mitsplat.render.layers import render_splats
+
+    splats = Splats.load(path)
+    width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
+
+    def shoot(i: int) -> Shot:
+        camera = look_around(splats, i, frames, width=width, height=height)
+        start = time.perf_counter()
+        layers = render_splats(splats, camera, quality=quality)
+        seconds = time.perf_counter() - start
+        colour = layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]
+        picture = np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1)
+        return picture.astype(np.float32), layers.instance, seconds
+
+    return shoot
+
+
+def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+    from mitsplat.colour import encode_srgb
+    from mitsplat.frames.volprim import render_volprim, volprim_scene
+    from mitsplat.render.layers import ensure_variant
+
+    ensure_variant()
+    splats = Splats.load(path)
+    width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
+
+    def shoot(i: int) -> Shot:
+        scene = volprim_scene(splats, look_around(splats, i, frames, width=width, height=height))
+        start = time.perf_counter()
+        picture = render_volprim(scene)
+        seconds = time.perf_counter() - start
+        return np.clip(encode_srgb(picture), 0, 1).astype(np.float32), np.empty(0, np.uint16), seconds
+
+    return shoot
+
+
+def look_around(splats: Splats, index: int, count: int, *, width: int, height: int) -> Camera:
+    """View ``index`` of ``count`` on a circle around splats whose up axis is -y, as files of 3DGS have it."""
+    centre = np.median(splats.means, axis=0)
+    size = np.percentile(np.linalg.norm(splats.means - centre, axis=1), 80)
+    angle = 2 * math.pi * index / count + 0.25
+    eye = centre + 2 * size * np.array([math.sin(angle), -0.5, -math.cos(angle)])
+    return Camera.look_at(eye, centre, up=(0, -1, 0), width=width, height=height, fov_x=50)
+
+
+def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
+    from skimage.metrics import structural_similarity
+
+    difference = shots.pictures.astype(np.float64) - truth.pictures
+    rmse = float(np.sqrt(np.mean(difference**2)))
+    ssim = [
+        structural_similarity(a, b, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
+        for a, b in zip(shots.pictures, truth.pictures, strict=True)
+    ]
+    return Row(
+        name,
+        shots.seconds,
+        rmse,
+        -20 * math.log10(rmse) if rmse > 0 else math.inf,
+        float(np.abs(difference).max()),
+        float(np.mean(ssim)),
+        _mask_iou(shots.instances, truth.instances),
+        shots.memory,
+    )
+
+
+def _mask_iou(mine: npt.NDArray[np.uint16] | None, theirs: npt.NDArray[np.uint16] | None) -> float:
+    """Mean IoU over the instances of all pictures, or NaN."""
+    if mine is None or theirs is None:
+        return math.nan
+    ious = []
+    for a, b in zip(mine, theirs, strict=True):
+        ids, counts = np.unique(b[b > 0], return_counts=True)
+        for instance in ids[counts >= INSTANCE_MIN]:
+            own, other = a == instance, b == instance
+            ious.append(np.count_nonzero(own & other) / np.count_nonzero(own | other))
+    return float(np.mean(ious)) if ious else math.nan
+
+
+def write_csv(rows: Sequence[Row], file: Path) -> None:
+    """One line per row, with a head."""
+    with file.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(asdict(rows[0])))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+
+
+def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float) -> None:
+    """Time of an image against its error, both logarithmic; the steps that nothing beats in both are joined."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.add_subplot()
+    least = min((row.rmse for row in rows if row.rmse > 0), default=1e-3) / 4
+    errors = [max(row.rmse, least) for row in rows]
+    front = sorted(
+        (row.seconds, error)
+        for row, error in zip(rows, errors, strict=True)
+        if not any(
+            other.seconds <= row.seconds and e <= error and (other.seconds, e) != (row.seconds, error)
+            for other, e in zip(rows, errors, strict=True)
+        )
+    )
+    axes.step(*zip(*front, strict=True), where="post", color="0.7", zorder=1)
+    chosen = cheapest(rows, tolerance)
+    for row, error in zip(rows, errors, strict=True):
+        axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
+        label = f"{row.name} (no error)" if row.rmse == 0 else row.name
+        axes.annotate(label, (row.seconds, error), xytext=(6, 4), textcoords="offset points", fontsize=8)
+    axes.axhline(tolerance, color="C3", linewidth=0.8, linestyle="--")
+    axes.set(xscale="log", yscale="log", xlabel="seconds per image", ylabel="RMSE against exact", title=title)
+    axes.margins(x=0.2, y=0.1)
+    figure.savefig(file, dpi=110)

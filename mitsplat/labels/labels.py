@@ -1,0 +1,380 @@
+"""Labels of a frame: exclusive masks, boxes, outlines and poses of the instances that can be seen, and their audit.
+
+Every label derives from the integer id map of the frame, so masks are exclusive and respect occlusion. These rules, in
+this order, decide what is labelled; what they drop or mark is counted and never silent:
+
+1. a connected part (8-connectivity) of fewer than ``min_fragment`` pixels is removed from its instance;
+2. an instance left with fewer than ``min_pixels`` pixels is dropped;
+3. an instance of which less than ``min_visible`` is visible is ``occluded``, and one whose splats and proxy agree by
+   less than ``min_agreement`` is ``disagreeing``; both are dropped or only marked, as ``below_threshold`` says.
+
+What an instance would cover if it were alone, by the same rule for a pixel and after rule 1, is its *silhouette*. Its
+visible fraction is exact: visible pixels over the silhouette's pixels in the image, no depth tolerance involved. Its
+truncation is the share of the silhouette beyond the image's border.
+
+Positions are in pixels with the image's corner at (0, 0), so pixel centres are at +0.5 and a box is half-open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pycocotools import mask as coco_mask
+from scipy import ndimage
+
+from mitsplat.arrays import BoolArray, Float64Array, Int32Array
+from mitsplat.labels.polygons import fill_polygon, outline
+from mitsplat.masks import BOUNDARY_TOLERANCE, Box, Silhouette, boundary_f1, encode_mask, without_fragments
+
+if TYPE_CHECKING:
+    from mitsplat.camera import Camera
+    from mitsplat.scene.layout import Instance
+
+
+KEYPOINT_TOLERANCE = 0.005
+"""How far behind the surface that is seen a keypoint may lie and still count as visible, as a share of its depth."""
+
+UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
+"""Visibility of a keypoint, as in COCO: outside the image, behind something, seen."""
+
+
+@dataclass(frozen=True)
+class LabelRules:
+    """Thresholds of the rules above.
+
+    Attributes:
+        min_pixels: Fewest visible pixels of a labelled instance.
+        min_fragment: Fewest pixels of a connected part.
+        min_visible: Smallest visible fraction.
+        min_agreement: Smallest IoU of the instance's masks by splats and by proxies.
+        below_threshold: What happens to instances below one of the last two.
+    """
+
+    min_pixels: int = 16
+    min_fragment: int = 8
+    min_visible: float = 0.0
+    min_agreement: float = 0.0
+    below_threshold: Literal["drop", "mark"] = "mark"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a rendered frame says about its instances, 0 = no instance in the maps.
+
+    Attributes:
+        instance: Ids that labels derive from, (H, W) integers.
+        second: Ids by the other source: proxies where the labels are the splats', (H, W) integers.
+        silhouettes: Every instance alone, by id and by the labels' source; an instance without pixels is absent.
+        depth: Depth along the optical axis of what is seen [m], (H, W), to tell hidden keypoints.
+    """
+
+    instance: npt.NDArray[np.integer[Any]]
+    second: npt.NDArray[np.integer[Any]]
+    silhouettes: Mapping[int, Silhouette]
+    depth: npt.NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class InstanceLabel:
+    """What can be seen of one instance.
+
+    Attributes:
+        id: Value of the instance in the id map, from 1.
+        asset: Position among the scene's assets.
+        class_index: Position of ``class_name`` among the scene's classes.
+        class_name: Class that detectors learn.
+        box: Bounds of the mask [px].
+        mask: Visible pixels inside the box, shape (y1 - y0, x1 - x0).
+        amodal: The silhouette's part in the image, hidden pixels included.
+        silhouette_box: Bounds of the silhouette, beyond the image's border too [px].
+        silhouette_area: Its pixels.
+        depth_area: Pixels of ``amodal`` at which the image has a depth.
+        agreement: IoU of the instance's masks by splats and by proxies.
+        boundary_f1: F1 score of their boundaries, see :func:`mitsplat.masks.boundary_f1`.
+        world_from_object: Rigid transform of the asset's coordinates to the world's [m], shape (4, 4).
+        keypoints: Position [px] and visibility of the asset's named points, shape (K, 3): :data:`VISIBLE`,
+            :data:`HIDDEN`, or :data:`UNLABELLED` at (0, 0).
+        marks: ``occluded`` and ``disagreeing``, as they apply.
+    """
+
+    id: int
+    asset: int
+    class_index: int
+    class_name: str
+    box: Box
+    mask: BoolArray
+    amodal: Silhouette
+    silhouette_box: Box
+    silhouette_area: int
+    depth_area: int
+    agreement: float
+    boundary_f1: float
+    world_from_object: Float64Array
+    keypoints: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
+    marks: tuple[str, ...] = ()
+
+    @cached_property
+    def area(self) -> int:
+        """Visible pixels."""
+        return int(np.count_nonzero(self.mask))
+
+    @property
+    def visible_fraction(self) -> float:
+        """Visible pixels over those that the instance would have in the image if it were alone."""
+        return self.area / self.amodal.area
+
+    @property
+    def truncation(self) -> float:
+        """Share of the silhouette that the image's border cuts off."""
+        return 1 - self.amodal.area / self.silhouette_area
+
+    @cached_property
+    def polygon(self) -> Float64Array:
+        """The mask as one closed polygon [px], see :func:`mitsplat.labels.polygons.outline`, shape (M, 2)."""
+        return outline(self.mask) + self.box[:2]
+
+    @cached_property
+    def polygon_iou(self) -> float:
+        """Intersection over union of the mask and the polygon as :func:`fill_polygon` reads it back."""
+        height, width = self.mask.shape
+        filled = fill_polygon(self.polygon - self.box[:2], width, height)
+        return float(np.count_nonzero(filled & self.mask) / np.count_nonzero(filled | self.mask))
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """The labels of one frame.
+
+    Attributes:
+        width, height: Size of the image [px].
+        instances: Labelled instances by ascending id.
+        dropped: Counts by reason: ``fragments`` removed by rule 1; instances too ``small`` by rule 2, ``occluded`` or
+            ``disagreeing`` by rule 3 (the first that applies), ``hidden`` entirely, or ``outside`` the image.
+    """
+
+    width: int
+    height: int
+    instances: tuple[InstanceLabel, ...]
+    dropped: dict[str, int]
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON values; masks are COCO run-length codes over the whole image."""
+        size = self.width, self.height
+        return {
+            "size": list(size),
+            "instances": [
+                {
+                    "id": label.id,
+                    "asset": label.asset,
+                    "class_index": label.class_index,
+                    "class": label.class_name,
+                    "box": list(label.box),
+                    "area": label.area,
+                    "amodal_box": list(label.amodal.box),
+                    "amodal_area": label.amodal.area,
+                    "silhouette_box": list(label.silhouette_box),
+                    "silhouette_area": label.silhouette_area,
+                    "depth_area": label.depth_area,
+                    "visible_fraction": round(label.visible_fraction, 6),
+                    "truncation": round(label.truncation, 6),
+                    "polygon_iou": round(label.polygon_iou, 6),
+                    "agreement": round(label.agreement, 6),
+                    "boundary_f1": round(label.boundary_f1, 6),
+                    "marks": list(label.marks),
+                    "keypoints": label.keypoints.round(3).tolist(),
+                    "world_from_object": label.world_from_object.tolist(),
+                    "rle": encode_mask(label.mask, label.box, size),
+                    "amodal_rle": encode_mask(label.amodal.mask, label.amodal.box, size),
+                }
+                for label in self.instances
+            ],
+            "dropped": self.dropped,
+        }
+
+    @classmethod
+    def from_json(cls, record: dict[str, Any]) -> Labels:
+        """Inverse of :meth:`to_json`."""
+        width, height = record["size"]
+
+        def decode(code: str, box: list[int]) -> BoolArray:
+            x0, y0, x1, y1 = box
+            mask = coco_mask.decode({"size": [height, width], "counts": code})
+            return np.ascontiguousarray(mask[y0:y1, x0:x1], dtype=bool)
+
+        instances = []
+        for entry in record["instances"]:
+            amodal = Silhouette(tuple(entry["amodal_box"]), decode(entry["amodal_rle"], entry["amodal_box"]))
+            instances.append(
+                InstanceLabel(
+                    id=entry["id"],
+                    asset=entry["asset"],
+                    class_index=entry["class_index"],
+                    class_name=entry["class"],
+                    box=tuple(entry["box"]),
+                    mask=decode(entry["rle"], entry["box"]),
+                    amodal=amodal,
+                    silhouette_box=tuple(entry["silhouette_box"]),
+                    silhouette_area=entry["silhouette_area"],
+                    depth_area=entry["depth_area"],
+                    agreement=entry["agreement"],
+                    boundary_f1=entry["boundary_f1"],
+                    world_from_object=np.array(entry["world_from_object"]),
+                    keypoints=np.array(entry["keypoints"], dtype=np.float64).reshape(-1, 3),
+                    marks=tuple(entry["marks"]),
+                )
+            )
+        return cls(width, height, tuple(instances), dict(record["dropped"]))
+
+
+def label_instances(
+    truth: Truth,
+    instances: Sequence[Instance],
+    class_names: Sequence[str],
+    rules: LabelRules,
+    *,
+    camera: Camera | None = None,
+    keypoints: Mapping[int, Float64Array] | None = None,
+) -> Labels:
+    """Labels of the ``instances`` that a frame shows.
+
+    Args:
+        truth: The frame's maps, all of the same shape (H, W).
+        instances: Everything that was placed.
+        class_names: Names by class index.
+        rules: What is dropped or marked.
+        camera: Needed for keypoints.
+        keypoints: Points of each asset that has any, by its position, in its own coordinates [m], shape (K, 3).
+
+    Raises:
+        ValueError: If a map is not a 2-D integer array, the maps differ in shape, or one holds an id of none of the
+            instances.
+    """
+    for ids in (truth.instance, truth.second):
+        if ids.ndim != 2 or not np.issubdtype(ids.dtype, np.integer) or ids.shape != truth.instance.shape:
+            raise ValueError(f"id maps must be 2-D integer arrays of one shape (got {ids.dtype}, {ids.shape})")
+    height, width = truth.instance.shape
+    ids, second = truth.instance.astype(np.int32), truth.second.astype(np.int32)
+    found, found_second = (
+        {i: bounds for i, bounds in enumerate(ndimage.find_objects(image), start=1) if bounds is not None}
+        for image in (ids, second)
+    )
+    if unknown := (found.keys() | found_second.keys()) - {instance.id for instance in instances}:
+        raise ValueError(f"the id map holds {min(unknown)}, which is the id of no instance")
+
+    labels = []
+    dropped = dict.fromkeys(("fragments", "small", "occluded", "disagreeing", "hidden", "outside"), 0)
+    for instance in sorted(instances, key=lambda instance: instance.id):
+        alone = truth.silhouettes.get(instance.id)
+        if instance.id not in found:
+            dropped["outside" if alone is None or alone.inside(width, height) is None else "hidden"] += 1
+            continue
+        rows, columns = found[instance.id]
+        mask, fragments = without_fragments(ids[rows, columns] == instance.id, rules.min_fragment)
+        dropped["fragments"] += fragments
+        if np.count_nonzero(mask) < rules.min_pixels:
+            dropped["small"] += 1
+            continue
+        seen = Silhouette.cropped(mask, columns.start, rows.start)
+        amodal, box, area = _amodal(alone, seen, rules.min_fragment, (width, height))
+        agreement, boundary = _agreement(seen, second, instance.id, found_second.get(instance.id))
+        marks = tuple(
+            name
+            for name, value, least in (
+                ("occluded", seen.area / amodal.area, rules.min_visible),
+                ("disagreeing", agreement, rules.min_agreement),
+            )
+            if value < least
+        )
+        if marks and rules.below_threshold == "drop":
+            dropped[marks[0]] += 1
+            continue
+        points = (keypoints or {}).get(instance.asset)
+        labels.append(
+            InstanceLabel(
+                id=instance.id,
+                asset=instance.asset,
+                class_index=instance.class_index,
+                class_name=class_names[instance.class_index],
+                box=seen.box,
+                mask=seen.mask,
+                amodal=amodal,
+                silhouette_box=box,
+                silhouette_area=area,
+                depth_area=_with_depth(amodal, truth),
+                agreement=agreement,
+                boundary_f1=boundary,
+                world_from_object=instance.world_from_object,
+                keypoints=np.zeros((0, 3))
+                if points is None or camera is None
+                else _see_keypoints(points, instance, camera, truth),
+                marks=marks,
+            )
+        )
+    return Labels(width, height, tuple(labels), dropped)
+
+
+def _amodal(
+    alone: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
+) -> tuple[Silhouette, Box, int]:
+    """What an instance covers in the image, and the bounds and pixels of its whole silhouette.
+
+    Where three instances mix in a pixel, one may have the largest share of it that would not cover it alone: what is
+    seen always counts as covered.
+    """
+    parts = [seen] if alone is None else [alone, seen]
+    x0, y0 = min(part.box[0] for part in parts), min(part.box[1] for part in parts)
+    x1, y1 = max(part.box[2] for part in parts), max(part.box[3] for part in parts)
+    canvas = np.zeros((y1 - y0, x1 - x0), dtype=bool)
+    for part in parts:
+        left, top, right, bottom = part.box
+        canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
+    # Fragments are judged in the image, as those of the visible mask are, and again beyond it.
+    whole = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
+    inside = whole.inside(*size)
+    kept = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
+    if inside is None or kept is None or not kept.any():
+        raise AssertionError("what is seen of an instance is part of its silhouette")
+    return Silhouette.cropped(kept, *inside.box[:2]), whole.box, whole.area
+
+
+def _agreement(
+    seen: Silhouette, second: Int32Array, number: int, bounds: tuple[slice, slice] | None
+) -> tuple[float, float]:
+    """IoU and boundary F1 of an instance's mask and its mask in the other id map, which is within ``bounds``."""
+    height, width = second.shape
+    x0, y0, x1, y1 = seen.box
+    if bounds is not None:
+        rows, columns = bounds
+        x0, x1 = min(x0, columns.start), max(x1, columns.stop)
+        y0, y1 = min(y0, rows.start), max(y1, rows.stop)
+    room = 1 + BOUNDARY_TOLERANCE
+    x0, y0, x1, y1 = max(x0 - room, 0), max(y0 - room, 0), min(x1 + room, width), min(y1 + room, height)
+    other = second[y0:y1, x0:x1] == number
+    one = np.zeros_like(other)
+    left, top, right, bottom = seen.box
+    one[top - y0 : bottom - y0, left - x0 : right - x0] = seen.mask
+    return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
+
+
+def _see_keypoints(points: Float64Array, instance: Instance, camera: Camera, truth: Truth) -> Float64Array:
+    """Pixels and visibilities of an asset's keypoints, shape (K, 3)."""
+    pose = instance.world_from_object
+    pixels, depth = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
+    seen = np.zeros((len(points), 3))
+    for row, (x, y), z in zip(seen, pixels, depth, strict=True):
+        if not (z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):
+            continue
+        at = int(y), int(x)
+        shown = truth.instance[at] == instance.id and z <= truth.depth[at] * (1 + KEYPOINT_TOLERANCE)
+        row[:] = x, y, VISIBLE if shown else HIDDEN
+    return seen
+
+
+def _with_depth(amodal: Silhouette, truth: Truth) -> int:
+    x0, y0, x1, y1 = amodal.box
+    return int(np.count_nonzero(amodal.mask & (truth.depth[y0:y1, x0:x1] > 0)))

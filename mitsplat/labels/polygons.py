@@ -1,0 +1,123 @@
+"""Masks as polygons that come back: one closed polygon for an instance, whatever its holes and parts.
+
+Positions are in pixels with the image's corner at (0, 0), so pixel centres are at +0.5.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array, csgraph
+
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+
+_LEAN = 0.02
+"""How far from a pixel's edge the outline's outermost vertices stay [px], so that they truncate to that pixel."""
+
+
+def outline(mask: BoolArray) -> Float64Array:
+    """A mask of at least one pixel as one closed polygon [px], shape (M, 2).
+
+    Made for how Ultralytics reads YOLO segments: one polygon per instance; positions scaled to the training size,
+    resampled along the edges and truncated to pixels; ``cv2.fillPoly`` (even-odd, edges painted). Therefore
+
+    * vertices are the *centres* of the mask's border pixels and edges run in the eight directions of the grid: at the
+      image's own size vertices and edges truncate to pixels of the mask, so the mask comes back exactly (but for a
+      pixel where a resampled point meets the middle of a diagonal step), and when scaled down no side gains more than
+      half a pixel; vertices on the border pixels' outer edges gain as much or more at every scale;
+    * holes and separate parts hang on bridges walked there and back. A bridge to a hole runs inside the mask; a
+      bridge between parts paints the pixels of the gap, so the bridges are a minimum spanning tree;
+    * at its four extremes the polygon reaches out to the pixels' outer edges by spikes without area: the box that
+      is read off the polygon is the box of the mask.
+    """
+    height, width = mask.shape
+    rings = [
+        ring.reshape(-1, 2).astype(np.intp)
+        for ring in cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+    ]
+    polygon: Float64Array = _corners(_joined(rings, (height, width))) + np.float64(0.5)
+    xs, ys = (np.flatnonzero(mask.any(axis=axis)) for axis in (0, 1))
+    for axis, edge in ((0, xs.min()), (0, xs.max() + 1), (1, ys.min()), (1, ys.max() + 1)):
+        at = int(np.abs(polygon[:, axis] - edge).argmin())
+        spike = polygon[[at, at]]
+        spike[0, axis] = edge - np.sign(edge - spike[0, axis]) * _LEAN
+        polygon = np.insert(polygon, at + 1, spike, axis=0)
+    return polygon
+
+
+def fill_polygon(polygon: npt.ArrayLike, width: int, height: int) -> BoolArray:
+    """Pixels of a polygon (M, 2) [px] as Ultralytics' ``polygon2mask`` fills it, shape (height, width)."""
+    canvas = np.zeros((height, width), dtype=np.uint8)
+    cv2.fillPoly(canvas, [np.asarray(polygon, dtype=np.float32).astype(np.int32)], 1)
+    return canvas.astype(bool)
+
+
+def _joined(rings: list[Int64Array], shape: tuple[int, int]) -> Int64Array:
+    """One closed walk of pixels (x, y) through all ``rings``, each bridge walked there and back."""
+    walk = rings[0]
+    for start, ring, first in _bridges(rings, shape):
+        at = int(np.flatnonzero((walk == start).all(axis=1))[0])
+        loop = np.roll(ring, -first, axis=0)
+        step = loop[0] - start
+        ahead = np.arange(1, np.abs(step).max())[:, None]
+        bridge = start + np.sign(step) * np.minimum(ahead, np.abs(step))
+        walk = np.concatenate([walk[: at + 1], bridge, loop, loop[:1], bridge[::-1], walk[at:]])
+    return walk
+
+
+def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int64Array, Int64Array, int]]:
+    """The bridges that join all rings over the fewest pixels, in an order in which a bridge starts on a joined ring.
+
+    A minimum spanning tree over the neighbours in the rings' discrete Voronoi diagram in the chessboard metric, which
+    counts the pixels that ``cv2.fillPoly`` paints along an edge.
+
+    Returns:
+        For each bridge the pixel (x, y) it starts at, the ring it joins and the position in that ring where it ends.
+    """
+    if len(rings) == 1:
+        return []
+    pixels = np.concatenate(rings)
+    ring_of = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    away = np.ones(shape, dtype=np.uint8)
+    away[pixels[:, 1], pixels[:, 0]] = 0
+    _, cell = cv2.distanceTransformWithLabels(away, cv2.DIST_C, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    pixel_of_cell = np.zeros(cell.max() + 1, dtype=np.intp)
+    pixel_of_cell[cell[pixels[:, 1], pixels[:, 0]]] = np.arange(len(pixels))
+    near = pixel_of_cell[cell]
+    position = pixels @ (1, shape[1])
+    order = np.argsort(position, kind="stable")
+    shared = np.flatnonzero(np.diff(position[order]) == 0)  # walls one pixel thick belong to the rings of both sides
+    neighbours = [
+        (order[shared], order[shared + 1]),
+        (near[:, :-1], near[:, 1:]),
+        (near[:-1], near[1:]),
+        (near[:-1, :-1], near[1:, 1:]),
+        (near[:-1, 1:], near[1:, :-1]),
+    ]
+    a, b = (np.concatenate([pair[side].ravel() for pair in neighbours]) for side in (0, 1))
+    a, b = a[ring_of[a] != ring_of[b]], b[ring_of[a] != ring_of[b]]
+    length = np.abs(pixels[a] - pixels[b]).max(axis=1)
+    low, high = np.minimum(ring_of[a], ring_of[b]), np.maximum(ring_of[a], ring_of[b])
+    shortest = np.lexsort((length, low * len(rings) + high))
+    _, first = np.unique((low * len(rings) + high)[shortest], return_index=True)
+    best = shortest[first]
+    # SciPy takes a stored zero for no edge; one more pixel for every edge leaves the tree the same.
+    graph = coo_array((length[best] + 1, (low[best], high[best])), shape=(len(rings), len(rings)))
+    ends = {(int(low[i]), int(high[i])): (int(a[i]), int(b[i])) for i in best}
+    order, parent = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(graph.tocsr()), 0, directed=False)
+    bridges = []
+    for ring in order[1:]:
+        start, end = ends[min(ring, parent[ring]), max(ring, parent[ring])]
+        if ring_of[start] == ring:
+            start, end = end, start
+        bridges.append((pixels[start], rings[ring], end - int(np.searchsorted(ring_of, ring))))
+    return bridges
+
+
+def _corners(walk: Int64Array) -> Int64Array:
+    """The closed ``walk`` without standing still and without pixels between two steps of one direction."""
+    walk = walk[np.any(walk != np.roll(walk, 1, axis=0), axis=1)] if len(walk) > 1 else walk
+    arriving = walk - np.roll(walk, 1, axis=0)
+    leaving = np.roll(walk, -1, axis=0) - walk
+    return walk[np.any(arriving != leaving, axis=1)] if len(walk) > 1 else walk

@@ -1,0 +1,28 @@
+"""Normals at the corners of a mesh's faces, smooth except across creases."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import Float64Array
+
+CREASE_ANGLE = np.radians(28.0)
+"""Dihedral angle above which an edge is a crease [rad]: Gaussians must not cross it, normals are not smoothed."""
+
+
+def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE) -> Float64Array:
+    """Unit normals (F, 3, 3) at the corners of faces, smooth except across creases [rad], weighted by area."""
+    corner = np.repeat(np.arange(len(mesh.faces)), 3)
+    incidence = mesh.faces_sparse.astype(np.float64)
+    pairs = (incidence.T @ incidence).tocoo()
+    alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(crease_angle)
+    row, col = pairs.row[alike], pairs.col[alike]
+    normals = np.zeros((len(mesh.faces), 3, 3))
+    weighted = mesh.face_normals * mesh.area_faces[:, None]
+    for k in range(3):
+        shares = (mesh.faces[col] == mesh.faces[row, k][:, None]).any(axis=1)
+        np.add.at(normals[:, k], row[shares], weighted[col[shares]])
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    flat = mesh.face_normals[corner].reshape(-1, 3, 3)
+    return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))

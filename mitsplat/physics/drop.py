@@ -1,0 +1,387 @@
+"""Draw poses above a scene, drop the objects from them, and judge how they came to rest."""
+
+from __future__ import annotations
+
+import gc
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array
+from mitsplat.asset import Asset
+from mitsplat.errors import InputError
+from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
+from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
+from mitsplat.physics.contacts import ContactFinder
+from mitsplat.physics.placement import Item, draw_poses, fixed_pose
+from mitsplat.physics.worlds import (
+    OVERFLOW,
+    Body,
+    Collider,
+    MujocoWorld,
+    Outcome,
+    WarpWorld,
+    World,
+    all_pieces,
+    run_to_rest,
+)
+from mitsplat.progress import Note
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds
+
+_REACH = 5e-3  # gaps beyond this are not measured [m]
+# What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
+_DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _WIDEST_GAP, _SHARE = 3e-4, 5e-4, 1e-3, 0.005
+_DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scene file says so [m]
+_NEAREST = 5e-4  # what is scattered is farther apart than this [m]
+_FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
+# Simulations of which the remains may pile up. Newton leaves the model of each, a MiB and more, in reference cycles,
+# which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
+_GARBAGE = 24
+_POURED = 1.0  # speed of objects that are poured in piles [m/s]: faster, light ones are flung out by heavy ones
+_THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What physics needs of an asset; ``standoff`` as in :func:`mitsplat.mesh_distance.standoff`."""
+
+    body: Body
+    surface: Surface
+    standoff: float
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A scene, and whom to tell what making its :class:`Drop` takes, which is no part of what is asked for."""
+
+    scene: Scene
+    progress: Note = field(compare=False)
+
+
+def drop_of(scene: Scene, progress: Note) -> Drop:
+    """The :class:`Drop` of a scene, the same as the last time if the scene is."""
+    return _make_drop(_Request(scene, progress))
+
+
+@lru_cache(maxsize=1)
+def _make_drop(request: _Request) -> Drop:
+    return Drop(request.scene, request.progress)
+
+
+class Drop:
+    """Drops the objects of a scene; keeps what its layouts share, of which the simulation itself costs most to make.
+
+    Args:
+        scene: What to drop, from where, and on what.
+        progress: Told in a few words what takes long.
+    """
+
+    def __init__(self, scene: Scene, progress: Note) -> None:
+        self.scene = scene
+        self._parts: dict[int, _Part] = {}
+        self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float], World] = {}
+        self._made = 0
+        self._objects = [self._part(asset, progress) for asset in scene.assets]
+        self._colliders: list[Collider] = []
+        self._obstacles: list[PlacedSurface] = []
+        walls = self._add_colliders(progress)
+        self._contact_finder = ContactFinder(all_pieces((part.body for part in self._objects), self._colliders))
+        self._check_given_poses()
+        self._bounds = enclosed_bounds(scene.spec.region, [item.bounds for item in self._obstacles], walls)
+        if scene.spec.settle.arrangement == "pile":
+            self._bounds[1][2] += PILE_HEIGHT
+
+    def settle(self, index: int) -> Layout:
+        """Draw poses until a layout holds.
+
+        Raises:
+            InputError: If objects find no room, or no draw holds.
+        """
+        spec, refused, capacity = self.scene.spec, [], 1.0
+        assets, given = self._draw_objects(index)
+        if not assets:
+            return Layout(index, (), NOTHING_TO_REST)
+        frictions = self._draw_frictions(index)
+        for attempt in range(spec.settle.attempts):
+            start = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt), given)
+            world = self._world(assets, frictions, capacity)
+            world.reset(start)
+            outcome = self._run(world)
+            reason = outcome.refused
+            if reason == OVERFLOW:
+                capacity *= 2
+            if not reason:
+                resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
+                clearances = all_clearances(resting, self._obstacles, reach=_REACH)
+                gaps = _support_gaps(resting, clearances)
+                reason = _fault(clearances, gaps, self._obstacles) or self._disarray(
+                    resting, clearances, start, outcome.poses, given
+                )
+            if reason:
+                refused.append(reason)
+                continue
+            certificate = RestCertificate(
+                rested=True,
+                inside=True,
+                overflow=False,
+                time_to_rest=outcome.time,
+                max_speed=outcome.max_speed,
+                max_spin=outcome.max_spin,
+                surface_motion=outcome.surface_motion,
+                collider_penetration=_deepest(pair for pair in clearances if pair.second in self._obstacles),
+                pair_penetration=_deepest(pair for pair in clearances if pair.second not in self._obstacles),
+                support_gap=max(gaps.values()),
+                standoff=max(self._objects[asset].standoff for asset in assets),
+                attempts=attempt + 1,
+                refused=tuple(refused),
+            )
+            return Layout(index, self._instances(assets, outcome.poses), certificate)
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused).items())
+        raise InputError(
+            f"{self.scene.path}: layout {index} must come to rest in settle.attempts = {spec.settle.attempts} "
+            f"draws (got {reasons})"
+        )
+
+    def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
+        """Poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
+        assets, given = self._draw_objects(layout.index)
+        if not assets:
+            return
+        certificate = layout.certificate
+        rng = _random(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
+        capacity = 2.0 ** certificate.refused.count(OVERFLOW)
+        world = self._world(assets, self._draw_frictions(layout.index), capacity)
+        world.reset(self.draw_poses(assets, rng, given))
+        moments = [world.poses]
+
+        def observe(time: float, poses: Float64Array) -> None:
+            if len(moments) * interval <= time <= certificate.time_to_rest:
+                moments.append(poses)
+
+        self._run(world, observe=observe)
+        yield from moments
+
+    def _run(self, world: World, **options: Any) -> Outcome:
+        settle = self.scene.spec.settle
+        fastest = _POURED if settle.arrangement == "pile" else np.inf
+        return run_to_rest(world, max_time=settle.max_time, bounds=self._bounds, fastest=fastest, **options)
+
+    def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
+        """Which entry each object of a layout is of, and the pose that the file gives it, if any."""
+        counts = _random(self.scene.spec.seed, "object counts", index)
+        assets: list[int] = []
+        given: list[Float64Array | None] = []
+        for position, entry in enumerate(self.scene.spec.objects):
+            count = int(counts.integers(*entry.count, endpoint=True))
+            poses: list[Float64Array | None] = [fixed_pose(pose) for pose in entry.poses]
+            poses = poses or [None] * count
+            assets += [position] * len(poses)
+            given += poses
+        return tuple(assets), tuple(given)
+
+    def _draw_frictions(self, index: int) -> tuple[float, ...]:
+        """Friction coefficient of each entry in a layout."""
+        spec = self.scene.spec
+        rng = _random(spec.seed, "friction", index)
+        return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
+
+    def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float) -> World:
+        """The simulation of these assets; the last one is kept."""
+        if (assets, frictions, capacity) not in self._worlds:
+            settle = self.scene.spec.settle
+            bodies = [self._objects[asset].body.with_friction(frictions[asset]) for asset in assets]
+            self._worlds.clear()
+            self._made += 1
+            if self._made % _GARBAGE == 0:
+                gc.collect()
+            self._worlds[assets, frictions, capacity] = (
+                MujocoWorld(bodies, self._colliders, timestep=settle.timestep)
+                if settle.stepper == "mujoco"
+                else WarpWorld(
+                    bodies,
+                    self._colliders,
+                    timestep=settle.timestep,
+                    capacity=capacity,
+                    contact_finder=self._contact_finder,
+                )
+            )
+        return self._worlds[assets, frictions, capacity]
+
+    def _part(self, asset: Asset, progress: Note) -> _Part:
+        """What physics needs of an asset, made once for all entries that share its mesh."""
+        if asset.mesh is None:
+            raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
+        if id(asset.mesh) not in self._parts:
+            mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
+            surface = Surface(mesh)
+            pieces, stands_off = asset.pieces, 0.0
+            if pieces:
+                stands_off = standoff(surface, pieces)
+            else:
+                limit = max(_WIDEST_GAP, _SHARE * float(mesh.extents.max()))
+                for threshold in _THRESHOLDS:
+                    pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
+                    stands_off = standoff(surface, pieces)
+                    if stands_off <= limit:
+                        break
+            mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
+            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, asset.friction), surface, stands_off)
+        return self._parts[id(asset.mesh)]
+
+    def _add_colliders(self, progress: Note) -> list[int]:
+        """Fill colliders and obstacles, which are parallel; positions of the invisible ones: the enclosure."""
+        scene, walls = self.scene, []
+        for shape, shape_mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+            if not shape.collider:
+                continue
+            if not (shape.visible or shape.proxy):
+                walls.append(len(self._colliders))
+            mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
+            if shape.bin is not None:
+                collider = Collider(shape.friction, pieces=bin_walls(shape.bin))
+            elif shape.box is None:
+                collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
+            else:
+                pose = np.eye(4)
+                pose[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
+                pose[:3, 3] = shape.box.position
+                collider = Collider(shape.friction, box=(shape.box.size, pose))
+            self._colliders.append(collider)
+            self._obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
+        surroundings = scene.environment
+        if scene.spec.environment_collides and surroundings is not None and surroundings.mesh is not None:
+            mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
+            pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
+            self._colliders.append(Collider(surroundings.friction, pieces=pieces))
+            self._obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
+        if not self._colliders:
+            raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
+        return walls
+
+    def _check_given_poses(self) -> None:
+        """Refuse poses of the scene file that start in one another or in a collider, which would part them anyhow."""
+        keys: dict[PlacedSurface, str] = {}
+        for entry, spec in enumerate(self.scene.spec.objects):
+            for number, pose in enumerate(spec.poses):
+                keys[self._placed(entry, fixed_pose(pose))] = f"objects[{entry}].poses[{number}]"
+        for pair in all_clearances(list(keys), self._obstacles, reach=_REACH):
+            if -pair.distance > _DEEPEST_GIVEN:
+                other = keys.get(pair.second, f"collider {pair.second.name!r}")
+                raise InputError(
+                    f"{self.scene.path}: {keys[pair.first]}: must not start in {other} "
+                    f"(got an overlap of {-pair.distance * 1e3:.1f} mm)"
+                )
+
+    def draw_poses(
+        self, assets: Sequence[int], rng: np.random.Generator, given: Sequence[Float64Array | None] = ()
+    ) -> Float64Array:
+        """Poses (N, 4, 4) to start from, see :func:`mitsplat.physics.placement.draw_poses`.
+
+        Raises:
+            InputError: If objects find no room.
+        """
+        items = [
+            Item(asset, self._objects[asset].surface, self._objects[asset].body.outline, given[i] if given else None)
+            for i, asset in enumerate(assets)
+        ]
+        region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
+        poses = draw_poses(items, self._obstacles, region, arrangement, rng)
+        if poses is not None:
+            return poses
+        size = np.subtract(region.max, region.min)
+        raise InputError(
+            f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
+            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m{self._in_way()}, "
+            f"settle.arrangement {arrangement})"
+        )
+
+    def _in_way(self) -> str:
+        """Of what takes most of the region: how much, and its name; empty if nothing takes a tenth."""
+        points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
+        taken = [float((item.signed_distances(points) < 0).mean()) for item in self._obstacles]
+        worst = int(np.argmax(taken))
+        return (
+            f", {taken[worst]:.0%} of which are inside of {self._obstacles[worst].name!r}"
+            if taken[worst] >= 0.1
+            else ""
+        )
+
+    def _disarray(
+        self,
+        resting: Sequence[PlacedSurface],
+        clearances: Sequence[Clearance],
+        start: Float64Array,
+        end: Float64Array,
+        given: Sequence[Float64Array | None],
+    ) -> str:
+        """How a layout at rest is not arranged as asked for, or empty."""
+        arrangement = self.scene.spec.settle.arrangement
+        for pair in clearances:
+            if pair.second.name.startswith(ENCLOSURE) and pair.distance < _WIDEST_GAP:
+                return f"{pair.first.name} rests against the enclosure"
+        if arrangement == "scatter":
+            for pair in clearances:
+                if pair.second not in self._obstacles and pair.distance < _NEAREST:
+                    return f"{pair.first.name} and {pair.second.name} touch"
+        if arrangement in ("stack", "upright"):
+            # Angle between the world's vertical, carried along by the object, and the vertical.
+            tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
+            for item, tilt, pose in zip(resting, tilts, given, strict=True):
+                if pose is None and tilt > _FALLEN:
+                    return f"{item.name} fell over"
+        return ""
+
+    def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:
+        return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
+
+    def _instances(self, assets: Sequence[int], poses: Float64Array) -> tuple[Instance, ...]:
+        classes = [self.scene.class_names.index(self.scene.assets[asset].class_name) for asset in assets]
+        return tuple(
+            Instance(number + 1, asset, class_index, pose)
+            for number, (asset, class_index, pose) in enumerate(zip(assets, classes, poses, strict=True))
+        )
+
+
+def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearance]) -> dict[PlacedSurface, float]:
+    """Distance of each object from what is nearest to it [m]."""
+    return {
+        item: max(0.0, min(pair.distance for pair in clearances if item in (pair.first, pair.second)))
+        for item in resting
+    }
+
+
+def _fault(
+    clearances: Sequence[Clearance], gaps: Mapping[PlacedSurface, float], obstacles: Sequence[PlacedSurface]
+) -> str:
+    """Why objects at rest are not where they could be, or empty."""
+    for pair in sorted(clearances, key=lambda pair: pair.distance):
+        if -pair.distance > (_DEEPEST_IN_COLLIDER if pair.second in obstacles else _DEEPEST_IN_OBJECT):
+            return f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
+    for item, gap in gaps.items():
+        if gap > max(_WIDEST_GAP, _SHARE * item.size):
+            return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest"
+    return ""
+
+
+def _deepest(pairs: Iterable[Clearance]) -> float:
+    return max([0.0, *(-pair.distance for pair in pairs)])
+
+
+def _random(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), *numbers]))
+
+
+def _pieces(
+    mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _THRESHOLDS[0]
+) -> tuple[trimesh.Trimesh, ...]:
+    progress(f"convex pieces of {name}")
+    return convex_pieces(mesh, threshold=threshold)

@@ -1,0 +1,241 @@
+"""Where objects start: poses that overlap nothing, for each way of laying them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.mesh_distance import PlacedSurface, Surface, clearance
+from mitsplat.scene.spec import Arrangement, ObjectPose, Region
+from mitsplat.scene.walls import PILE_HEIGHT
+
+_PLACES = 200  # positions tried for an object before all are drawn anew
+_PLACES_IN_LAYER = 20  # of a pile
+_DRAWS = 20
+_SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
+_HOVER = 2e-4  # how closely objects are put on what is below them [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """An object to place.
+
+    Attributes:
+        entry: Position of its entry in the scene file; a stack is of one entry.
+        surface: Its mesh.
+        outline: Vertices of its convex hull [m], shape (N, 3).
+        pose: Where the scene file puts it, or None.
+    """
+
+    entry: int
+    surface: Surface
+    outline: Float64Array
+    pose: Float64Array | None = None
+
+
+def fixed_pose(pose: ObjectPose) -> Float64Array:
+    """A pose of the scene file as a transform (4, 4)."""
+    world_from_object = np.eye(4)
+    world_from_object[:3, :3] = Rotation.from_euler("xyz", pose.rotate, degrees=True).as_matrix()
+    world_from_object[:3, 3] = pose.position
+    return world_from_object
+
+
+def draw_poses(
+    items: Sequence[Item],
+    obstacles: Sequence[PlacedSurface],
+    region: Region,
+    arrangement: Arrangement,
+    rng: np.random.Generator,
+) -> Float64Array | None:
+    """Poses (N, 4, 4) of all items; None if they find no room. None that is drawn touches another or an obstacle.
+
+    Args:
+        items: What to place.
+        obstacles: What does not move.
+        region: Where.
+        arrangement: How, see :class:`mitsplat.scene.spec.Settle`.
+        rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
+    """
+    for _ in range(_DRAWS):
+        poses = _Draw(items, obstacles, region, rng).all_poses(arrangement)
+        if poses is not None:
+            return poses
+    return None
+
+
+def resting_turn(outline: Float64Array) -> Float64Array:
+    """Rotation (3, 3) that lays a convex hull on its largest face."""
+    hull = ConvexHull(outline)
+    corners = outline[hull.simplices]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    normals = np.round(hull.equations[:, :3], 6)  # triangles of one face count together
+    faces, face_of = np.unique(normals, axis=0, return_inverse=True)
+    normal = faces[np.argmax(np.bincount(face_of, areas).round(12))]
+    turn: Float64Array = Rotation.align_vectors([[0.0, 0.0, -1.0]], [normal])[0].as_matrix()
+    return turn
+
+
+class _Draw:
+    """One attempt to place all items."""
+
+    def __init__(
+        self, items: Sequence[Item], obstacles: Sequence[PlacedSurface], region: Region, rng: np.random.Generator
+    ) -> None:
+        self._items, self._obstacles, self._rng = items, obstacles, rng
+        self._low, self._high = np.array(region.min), np.array(region.max)
+        self._foot = self._low.copy()  # of what is still free of a pile's column
+        self._poses = np.tile(np.eye(4), (len(items), 1, 1))
+        self._taken: list[Float64Array] = []
+
+    def all_poses(self, arrangement: Arrangement) -> Float64Array | None:
+        free = []
+        for i, item in enumerate(self._items):
+            if item.pose is None:
+                free.append(i)
+            else:
+                self._take(i, item.pose, _bounds(item.outline, item.pose))
+        # Large ones first, for which room is scarce.
+        free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
+        if arrangement == "stack":
+            entries = dict.fromkeys(self._items[i].entry for i in free)
+            done = all(self._stack([i for i in free if self._items[i].entry == entry]) for entry in entries)
+        else:
+            place: dict[str, Callable[[int], bool]] = {
+                "drop": self._drop,
+                "pile": self._pour,
+                "scatter": self._scatter,
+                "upright": lambda i: self._stand(i, np.eye(3)),
+            }
+            done = all(place[arrangement](i) for i in free)
+        return self._poses if done else None
+
+    def _drop(self, i: int) -> bool:
+        return self._try(i, self._low, self._high)
+
+    def _pour(self, i: int) -> bool:
+        """In a column above the region's foot that grows as it fills."""
+        height = float(np.linalg.norm(np.ptp(self._items[i].outline, axis=0)))
+        while self._foot[2] + height < self._high[2] + PILE_HEIGHT:
+            top = self._high.copy()
+            top[2] = self._foot[2] + height
+            if self._try(i, self._foot, top, places=_PLACES_IN_LAYER):
+                return True
+            self._foot[2] += height / 2
+        return False
+
+    def _scatter(self, i: int) -> bool:
+        """Low, and so far from the others that it meets none of them whichever way it falls."""
+        outline = self._items[i].outline
+        reach = float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).max())
+        top = self._high.copy()
+        top[2] = min(top[2], self._low[2] + 2.5 * reach)
+
+        def around(box: Float64Array) -> Float64Array:
+            middle = box.mean(axis=0)
+            return np.stack([middle - reach, middle + reach])
+
+        return self._try(i, self._low, top, occupies=around)
+
+    def _try(
+        self,
+        i: int,
+        low: Float64Array,
+        high: Float64Array,
+        *,
+        places: int = _PLACES,
+        occupies: Callable[[Float64Array], Float64Array] = lambda box: box,
+    ) -> bool:
+        """Put an item, turned at random, somewhere between two corners where there is room."""
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=self._rng).as_matrix()
+        bounds = _bounds(self._items[i].outline, pose)
+        if (low - bounds[0] > high - bounds[1]).any():
+            return False
+        for _ in range(places):
+            pose[:3, 3] = self._rng.uniform(low - bounds[0], high - bounds[1])
+            box = bounds + pose[:3, 3]
+            if self._free(i, pose, occupies(box)):
+                self._take(i, pose, occupies(box))
+                return True
+        return False
+
+    def _stack(self, members: Sequence[int]) -> bool:
+        """All members above one another, each on its largest face, turned about the vertical alike."""
+        first = members[0]
+        turn = resting_turn(self._items[first].outline)
+        if not self._stand(first, turn):
+            return False
+        for below, i in pairwise(members):
+            pose = self._poses[below].copy()
+            height = float(np.ptp(self._taken[-1][:, 2]))
+            pose[2, 3] += height + _HOVER
+            box = _bounds(self._items[i].outline, pose)
+            if box[1][2] > self._high[2]:
+                return False
+            self._take(i, pose, box)
+        return True
+
+    def _stand(self, i: int, turn: Float64Array) -> bool:
+        """Put an item, turned about the vertical, down on what is below."""
+        outline = self._items[i].outline
+        for _ in range(_PLACES):
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_euler("z", self._rng.uniform(0, 2 * np.pi)).as_matrix() @ turn
+            bounds = _bounds(outline, pose)
+            low, high = self._low - bounds[0], self._high - bounds[1]
+            if (low > high).any():
+                continue
+            pose[:3, 3] = self._rng.uniform(low, high)
+            pose[2, 3] = high[2]
+            if self._lower(i, pose) and self._free(i, pose, _bounds(outline, pose), above=True):
+                self._take(i, pose, _bounds(outline, pose))
+                return True
+        return False
+
+    def _lower(self, i: int, pose: Float64Array) -> bool:
+        """Lower a pose, in place, until it all but touches an obstacle; false if there is none below.
+
+        Conservative advancement: nothing is met on a way that is shorter than the distance of what is nearest.
+        """
+        floor = min(obstacle.bounds[0][2] for obstacle in self._obstacles)
+        reach = float(pose[2, 3] - floor) + 1.0
+        while True:
+            placed = PlacedSurface("", self._items[i].surface, pose)
+            distance = min(clearance(placed, obstacle, reach=reach).distance for obstacle in self._obstacles)
+            if distance < _HOVER:
+                return distance > 0
+            if placed.bounds[1][2] < floor:
+                return False
+            pose[2, 3] -= distance - _HOVER / 2
+
+    def _free(self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False) -> bool:
+        """Whether nothing is in the way; ``above`` asks for free sky as well, which whatever stands there needs."""
+        if above:
+            box = np.stack([box[0], [*box[1][:2], np.inf]])
+        if self._taken and _boxes_meet(box, np.stack(self._taken)).any():
+            return False
+        placed = PlacedSurface("", self._items[i].surface, pose)
+        return all(clearance(placed, item, reach=_SPACING).distance > 0 for item in self._obstacles)
+
+    def _take(self, i: int, pose: Float64Array, box: Float64Array) -> None:
+        self._poses[i] = pose
+        self._taken.append(box)
+
+
+def _bounds(outline: Float64Array, pose: Float64Array) -> Float64Array:
+    """Corners of the bounding box of points (N, 3) at a pose, shape (2, 3)."""
+    moved = outline @ pose[:3, :3].T + pose[:3, 3]
+    return np.stack([moved.min(axis=0), moved.max(axis=0)])
+
+
+def _boxes_meet(box: Float64Array, others: Float64Array) -> BoolArray:
+    """Which of some boxes (N, 2, 3) come nearer to a box (2, 3) than objects may start."""
+    meet: BoolArray = ((box[0] < others[:, 1] + _SPACING) & (others[:, 0] < box[1] + _SPACING)).all(axis=1)
+    return meet

@@ -1,0 +1,161 @@
+"""Layouts: objects dropped at random poses and simulated until they rest, each with a certificate that they do."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mitsplat.cache import cache_folder, keep_file
+from mitsplat.errors import InputError
+from mitsplat.progress import Note
+from mitsplat.scene.layout import Layout
+from mitsplat.variant import one_at_a_time
+from mitsplat.warp_start import quiet_warp
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from mitsplat.scene.scene import Scene
+
+PACKAGE = Path(__file__).parents[1]
+
+_OWN = ("contacts", "drop", "friction", "placement", "worlds")
+MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.walls")
+"""Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
+_SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
+LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
+
+
+@one_at_a_time
+def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cached: bool = True) -> Layout:
+    """Drop the objects of one layout until they rest. The scene's seed and ``index`` decide the result.
+
+    It is kept in ``$XDG_CACHE_HOME/mitsplat/layouts`` (``~/.cache`` by default) by the hash of all that decides it:
+    what is dropped, from where, on what and with which code, but not how it is shown.
+
+    Args:
+        scene: What to drop, from where, and on what.
+        index: Index of the layout.
+        progress: Told in a few words what takes long: making convex pieces, compiling.
+        cached: Whether a layout that was settled before is taken from the cache, and this one kept there.
+
+    Raises:
+        InputError: If the index is no layout's, the region is too small for the objects, or no draw of poses comes to
+            rest within the limits.
+    """
+    from mitsplat.scene.scene import whole
+
+    index = whole(index, "layout")
+    if index < 0:
+        raise InputError(f"layout must be at least 0 (got {index})")
+    path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
+    if cached:
+        with suppress(OSError, ValueError, KeyError, TypeError):  # damaged or missing: settled anew
+            return Layout.from_json(json.loads(path.read_bytes()))
+    with warp_settings(progress):
+        from mitsplat.physics.drop import drop_of
+
+        layout = drop_of(scene, progress or (lambda text: None)).settle(index)
+    if cached:
+        keep_file(path, lambda file: file.write(json.dumps(layout.to_json()).encode()))
+    return layout
+
+
+@dataclass(frozen=True)
+class _SettleOne:
+    """Settles a layout in a worker process."""
+
+    scene: Scene
+    cached: bool
+
+    def __call__(self, index: int, note: Callable[[str], None], /) -> Layout:
+        return settle_layout(self.scene, index, progress=note, cached=self.cached)
+
+
+def settle_layouts(
+    scene: Scene, indices: Iterable[int], *, workers: int = 1, progress: Note | None = None, cached: bool = True
+) -> Iterator[Layout]:
+    """Settle many layouts over processes, in the order in which they are finished; see :func:`settle_layout`.
+
+    Several layouts in one simulation (Newton's worlds) cost about as much each as one alone on a CPU, and would wait
+    for the slowest (``python -m benchmarks.physics.settle worlds``).
+    """
+    from mitsplat.engine.pool import run_frames
+
+    layouts = {index: [index] for index in indices}
+    return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
+
+
+def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:
+    """How a layout came to rest: the layout as it was every ``interval`` seconds [s], and at last as it is.
+
+    On a CPU the drop that is simulated again is the one that was.
+    """
+    with warp_settings():
+        from mitsplat.physics.drop import drop_of
+
+        for poses in drop_of(scene, lambda text: None).replay(layout, interval):
+            moving = (
+                replace(instance, world_from_object=pose)
+                for instance, pose in zip(layout.instances, poses, strict=True)
+            )
+            yield replace(layout, instances=tuple(moving))
+    yield layout
+
+
+@lru_cache(maxsize=4)
+def _scene_hash(scene: Scene) -> str:
+    """Hash of what decides where the objects of a scene come to rest."""
+    spec = scene.spec
+    digest = hashlib.sha256()
+
+    def add(*values: object) -> None:
+        digest.update(repr(values).encode())
+
+    def add_mesh(mesh: trimesh.Trimesh | None) -> None:
+        if mesh is not None:
+            for array in (mesh.vertices, mesh.faces):
+                add(array.shape)
+                digest.update(np.ascontiguousarray(array).tobytes())
+
+    for name in LIBRARIES:
+        add(name, version(name))
+    for module in MODULES:
+        digest.update((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
+    add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
+    add(scene.class_names, spec.environment_collides)
+    for mesh in scene.shape_meshes:
+        add_mesh(mesh)
+    surroundings = [scene.environment] if spec.environment_collides and scene.environment is not None else []
+    for asset in (*scene.assets, *surroundings):
+        add(asset.name, asset.class_name, asset.density, asset.mass, asset.friction)
+        for mesh in (asset.mesh, *asset.pieces):
+            add_mesh(mesh)
+    return digest.hexdigest()
+
+
+@contextmanager
+def warp_settings(progress: Note | None = None) -> Iterator[None]:
+    """Keep Warp quiet and leave gradients out, without which the simulation compiles in two thirds of the time."""
+    import warp as wp
+
+    kept = wp.config.enable_backward
+    wp.config.enable_backward = False
+    try:
+        with quiet_warp():
+            compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
+            if progress is not None and not any(compiled):
+                progress("compiling physics, once (about a minute)")
+            yield
+    finally:
+        wp.config.enable_backward = kept

@@ -1,0 +1,542 @@
+"""Rigid bodies that fall until they rest: a Newton model, stepped by MuJoCo's solver on Warp or in C.
+
+Import it, and use it, within :func:`mitsplat.physics.settle.warp_settings`, which keeps compilation short.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import newton
+import numpy as np
+import trimesh
+import warp as wp
+from newton.solvers import SolverMuJoCo
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array
+from mitsplat.mesh import MassProperties, join_meshes
+from mitsplat.physics.contacts import ContactFinder, newton_hull
+from mitsplat.physics.friction import PairFrictionSolver, pair_friction
+
+OVERFLOW = "contact buffer overflow"
+"""Why :func:`run_to_rest` refuses a drop that a larger capacity may save."""
+
+_GRAVITY = (0.0, 0.0, -9.81)
+# How far no surface may move [m] in how long [s] for all to be at rest, and before what may still roll is let go.
+# Speeds say less: contacts of rounded hulls flicker from step to step, and with them what stays where it is.
+_MOTION, _WATCH_TIME = 5e-4, 1.0
+_QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
+_MEAN_TIME = 0.05  # over which speeds are told [s]
+# Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
+# 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
+_CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
+# Radius of contact and length of roll friction [m], at most these shares of the size: round parts stop, thin ones do
+# not stand on their rim. See :mod:`mitsplat.physics.friction`.
+_CONTACT_RADIUS, _ROLLING = (0.01, 0.2), (5e-4, 0.01)
+_WITH_ROLL, _WITHOUT_ROLL = 6, 4  # dimensions of a contact: one across, two of sliding, spin, and two of rolling
+# Impedance of contacts at their surface and 1 mm deep: at MuJoCo's default of 0.9, a nut that carries a plate of a
+# hundred times its mass sinks by 1 mm. MuJoCo's own contacts, which flicker, come to rest less often when stiffer.
+_IMPEDANCE_WARP, _IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
+_STEPS = 4  # per captured graph; even, so that the two states end as they began
+_SOLVER_OPTIONS: dict[str, Any] = {
+    "integrator": "implicitfast",
+    "solver": "newton",
+    "cone": "elliptic",
+    "impratio": 100.0,
+    "enable_multiccd": True,
+    "disable_sensors": True,
+    "include_sites": False,
+    "kinematic_switchable_roots": False,
+}
+# The stages of mj_step (mj_forward, then the integrator) for models without sensors, before and after collision.
+_BEFORE_CONTACTS = (
+    *(mujoco.mj_checkPos, mujoco.mj_checkVel),
+    *(mujoco.mj_fwdKinematics, mujoco.mj_makeM, mujoco.mj_factorM),
+)
+_AFTER_CONTACTS = (
+    *(mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_transmission, mujoco.mj_projectConstraint),
+    *(mujoco.mj_fwdVelocity, mujoco.mj_fwdActuation, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint),
+    *(mujoco.mj_checkAcc, mujoco.mj_implicit),
+)
+# Some kernels are compiled for the number of bodies: bodies without shape fill it up to a multiple of this.
+_BATCH = 4
+
+
+class ContactOverflow(Exception):
+    """More contacts than the buffers hold: some were dropped, and bodies may have passed through one another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What falls. Bodies of one asset share it."""
+
+    pieces: tuple[trimesh.Trimesh, ...]
+    mass: MassProperties
+    friction: float
+
+    @cached_property
+    def outline(self) -> Float64Array:
+        """Vertices of the convex hull [m], shape (N, 3); nothing of the body moves farther than one of them."""
+        return np.asarray(join_meshes(self.pieces).convex_hull.vertices, dtype=np.float64)
+
+    @cached_property
+    def size(self) -> float:
+        """Longest extent [m]."""
+        return float(np.ptp(self.outline, axis=0).max())
+
+    @cached_property
+    def hulls(self) -> list[newton.Mesh]:
+        """The pieces for Newton."""
+        return [newton_hull(piece) for piece in self.pieces]
+
+    def with_friction(self, friction: float) -> Body:
+        """The same body with another friction; what is made of its pieces is made once for both."""
+        body = replace(self, friction=friction)
+        vars(body).update(outline=self.outline, size=self.size, hulls=self.hulls)
+        return body
+
+
+@dataclass(frozen=True, eq=False)
+class Collider:
+    """What does not move: convex pieces in world space, or a box by its full ``size`` [m] and pose (4, 4)."""
+
+    friction: float
+    pieces: tuple[trimesh.Trimesh, ...] = ()
+    box: tuple[tuple[float, float, float], Float64Array] | None = None
+
+
+def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterator[trimesh.Trimesh]:
+    """Convex pieces of all that is simulated."""
+    for body in bodies:
+        yield from body.pieces
+    for collider in colliders:
+        yield from collider.pieces
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How a drop ended.
+
+    Attributes:
+        refused: Why it cannot be used, or empty.
+        time: Simulated time from which the bodies were at rest [s].
+        surface_motion: Farthest that a point of any body moved in the second after that [m]; infinite if refused.
+        max_speed, max_spin: Of the fastest body at the end of that second [m/s, rad/s].
+        poses: World-from-body transforms then, shape (N, 4, 4).
+    """
+
+    refused: str
+    time: float
+    max_speed: float
+    max_spin: float
+    surface_motion: float
+    poses: Float64Array = field(repr=False)
+
+
+class World(ABC):
+    """Bodies above colliders; made without motion, set in motion by :meth:`reset`.
+
+    Attributes:
+        bodies: What falls.
+        interval: Simulated time of each :meth:`advance` [s].
+        time: Simulated time since :meth:`reset` [s].
+    """
+
+    def __init__(self, bodies: Sequence[Body], *, timestep: float) -> None:
+        self.bodies = tuple(bodies)
+        self.interval = _STEPS * timestep
+        self.time = 0.0
+        self._rolls = False
+
+    def reset(self, poses: Float64Array, velocities: Float64Array | None = None) -> None:
+        """Put the bodies somewhere; nothing is left of the past.
+
+        Args:
+            poses: World-from-body transforms, shape (N, 4, 4).
+            velocities: As :attr:`velocities`, shape (N, 2, 3); at rest if None.
+        """
+        self.time = 0.0
+        self.let_roll(False)
+        self._reset(_coordinates(self.bodies, poses))
+        self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
+
+    def set_velocities(self, velocities: Float64Array) -> None:
+        """Give the bodies other velocities, as :attr:`velocities`, where they are."""
+        self._set_velocities(np.pad(velocities, ((0, -len(velocities) % _BATCH), (0, 0), (0, 0))))
+
+    def advance(self) -> None:
+        """Step a few times.
+
+        Raises:
+            ContactOverflow: The contact buffers were too small in one of the steps.
+        """
+        self._advance()
+        self.time += self.interval
+
+    def let_roll(self, rolls: bool) -> None:
+        """Take roll friction away, or give it back."""
+        if rolls != self._rolls:
+            self._rolls = rolls
+            self._let_roll(rolls)
+
+    @property
+    def poses(self) -> Float64Array:
+        """World-from-body transforms, shape (N, 4, 4)."""
+        coordinates = self._coordinates()[: len(self.bodies)]
+        poses = np.tile(np.eye(4), (len(coordinates), 1, 1))
+        poses[:, :3, :3] = Rotation.from_quat(coordinates[:, 3:]).as_matrix()
+        poses[:, :3, 3] = coordinates[:, :3]
+        return poses
+
+    @property
+    @abstractmethod
+    def velocities(self) -> Float64Array:
+        """Linear velocity of the centre of mass [m/s] and angular velocity [rad/s] in world axes, shape (N, 2, 3)."""
+
+    @abstractmethod
+    def _reset(self, coordinates: Float64Array) -> None: ...
+
+    @abstractmethod
+    def _set_velocities(self, velocities: Float64Array) -> None:
+        """Velocities of every body, those without shape included, shape (M, 2, 3)."""
+
+    @abstractmethod
+    def _advance(self) -> None: ...
+
+    @abstractmethod
+    def _let_roll(self, rolls: bool) -> None: ...
+
+    @abstractmethod
+    def _coordinates(self) -> Float64Array:
+        """Position and xyzw quaternion of every body, those without shape included, shape (M, 7)."""
+
+
+class WarpWorld(World):
+    """Newton's contacts and mujoco_warp's solver in one captured graph.
+
+    The contacts of mujoco_warp itself flicker where many coplanar pieces touch in single precision: a cup of fifty
+    pieces then creeps at 5 mm/s for ever. Newton's come to rest.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        colliders: Sequence[Collider],
+        *,
+        timestep: float,
+        capacity: float,
+        contact_finder: ContactFinder | None = None,
+    ) -> None:
+        super().__init__(bodies, timestep=timestep)
+        self._timestep = timestep
+        model = _build_model(bodies, colliders, _IMPEDANCE_WARP)
+        contacts = max(8, int(capacity * max_contacts(len(bodies), model.shape_count)))
+        self._solver = PairFrictionSolver(
+            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
+        )
+        # Overflow is read from flags: the kernels would print it at every step.
+        self._solver.mjw_model.opt.warn_overflow = 0
+        # One contact more than the solver takes: the pipeline stops counting when it is full, and flags nothing then.
+        finder = contact_finder or ContactFinder(all_pieces(bodies, colliders))
+        self._pipeline = finder.pipeline(model, max_contacts=contacts + 1)
+        self._contacts = self._pipeline.contacts()
+        self._states = model.state(), model.state()
+        self._control = model.control()
+        self._observables = [self._solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW}) for _ in range(_STEPS)]
+        self._record(self._observables[:1])  # loads the kernels, which a capture must not
+        with wp.ScopedCapture(device="cpu") as capture:
+            self._record(self._observables)
+        self._graph = capture.graph
+
+    @property
+    def velocities(self) -> Float64Array:
+        """See :attr:`World.velocities`."""
+        return _array(self._states[0].body_qd)[: len(self.bodies)].reshape(-1, 2, 3)
+
+    def _record(self, steps: Sequence[Any]) -> None:
+        here, there = self._states
+        for observables in steps:
+            self._pipeline.collide(here, self._contacts)
+            self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
+            here, there = there, here
+
+    def _reset(self, coordinates: Float64Array) -> None:
+        state = self._states[0]
+        self._solver.reset(state)
+        _assign(state.joint_q, coordinates.ravel())
+        _assign(state.body_q, coordinates)
+
+    def _set_velocities(self, velocities: Float64Array) -> None:
+        state = self._states[0]
+        _assign(state.joint_qd, velocities.ravel())
+        _assign(state.body_qd, velocities.reshape(-1, 6))
+
+    def _advance(self) -> None:
+        wp.capture_launch(self._graph)
+        if any(_array(observed.overflow).any() for observed in self._observables):
+            raise ContactOverflow
+
+    def _let_roll(self, rolls: bool) -> None:
+        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if rolls else _WITH_ROLL)
+
+    def _coordinates(self) -> Float64Array:
+        return _array(self._states[0].body_q)
+
+
+class MujocoWorld(World):
+    """The same model, stepped by MuJoCo in C: double precision, its own contacts, buffers that grow."""
+
+    def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
+        super().__init__(bodies, timestep=timestep)
+        solver = PairFrictionSolver(
+            _build_model(bodies, colliders, _IMPEDANCE_MUJOCO), use_mujoco_cpu=True, **_SOLVER_OPTIONS
+        )
+        self._model, self._data = solver.mj_model, solver.mj_data
+        self._model.opt.timestep = timestep
+        self._centres = np.array([body.mass.centre for body in bodies])
+
+    @property
+    def velocities(self) -> Float64Array:
+        """See :attr:`World.velocities`; MuJoCo's are of the frame's origin, and turn in the body's axes."""
+        rotations = self.poses[:, :3, :3]
+        of_origin = np.array(self._data.qvel).reshape(-1, 2, 3)[: len(self.bodies)]
+        spin = np.einsum("nij,nj->ni", rotations, of_origin[:, 1])
+        arms = np.einsum("nij,nj->ni", rotations, self._centres)
+        return np.stack([of_origin[:, 0] + np.cross(spin, arms), spin], axis=1)
+
+    def _reset(self, coordinates: Float64Array) -> None:
+        mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = coordinates[:, [0, 1, 2, 6, 3, 4, 5]].ravel()
+
+    def _set_velocities(self, velocities: Float64Array) -> None:
+        rotations = self.poses[:, :3, :3]
+        of_centre, spin = velocities[: len(self.bodies), 0], velocities[: len(self.bodies), 1]
+        arms = np.einsum("nij,nj->ni", rotations, self._centres)
+        of_origin = np.stack([of_centre - np.cross(spin, arms), np.einsum("nji,nj->ni", rotations, spin)], axis=1)
+        self._data.qvel[: of_origin.size] = of_origin.ravel()
+
+    def _advance(self) -> None:
+        for _ in range(_STEPS):
+            self._step()
+        full = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+        if any(self._data.warning[kind].number for kind in full):
+            raise ContactOverflow
+
+    def _step(self) -> None:
+        """``mj_step`` for this integrator, but with the friction of :mod:`mitsplat.physics.friction`.
+
+        Between what it calls there is no callback where contacts are known and their constraints are not made yet.
+        """
+        model, data = self._model, self._data
+        for stage in (*_BEFORE_CONTACTS, mujoco.mj_collision):
+            stage(model, data)
+        pairs, friction = data.contact.geom, model.geom_friction
+        data.contact.friction[:] = pair_friction(friction[pairs[:, 0]], friction[pairs[:, 1]])
+        for stage in _AFTER_CONTACTS:
+            stage(model, data)
+
+    def _let_roll(self, rolls: bool) -> None:
+        self._model.geom_condim[:] = _WITHOUT_ROLL if rolls else _WITH_ROLL
+
+    def _coordinates(self) -> Float64Array:
+        return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]
+
+
+def run_to_rest(
+    world: World,
+    *,
+    max_time: float,
+    bounds: tuple[Float64Array, Float64Array],
+    fastest: float = np.inf,
+    observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
+) -> Outcome:
+    """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
+
+    At rest no surface moves by half a millimetre in a second, and by a tenth in its first quarter. After that quarter
+    nothing rolls with friction, which would let a box balance on its edge.
+
+    Args:
+        world: Changed in place.
+        max_time: When they must have come to rest [s].
+        bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+        fastest: Speed to which faster bodies are slowed down after each advance [m/s].
+        observe: Told the time [s] and the poses (N, 4, 4) after each advance.
+    """
+    try:
+        return _run_to_rest(world, max_time, bounds, fastest, observe)
+    except ContactOverflow:
+        reason = OVERFLOW
+    except _Refused as refused:
+        reason = str(refused)
+    return Outcome(reason, world.time, np.inf, np.inf, np.inf, world.poses)
+
+
+class _Refused(Exception):
+    """Why a drop cannot be used."""
+
+
+def _run_to_rest(
+    world: World,
+    max_time: float,
+    bounds: tuple[Float64Array, Float64Array],
+    fastest: float,
+    observe: Callable[[float, Float64Array], None],
+) -> Outcome:
+    mean_frames = max(1, round(_MEAN_TIME / world.interval))
+    past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
+    since, rest, motion = 0.0, world.poses, 0.0
+    while world.time - since < _WATCH_TIME:
+        world.let_roll(world.time - since >= _QUIET_TIME)
+        poses = _advance_within(world, bounds, fastest)
+        past.append(poses)
+        observe(world.time, poses)
+        motion = max(motion, _surface_motion(world.bodies, rest, poses))
+        if motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _MOTION):
+            since, rest, motion = world.time, poses, 0.0
+        if since >= max_time:
+            raise _Refused(f"not at rest within {max_time:g} s")
+    speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
+    return Outcome("", since, speed, spin, motion, world.poses)
+
+
+def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fastest: float) -> Float64Array:
+    """Advance, and return the poses."""
+    world.advance()
+    poses, velocities = world.poses, world.velocities
+    if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
+        raise _Refused("the simulation diverged")
+    speeds = np.linalg.norm(velocities[:, 0], axis=1)
+    if speeds.max() > fastest:
+        velocities[:, 0] *= np.minimum(1.0, fastest / np.maximum(speeds, fastest))[:, None]
+        world.set_velocities(velocities)
+    centres = _centres(world.bodies, poses)
+    outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
+    if outside.any():
+        raise _Refused(f"{int(outside.sum())} left the enclosure")
+    return poses
+
+
+def _centres(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
+    """Centres of mass [m], shape (N, 3)."""
+    local = np.array([body.mass.centre for body in bodies])
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3])
+
+
+def _mean_speeds(
+    bodies: Sequence[Body], before: Float64Array, after: Float64Array, seconds: float
+) -> tuple[float, float]:
+    """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
+    way = np.linalg.norm(_centres(bodies, after) - _centres(bodies, before), axis=1)
+    # Rotations that are an angle t apart differ by a matrix of Frobenius norm 2 sqrt(2) sin(t / 2).
+    apart = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2))
+    turn = 2 * np.arcsin(np.minimum(1.0, apart / np.sqrt(8.0)))
+    return float(way.max()) / seconds, float(turn.max()) / seconds
+
+
+def _array(values: Any) -> Float64Array:
+    """A Warp array as a copy in double precision."""
+    return np.array(values.numpy(), dtype=np.float64)
+
+
+def _assign(array: Any, values: Float64Array) -> None:
+    array.assign(values.astype(np.float32))
+
+
+def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> float:
+    """Farthest that a point of any body is displaced between two sets of poses [m]."""
+    moved = after - before
+    return max(
+        float(np.linalg.norm(body.outline @ change[:3, :3].T + change[:3, 3], axis=1).max())
+        for body, change in zip(bodies, moved, strict=True)
+    )
+
+
+def _parking(bodies: Sequence[Body]) -> Float64Array:
+    """Where bodies wait, those without shape always: in a row above everything, far apart; shape (M, 7).
+
+    Models are built there, so that no constant of the solver depends on the poses of a drop.
+    """
+    spacing = 2 * max(body.size for body in bodies)
+    count = len(bodies) + -len(bodies) % _BATCH
+    coordinates = np.tile([0.0, 0.0, 100.0, 0.0, 0.0, 0.0, 1.0], (count, 1))
+    coordinates[:, 0] = spacing * np.arange(count)
+    return coordinates
+
+
+def _coordinates(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
+    """Position and xyzw quaternion of bodies at poses (N, 4, 4), and of those without shape, shape (M, 7)."""
+    coordinates = _parking(bodies)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    coordinates[: len(poses)] = np.concatenate([poses[:, :3, 3], turns], axis=1)
+    return coordinates
+
+
+def max_contacts(bodies: int, shapes: int) -> int:
+    """How many contacts to make room for: most kernels run over all of it, and parts that tumble fill a half to 0.8."""
+    return 24 * bodies + shapes
+
+
+def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]) -> newton.Model:
+    return _build_scene(bodies, colliders, impedance).finalize(device="cpu")
+
+
+def _build_scene(
+    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]
+) -> newton.ModelBuilder:
+    contact = {"mujoco:condim": _WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
+    builder = newton.ModelBuilder(gravity=_GRAVITY)
+    builder.validate_inertia_detailed = True  # in Python: the other way compiles a kernel for 4 s
+    SolverMuJoCo.register_custom_attributes(builder)
+    for collider in colliders:
+        # Size 0 leaves the lengths of spin and roll friction to the bodies.
+        config = _shape_config(collider.friction, size=0.0)
+        if collider.box is not None:
+            size, pose = collider.box
+            hx, hy, hz = np.divide(size, 2).tolist()
+            xform = wp.transform(wp.vec3(*pose[:3, 3]), wp.quat(*Rotation.from_matrix(pose[:3, :3]).as_quat()))
+            builder.add_shape_box(-1, xform=xform, hx=hx, hy=hy, hz=hz, cfg=config, custom_attributes=contact)
+        _add_hulls(builder, -1, [newton_hull(piece) for piece in collider.pieces], config, contact)
+    for i, place in enumerate(_parking(bodies)):
+        body = bodies[i] if i < len(bodies) else None
+        mass = bodies[0].mass if body is None else body.mass
+        link = builder.add_body(
+            xform=wp.transform(wp.vec3(*place[:3]), wp.quat(*place[3:])),
+            mass=mass.mass,
+            com=wp.vec3(*mass.centre),
+            inertia=wp.mat33(*mass.inertia.ravel()),
+            lock_inertia=True,
+        )
+        if body is not None:
+            _add_hulls(builder, link, body.hulls, _shape_config(body.friction, size=body.size), contact)
+    return builder
+
+
+def _add_hulls(
+    builder: newton.ModelBuilder,
+    link: int,
+    hulls: Sequence[newton.Mesh],
+    config: newton.ModelBuilder.ShapeConfig,
+    contact: dict[str, Any],
+) -> None:
+    for hull in hulls:
+        builder.add_shape_convex_hull(link, mesh=hull, cfg=config, custom_attributes=contact)
+
+
+def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeConfig:
+    return newton.ModelBuilder.ShapeConfig(
+        density=0.0,
+        ke=1 / (_CONTACT_TIME * _DAMPING_RATIO) ** 2,
+        kd=2 / _CONTACT_TIME,
+        mu=friction,
+        mu_torsional=min(_CONTACT_RADIUS[0], _CONTACT_RADIUS[1] * size),
+        mu_rolling=min(_ROLLING[0], _ROLLING[1] * size),
+        margin=0.0,
+        gap=0.0,
+    )

@@ -1,0 +1,240 @@
+"""How good an asset is that was made of photographs, in figures and in plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import BoolArray, Float32Array
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.colour import encode_srgb
+from mitsplat.reconstruct.registration import measure_offset, surface_points
+from mitsplat.reconstruct.segment_splats import Isolation
+from mitsplat.reconstruct.silhouette_refinement import RefinedMesh
+from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.splats import Splats
+
+VERDICT_FILE = "verdict.json"
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Figures from which an asset is good enough for a training set.
+
+    Attributes:
+        registered: Least share of the photos that found their camera.
+        psnr: Least PSNR of held-out photos [dB].
+        splat_iou: Least mean IoU of the splats' alpha with the masks of held-out photos.
+        mesh_iou: The same of the mesh's silhouette.
+        offset: Largest shift between mesh and splats, as a share of the diagonal.
+        scale_error: Largest relative error of the metric scale, where it is known.
+        lost: Largest share of the object that isolation removed with its surroundings.
+    """
+
+    registered: float = 0.75
+    psnr: float = 24.0
+    splat_iou: float = 0.95
+    mesh_iou: float = 0.94
+    offset: float = 0.005
+    scale_error: float = 0.01
+    lost: float = 0.05
+
+
+_ADVICE = {
+    "registered": "take photos with more overlap, 10 to 15 degrees apart, and put texture such as newsprint under it",
+    "psnr": "use even light, fixed exposure and sharp photos, and fit longer",
+    "splat_iou": "check the masks in the report, and give better ones",
+    "mesh_iou": "check the masks in the report, and photograph the object from more heights",
+    "watertight": "photograph the object from all sides, or import a closed mesh",
+    "offset": "fit longer, or check the frame and scale of an imported mesh",
+    "scale_error": "measure a longer distance, or put a board beside the object that more photos see",
+    "lost": "check whether masks leave parts of the object out",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutView:
+    """What a photo that nothing was fitted to shows, and what the asset shows from there.
+
+    Attributes:
+        name: Of the photo.
+        camera: At the size of these pictures.
+        photo: Display-encoded, (H, W, 3).
+        mask: Share of the pixel that is object, (H, W), or None.
+        render: Splats, display-encoded and multiplied by alpha, (H, W, 3).
+        alpha: Of the splats, (H, W).
+        mesh: Whether the mesh covers the pixel's middle, (H, W).
+        normal: Unit normals of the mesh in the world, (H, W, 3).
+    """
+
+    name: str
+    camera: Camera
+    photo: Float32Array
+    mask: Float32Array | None
+    render: Float32Array
+    alpha: Float32Array
+    mesh: BoolArray
+    normal: Float32Array
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Figures of an asset; None where they are not known or make no sense.
+
+    Attributes:
+        photos: Number of photos that found their camera.
+        rejected: Number that did not, or were refused.
+        psnr: Of held-out photos, as the fit reports it [dB].
+        psnr_object: Of the object's pixels in held-out photos, after isolation [dB].
+        splat_iou: Mean IoU of the splats' alpha with held-out masks.
+        mesh_iou: The same of the mesh's silhouette.
+        offset: Shift between mesh and the splats' surface, as a share of the mesh's diagonal.
+        spread: Median distance between the two, in the same units.
+        lost: Share of the object that isolation removed.
+        scale_error: Estimated relative error of the metric scale.
+        units: Whether the asset is in metres.
+        gaussians: Number of Gaussians.
+        faces: Number of faces of the mesh.
+        watertight: Whether the mesh encloses a volume.
+        solid: Whether it must, as that of an object.
+        refinement: What came of refining the mesh, as one clause, or None where that was not asked for.
+    """
+
+    photos: int
+    rejected: int
+    psnr: float | None
+    psnr_object: float | None
+    splat_iou: float | None
+    mesh_iou: float | None
+    offset: float | None
+    spread: float | None
+    lost: float | None
+    scale_error: float | None
+    units: str
+    gaussians: int
+    faces: int
+    watertight: bool
+    solid: bool
+    refinement: str | None = None
+
+    @property
+    def registered(self) -> float:
+        """Share of the photos that found their camera."""
+        return self.photos / max(1, self.photos + self.rejected)
+
+    def misses(self, thresholds: Thresholds = Thresholds()) -> tuple[str, ...]:
+        """A sentence for each threshold that is missed, with advice."""
+        least = {
+            "registered": f"only {self.photos} of {self.photos + self.rejected} photos found their camera",
+            "psnr": f"held-out photos are met at only {self.psnr or 0:.1f} dB",
+            "splat_iou": f"the splats meet held-out masks with an IoU of only {self.splat_iou or 0:.3f}",
+            "mesh_iou": f"the mesh meets held-out masks with an IoU of only {self.mesh_iou or 0:.3f}",
+        }
+        most = {
+            "offset": f"mesh and splats are {self.offset or 0:.2%} of the diagonal apart",
+            "scale_error": f"the scale is known to {self.scale_error or 0:.1%} only",
+            "lost": f"isolation removed {self.lost or 0:.1%} of the object",
+        }
+        found = []
+        for names, sign in ((least, 1.0), (most, -1.0)):
+            for name, sentence in names.items():
+                value, limit = getattr(self, name), getattr(thresholds, name)
+                if value is not None and sign * value < sign * limit:
+                    rule = "at least" if sign > 0 else "at most"
+                    found.append(f"{sentence} ({rule} {limit:g} is wanted): {_ADVICE[name]}")
+        if self.solid and not self.watertight:
+            found.append(f"the mesh is open (a closed one is wanted): {_ADVICE['watertight']}")
+        return tuple(found)
+
+
+def show_held_out(
+    splats: Splats, mesh: trimesh.Trimesh | None, photos: Sequence[Photo], size: int
+) -> list[HeldOutView]:
+    """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
+    integrator = make_integrator(shadow="none")
+    shape = make_splats_shape(splats, instance=1, proxy=mesh)
+    import mitsuba as mi
+
+    scene = mi.load_dict({"type": "scene", "splats": shape})
+    views = []
+    for photo in photos:
+        camera, rgb, mask = sized_photo(photo, size)
+        layers = render_layers(integrator, scene, camera)
+        alpha = np.maximum(layers.alpha, 1e-6)[..., None]
+        views.append(
+            HeldOutView(
+                name=photo.name,
+                camera=camera,
+                photo=rgb,
+                mask=mask,
+                render=(encode_srgb(layers.captured / alpha) * layers.alpha[..., None]).astype(np.float32),
+                alpha=layers.alpha,
+                mesh=layers.proxy_instance > 0,
+                normal=layers.normal,
+            )
+        )
+    return views
+
+
+def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None]:
+    """Camera, colours and mask of a photo, its longest edge at most ``size`` px."""
+    scale = min(1.0, size / max(photo.camera.width, photo.camera.height))
+    rgb, mask = photo.picture(scale)
+    return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask
+
+
+def judge(
+    capture: Capture,
+    splats: Splats,
+    mesh: trimesh.Trimesh | None,
+    views: Sequence[HeldOutView],
+    *,
+    isolation: Isolation | None,
+    psnr: float | None,
+    refinement: RefinedMesh | None = None,
+) -> Verdict:
+    """Figures from held-out views of splats and mesh."""
+    masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
+    errors = [float(((view.render - view.photo)[mask] ** 2).mean()) for view, mask in masked]
+    offset = None
+    if mesh is not None and views:
+        offset = measure_offset(mesh, surface_points(splats, [view.camera for view in views]))
+    return Verdict(
+        photos=len(capture.photos),
+        rejected=len(capture.rejected),
+        psnr=psnr,
+        psnr_object=_mean([-10 * float(np.log10(max(error, 1e-12))) for error in errors]),
+        splat_iou=_mean([iou(view.alpha >= 0.5, mask) for view, mask in masked]),
+        mesh_iou=None if mesh is None else _mean([iou(view.mesh, mask) for view, mask in masked]),
+        offset=None if offset is None else offset.shift,
+        spread=None if offset is None else offset.spread,
+        lost=None if isolation is None else isolation.lost,
+        scale_error=capture.scale_error,
+        units=capture.units,
+        gaussians=len(splats),
+        faces=0 if mesh is None else len(mesh.faces),
+        watertight=mesh is not None and _closed(mesh),
+        solid=isolation is not None,
+        refinement=None if refinement is None else str(refinement),
+    )
+
+
+def _closed(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh is watertight also where readers weld vertices that lie on each other."""
+    welded = mesh.copy()
+    welded.merge_vertices(merge_tex=True, merge_norm=True)
+    return bool(welded.is_watertight)
+
+
+def iou(one: BoolArray, other: BoolArray) -> float:
+    """Intersection over union; 1 where both are empty."""
+    union = int((one | other).sum())
+    return int((one & other).sum()) / union if union else 1.0
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -1,0 +1,227 @@
+"""From photographs to an asset folder: capture, fit, isolation, mesh and verdict, each kept until its inputs change.
+
+The work folders ``capture/`` and ``fit/`` inside the asset's folder keep what those stages made; they look after their
+own inputs. The last stage is kept by a hash of everything that decides it, in ``verdict.json`` beside the figures.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mitsplat.capture.capture import Capture
+from mitsplat.errors import InputError
+from mitsplat.files import add_content, write_text
+from mitsplat.html import REPORT_FILE
+from mitsplat.progress import Progress
+from mitsplat.reconstruct.evaluation import VERDICT_FILE, Verdict
+from mitsplat.reconstruct.reconstruct import (
+    ImportedMesh,
+    Reconstruction,
+    ReconstructSettings,
+    check_refinable,
+    reconstruct_asset,
+)
+from mitsplat.reconstruct.report import write_asset_report
+from mitsplat.splats import Splats
+from mitsplat.version import __version__
+
+if TYPE_CHECKING:
+    from mitsplat.capture.pipeline import CaptureSettings
+    from mitsplat.fit.trainer import FitSettings
+
+
+@dataclass(frozen=True, eq=False)
+class AssetJob:
+    """What an asset of photographs is to be.
+
+    Attributes:
+        name: Of the asset.
+        class_name: Class that detectors learn; the name if None.
+        kind: Objects are isolated and can be dropped; environments stay whole.
+        settings: How the asset is made of the splats.
+        imported: A mesh to take instead of a reconstructed one.
+    """
+
+    name: str
+    class_name: str | None = None
+    kind: Literal["object", "environment"] = "object"
+    settings: ReconstructSettings = field(default_factory=ReconstructSettings)
+    imported: ImportedMesh | None = None
+
+    def __post_init__(self) -> None:
+        check_refinable(self.settings, self.kind, self.imported)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """An asset on disk.
+
+    Attributes:
+        folder: Of the asset.
+        verdict: Its figures.
+        kept: Whether an earlier run had made it of the same inputs.
+        warnings: What there is to say about its photographs, one sentence each.
+    """
+
+    folder: Path
+    verdict: Verdict
+    kept: bool
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def shortcoming(self) -> str | None:
+        """The thresholds that were missed and what would help, as one sentence, or None."""
+        return "; ".join(self.verdict.misses()) or None
+
+
+def read_fit(path: Path) -> tuple[Path, float | None]:
+    """Splat file and held-out PSNR [dB] of a fit's folder, or a splat file itself.
+
+    Raises:
+        InputError: If the folder holds no finished fit.
+    """
+    if not path.is_dir():
+        return path, None
+    record = path / "fit.json"
+    try:
+        psnr = json.loads(record.read_text())["psnr"]
+    except FileNotFoundError:
+        raise InputError(f"{record}: no such file: has the fit finished?") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{record}: not the record of a fit ({error})") from error
+    return path / "splats.ply", None if psnr is None else float(psnr)
+
+
+def make_photo_asset(
+    photos: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    capture: CaptureSettings,
+    fit: FitSettings,
+    progress: Progress | None = None,
+) -> Finished:
+    """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
+
+    Args:
+        photos: Folder of photographs of one object or place.
+        out: Folder of the asset; ``capture/`` and ``fit/`` in it are the work folders.
+        job: What to make.
+        capture: How cameras, scale and masks are found.
+        fit: How splats are fitted.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: If the photographs do not suffice.
+        MissingResourceError: If a program or model that is needed is missing.
+    """
+    from mitsplat.capture.pipeline import capture_photos
+    from mitsplat.fit.trainer import FitProgress, fit_capture
+
+    taken = capture_photos(photos, out / "capture", capture, progress=progress)
+    found = taken.capture
+
+    def fitting(now: FitProgress) -> None:
+        if progress is not None:
+            done = int(now.fraction * fit.iterations)
+            progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
+
+    fit_capture(found, out / "fit", fit, overwrite=True, progress=fitting)
+    done = make_asset(out / "capture", out / "fit", out, job, progress=progress)
+    return replace(done, warnings=taken.warnings)
+
+
+def make_asset(
+    capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
+) -> Finished:
+    """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
+
+    Args:
+        capture_folder: As ``mitsplat capture`` writes it.
+        fit: Folder that ``mitsplat fit`` wrote, or a splat file in the capture's frame.
+        out: Folder of the asset.
+        job: What to make.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: If a file is missing or damaged, or an object has no masks.
+    """
+    capture = Capture.load(capture_folder)
+    splat_file, psnr = read_fit(fit)
+    inputs = _digest(capture_folder, capture, splat_file, job)
+    done = _finished(out, inputs)
+    if done is not None:
+        return done
+    (out / VERDICT_FILE).unlink(missing_ok=True)
+    result = reconstruct_asset(
+        capture,
+        Splats.load(splat_file),
+        name=job.name,
+        class_name=job.class_name,
+        kind=job.kind,
+        settings=job.settings,
+        imported=job.imported,
+        psnr=psnr,
+        progress=progress,
+    )
+    result.asset.save(out)
+    write_asset_report(out, capture, result)
+    # Last, so that an interrupted run is not mistaken for a finished one.
+    _save_verdict(out, result, inputs)
+    return Finished(out, result.verdict, kept=False)
+
+
+def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
+    record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict)}
+    if result.isolation is not None:
+        record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}
+    if result.alignment is not None:
+        record["alignment"] = {
+            "scale": result.alignment.scale,
+            "residual": result.alignment.residual,
+            "splats_from_mesh": result.alignment.splats_from_mesh.tolist(),
+        }
+    write_text(out / VERDICT_FILE, json.dumps(record, indent=1) + "\n")
+
+
+_REMOVED = ("outside", "unseen", "needles", "floaters")
+
+
+def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
+    """Hash of everything that decides the asset."""
+    imported = None
+    if job.imported is not None:
+        matrix = job.imported.capture_from_mesh
+        imported = [
+            hashlib.sha256(job.imported.mesh.vertices.tobytes() + job.imported.mesh.faces.tobytes()).hexdigest(),
+            None if matrix is None else matrix.tolist(),
+            job.imported.metres_per_unit,
+        ]
+    decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported]
+    digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
+    for path in (*_files(folder, capture), splats):
+        add_content(digest, path)
+    return digest.hexdigest()
+
+
+def _files(folder: Path, capture: Capture) -> list[Path]:
+    """Everything that a capture is on disk."""
+    pictures = [path for photo in capture.photos for path in (photo.file, photo.mask) if path is not None]
+    return [folder / "capture.json", folder / "points.npz", *pictures]
+
+
+def _finished(out: Path, inputs: str) -> Finished | None:
+    """What an earlier run of the same inputs left, if it is whole."""
+    if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, "asset.yaml")):
+        return None
+    try:
+        record = json.loads((out / VERDICT_FILE).read_text())
+        if record.pop("inputs") != inputs:
+            return None
+        return Finished(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
+    except (ValueError, KeyError, TypeError, OSError):
+        return None

@@ -1,0 +1,217 @@
+"""Bring a mesh that was made elsewhere into the frame of a splat, and measure how far apart the two are.
+
+Tools that reconstruct meshes move the cameras first, so that the object is centred and of size one; the mesh is then
+in that frame, and the inverse of what they did to the cameras takes it back. A drawing (CAD) has a frame and a scale of
+its own and is registered to the surface that the splats show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.mesh_distance import Surface
+from mitsplat.render.layers import render_splats
+from mitsplat.splats import Splats, split_similarity
+
+_OPAQUE = 0.9
+"""Alpha of a pixel that shows a surface and no edge of it."""
+_COARSE_POINTS, _COARSE_STEPS = 400, 12
+_FINE_STEPS = 40
+_FINALISTS = 3
+_TRIM = 0.9
+"""Share of the points, the nearest ones, that a registration listens to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where a mesh belongs.
+
+    Attributes:
+        splats_from_mesh: Similarity transform, shape (4, 4).
+        scale: Its scale.
+        residual: Median distance of the splats' surface from the moved mesh, as a share of its diagonal.
+    """
+
+    splats_from_mesh: Float64Array
+    scale: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How far a mesh is from the surface that splats show, as shares of the mesh's diagonal.
+
+    Attributes:
+        shift: Length of the translation that would bring them together best.
+        spread: Median distance that is between them.
+    """
+
+    shift: float
+    spread: float
+
+
+def surface_points(splats: Splats, cameras: Sequence[Camera], *, count: int = 4000, seed: int = 0) -> Float64Array:
+    """Points (M, 3), at most ``count``, on the surface of splats as cameras see it: where half of the light is lost.
+
+    Raises:
+        InputError: If no camera sees an opaque pixel.
+    """
+    points = []
+    for camera in cameras:
+        layers = render_splats(splats, camera, quality="fast")
+        y, x = np.nonzero((layers.alpha > _OPAQUE) & (layers.depth > 0))
+        slopes = camera.ray_slopes(np.stack([x + 0.5, y + 0.5], axis=1))
+        local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * layers.depth[y, x, None]
+        points.append(local @ camera.world_from_camera[:3, :3].T + camera.centre)
+    found: Float64Array = np.concatenate([np.zeros((0, 3)), *points])
+    if not len(found):
+        raise InputError("the splats show no opaque surface to the cameras")
+    if len(found) > count:
+        found = found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
+    return found
+
+
+def invert_transform(path: Path) -> Float64Array:
+    """Inverse of the similarity that a text file holds, 3 x 4 or 4 x 4 numbers, as a (4, 4) matrix.
+
+    Raises:
+        InputError: If the file cannot be read or holds no similarity transform.
+    """
+    try:
+        matrix = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise InputError(f"{path}: must hold 3 or 4 rows of 4 numbers ({error})") from error
+    if matrix.shape == (3, 4):
+        matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+    if matrix.shape != (4, 4) or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise InputError(f"{path}: must be an affine 3 x 4 or 4 x 4 matrix (got shape {matrix.shape})")
+    try:
+        split_similarity(matrix)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
+    """Register a mesh of any frame and scale to points (N, 3) of the object's surface, of which parts may be missing.
+
+    Iterative closest points (Besl and McKay 1992) with scale, started from the 24 ways in which principal axes can be
+    matched, and finished by Gauss-Newton steps on the distances from the nearest planes (Chen and Medioni 1992).
+
+    Raises:
+        InputError: If there are fewer than 100 points.
+    """
+    if len(points) < 100:
+        raise InputError(f"a registration needs at least 100 points of the splats' surface (got {len(points)})")
+    surface = Surface(mesh)
+    rng = np.random.default_rng(0)
+    few = points[rng.choice(len(points), min(_COARSE_POINTS, len(points)), replace=False)]
+    samples, _ = trimesh.sample.sample_surface(mesh, _COARSE_POINTS, seed=0)
+    starts: list[tuple[float, int, Float64Array]] = []
+    for start in _starts(few, samples):
+        found = _procrustes_steps(surface, few, start, _COARSE_STEPS)
+        starts.append((_two_sided(surface, samples, few, found), len(starts), found))
+    finals: list[tuple[float, int, Float64Array]] = []
+    for _, _, start in sorted(starts)[:_FINALISTS]:
+        found = _plane_steps(surface, points, start, _FINE_STEPS)
+        finals.append((_two_sided(surface, samples, points, found), len(finals), found))
+    _, _, mesh_from_splats = min(finals)
+    distance = surface.nearest(_moved(points, mesh_from_splats))[2]
+    splats_from_mesh = np.asarray(np.linalg.inv(mesh_from_splats), dtype=np.float64)
+    scale = float(np.cbrt(np.linalg.det(splats_from_mesh[:3, :3])))
+    return Alignment(splats_from_mesh, scale, float(np.median(distance) / mesh.scale))
+
+
+def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
+    """How far a mesh is from surface points (N, 3) in the same frame."""
+    nearest, normal, distance = Surface(mesh).nearest(points)
+    near = distance <= np.quantile(distance, _TRIM)
+    gap = np.einsum("nd,nd->n", normal, nearest - points)
+    # Directions in which the surface can slide along itself stay at zero: the least-squares solution of least norm.
+    shift, *_ = np.linalg.lstsq(normal[near], gap[near], rcond=1e-3)
+    return Offset(float(np.linalg.norm(shift) / mesh.scale), float(np.median(distance) / mesh.scale))
+
+
+def _moved(points: Float64Array, matrix: Float64Array) -> Float64Array:
+    moved: Float64Array = points @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
+
+
+def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
+    """Transforms that match centres, sizes and, in every proper way, the principal axes of two sets of points."""
+    frames = []
+    for cloud in (points, samples):
+        middle = cloud.mean(axis=0)
+        axes = np.linalg.svd(cloud - middle, full_matrices=False)[2].T
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        frames.append((middle, axes, float(np.sqrt(((cloud - middle) ** 2).sum(axis=1).mean()))))
+    (from_middle, from_axes, from_size), (to_middle, to_axes, to_size) = frames
+    starts = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        turn = np.eye(3)[list(order)] * signs
+        if np.linalg.det(turn) < 0:
+            continue
+        start = np.eye(4)
+        start[:3, :3] = to_size / from_size * to_axes @ turn @ from_axes.T
+        start[:3, 3] = to_middle - start[:3, :3] @ from_middle
+        starts.append(start)
+    return starts
+
+
+def _matched(
+    surface: Surface, points: Float64Array, matrix: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray]:
+    """Moved points, what is nearest to them on the surface and its normals, and which are near enough to count."""
+    moved = _moved(points, matrix)
+    nearest, normal, distance = surface.nearest(moved)
+    return moved, nearest, normal, distance <= np.quantile(distance, _TRIM)
+
+
+def _procrustes_steps(surface: Surface, points: Float64Array, matrix: Float64Array, steps: int) -> Float64Array:
+    for _ in range(steps):
+        moved, nearest, _, near = _matched(surface, points, matrix)
+        step, *_ = trimesh.registration.procrustes(moved[near], nearest[near], reflection=False)
+        matrix = step @ matrix
+    return matrix
+
+
+def _plane_steps(surface: Surface, points: Float64Array, matrix: Float64Array, steps: int) -> Float64Array:
+    """Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t."""
+    for _ in range(steps):
+        moved, nearest, normal, near = _matched(surface, points, matrix)
+        middle = moved.mean(axis=0)
+        arm, normal, gap = (moved - middle)[near], normal[near], (nearest - moved)[near]
+        size = float(np.linalg.norm(arm, axis=1).mean())
+        arm, gap = arm / size, gap / size
+        rows = np.concatenate([np.cross(arm, normal), np.einsum("nd,nd->n", arm, normal)[:, None], normal], axis=1)
+        wanted = np.einsum("nd,nd->n", gap, normal)
+        # Directions in which the surface slides along itself, as around the axis of a turned part, stay as they are.
+        update = np.linalg.pinv(rows.T @ rows, rcond=1e-5, hermitian=True) @ (rows.T @ wanted)
+        turn = Rotation.from_rotvec(update[:3]).as_matrix() * (1 + float(np.clip(update[3], -0.1, 0.1)))
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = turn, middle - turn @ middle + size * update[4:]
+        matrix = step @ matrix
+        if np.abs(update).max() < 1e-6:
+            break
+    return matrix
+
+
+def _two_sided(surface: Surface, samples: Float64Array, points: Float64Array, matrix: Float64Array) -> float:
+    """Mean distance both ways: a cloud that shrank into a corner is near the mesh, but the mesh not near the cloud."""
+    moved = _moved(points, matrix)
+    there, back = surface.nearest(moved)[2], KDTree(moved).query(samples)[0]
+    trimmed = [float(np.sort(d)[: int(0.8 * len(d))].mean()) for d in (there, back)]
+    return sum(trimmed)

@@ -1,0 +1,227 @@
+"""Take one object out of the splats of a whole photographed place.
+
+The projection of masks is the published method's: a Gaussian belongs to the object if what the photographs show of it
+falls inside their masks. What a photograph shows of a Gaussian is its blended weight, ``sum over pixels of T a``, so
+that what is hidden in a view has no say in it. Needles and floaters, which masks cannot tell from the object, are
+removed after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.quality import Quality
+from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.spherical_harmonics import sh_basis
+from mitsplat.splats import Splats
+
+INSIDE = 0.5
+"""Least share of a Gaussian's visible weight that must fall inside the masks."""
+SEEN = 0.05
+"""Visible weight, summed over all views [px], below which nobody has seen a Gaussian."""
+NEEDLE = 8.0
+"""Longest over second longest standard deviation of a needle."""
+NEEDLE_TIP = 2.0
+"""Standard deviations from a needle's middle to its tips, which must not stick out of the masks."""
+TIP_MARGIN = 1.5
+"""How far a tip may stick out [px]."""
+TOUCH = 2.5
+"""Distance in standard deviations of the larger of two Gaussians up to which they touch."""
+SMALLEST_PART = 0.02
+"""Share of the object's visible weight that a part which touches no other must have to be no floater."""
+
+_QUALITY = Quality(alpha_min=2e-3, transmittance_min=1e-3, sh_degree=0)
+_NEIGHBOURS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class MaskedView:
+    """A camera and the mask of the object in its picture.
+
+    Attributes:
+        camera: From where.
+        mask: Share of each pixel that is the object, (H, W) in [0, 1].
+    """
+
+    camera: Camera
+    mask: Float32Array
+
+
+@dataclass(frozen=True, eq=False)
+class Isolation:
+    """An object's splats, and what was removed around them.
+
+    Attributes:
+        splats: Those that are left.
+        kept: Which these are, shape (N,).
+        unseen: Number of Gaussians that no view shows.
+        outside: Number of those seen mostly outside the masks.
+        needles: Number of elongated ones whose tips stick out of the masks.
+        floaters: Number of those in parts that touch nothing else.
+        lost: Share of the alpha inside the masks that went with what was removed.
+    """
+
+    splats: Splats
+    kept: BoolArray
+    unseen: int
+    outside: int
+    needles: int
+    floaters: int
+    lost: float
+
+
+def visible_weights(splats: Splats, view: MaskedView) -> Float64Array:
+    """Blended weight of each Gaussian inside and outside the mask, shape (N, 2) [px].
+
+    The picture is linear in the colours: the derivative of ``sum of mask * red`` with respect to the red of a Gaussian
+    is its weight ``T a`` summed over the mask, and green serves for what is outside.
+
+    Raises:
+        ValueError: If the mask is not of the camera's size.
+    """
+    if view.mask.shape != (view.camera.height, view.camera.width):
+        raise ValueError(f"a mask must be of its camera's {view.camera.height} x {view.camera.width} px")
+    return _Weigher(splats)(view)
+
+
+def isolate_object(
+    splats: Splats,
+    views: Sequence[MaskedView],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Isolation:
+    """The Gaussians of the object that the masks show.
+
+    Args:
+        splats: Object and surroundings.
+        views: All around the object.
+        progress: Told after every view how many of how many are done.
+
+    Raises:
+        InputError: If there are no views, or nothing is left.
+    """
+    if not views:
+        raise InputError("masks are needed to isolate an object (got no view with one)")
+    weigher = _Weigher(splats)
+    weights = np.zeros((len(splats), 2))
+    for done, view in enumerate(views, 1):
+        weights += weigher(view)
+        if progress is not None:
+            progress(done, len(views))
+    total = weights.sum(axis=1)
+    seen = total > SEEN
+    inside = seen & (weights[:, 0] >= INSIDE * total)
+    needles = inside & _needles(splats, views)
+    body = np.flatnonzero(inside & ~needles)
+    floating = body[find_floaters(splats.select(body), weights[body, 0])]
+    kept = inside & ~needles
+    kept[floating] = False
+    if not kept.any():
+        raise InputError("no Gaussian lies inside the masks: are these masks of this capture?")
+    isolated = splats.select(kept)
+    return Isolation(
+        splats=isolated,
+        kept=kept,
+        unseen=int((~seen).sum()),
+        outside=int((seen & ~inside).sum()),
+        needles=int(needles.sum()),
+        floaters=len(floating),
+        lost=_lost_share(splats, isolated, views),
+    )
+
+
+class _Weigher:
+    """:func:`visible_weights` of one cloud that is uploaded once."""
+
+    def __init__(self, splats: Splats) -> None:
+        ensure_variant()
+        fields = (splats.means, splats.quats, splats.scales, splats.opacities)
+        self._count = len(splats)
+        self._inputs = [mi.Float(np.ravel(values)) for values in fields]
+
+    def __call__(self, view: MaskedView) -> Float64Array:
+        from mitsplat.plugins.backward import pack_cloud, render_differentiable
+        from mitsplat.plugins.splat_proxy import view_of
+
+        colours = dr.zeros(mi.Float, 3 * self._count)
+        dr.enable_grad(colours)
+        cloud = pack_cloud(*self._inputs, colours, 1)
+        rgb, _ = render_differentiable(cloud, view_of(make_sensor(view.camera)), _QUALITY)
+        mask = mi.Float(np.ravel(view.mask).astype(np.float32))
+        dr.backward(dr.sum(rgb[0] * mask) + dr.sum(rgb[1] * (1 - mask)))
+        constant = float(sh_basis((0.0, 0.0, 1.0), 0).ravel()[0])
+        return np.array(dr.grad(colours), dtype=np.float64).reshape(-1, 3)[:, :2] / constant
+
+
+def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
+    """Elongated Gaussians one of whose tips more than one view sees outside its mask."""
+    import cv2
+
+    ordered = np.sort(splats.scales.astype(np.float64), axis=1)
+    needle = np.flatnonzero(ordered[:, 2] > NEEDLE * ordered[:, 1])
+    result = np.zeros(len(splats), dtype=bool)
+    if not len(needle):
+        return result
+    axis = np.argmax(splats.scales[needle], axis=1)
+    frames = Rotation.from_quat(splats.quats[needle]).as_matrix()
+    reach = frames[np.arange(len(needle)), :, axis] * (NEEDLE_TIP * ordered[needle, 2])[:, None]
+    tips = np.concatenate([splats.means[needle] + reach, splats.means[needle] - reach])
+    outside: Int64Array = np.zeros(len(tips), dtype=np.int64)
+    for view in views:
+        away = cv2.distanceTransform((view.mask < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        outside += sample_nearest(away, view.camera, tips, missing=0.0) > TIP_MARGIN
+    result[needle] = (outside.reshape(2, -1) > 1).any(axis=0)
+    return result
+
+
+def sample_nearest(
+    image: npt.NDArray[Any], camera: Camera, points: npt.NDArray[np.floating], missing: float
+) -> npt.NDArray[Any]:
+    """The pixels that world points (N, 3) fall on, and ``missing`` for those beside the picture or behind it."""
+    pixels, _ = camera.project(points)
+    known = np.isfinite(pixels[:, 0])
+    x, y = np.floor(np.where(known[:, None], pixels, -1)).clip(-1, 1 << 30).astype(np.int64).T
+    known &= (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    values = np.full(len(pixels), missing, dtype=np.float64)
+    values[known] = image[y[known], x[known]]
+    return values
+
+
+def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:
+    """Indices of Gaussians in groups that touch no other and have little of the visible weight (N,)."""
+    count = len(splats)
+    if count < 2:
+        return np.zeros(0, dtype=np.int64)
+    sigma = splats.scales.max(axis=1).astype(np.float64)
+    distance, other = KDTree(splats.means).query(splats.means, k=min(_NEIGHBOURS + 1, count))
+    touching = distance <= TOUCH * np.maximum(sigma[:, None], sigma[other])
+    row = np.broadcast_to(np.arange(count)[:, None], other.shape)[touching]
+    graph = coo_array((np.ones(len(row)), (row, other[touching])), shape=(count, count))
+    _, group = connected_components(graph, directed=False)
+    share = np.bincount(group, weights=weight) / max(float(weight.sum()), 1e-30)
+    return np.flatnonzero(share[group] < SMALLEST_PART)
+
+
+def _lost_share(before: Splats, after: Splats, views: Sequence[MaskedView]) -> float:
+    """Share of the alpha inside the masks that is missing after."""
+    shown = missing = 0.0
+    alphas = [render_splats(before, view.camera, quality="fast").alpha for view in views]
+    for view, alpha in zip(views, alphas, strict=True):
+        left = render_splats(after, view.camera, quality="fast").alpha
+        shown += float((view.mask * alpha).sum())
+        missing += float((view.mask * np.maximum(alpha - left, 0)).sum())
+    return missing / max(shown, 1e-30)

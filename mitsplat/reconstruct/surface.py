@@ -1,0 +1,336 @@
+"""Splats and masks to a closed surface: the visual hull intersected with a fusion of the splats' depth.
+
+The hull (Laurentini 1994) is the set of points that every mask shows as object; it closes the surface where no
+photograph looks, and knows nothing of hollows. Depth that the splats are rendered to is fused into a truncated signed
+distance (Curless and Levoy 1996), which cuts the hollows out, and only as deep as the views agree on. Both are
+distances on one grid, positive inside: their minimum is the intersection, and marching cubes (Lorensen and Cline 1987)
+takes its zero for the surface. Below an object that stands on a table the hull sags, because no camera looks there: the
+table bounds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import drjit as dr
+import manifold3d
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.ndimage import binary_erosion, gaussian_filter
+from skimage.measure import marching_cubes
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.splats import Splats
+
+_OPAQUE = 0.5
+"""Alpha from which a pixel shows the splats' surface."""
+_BULK = 0.002
+"""Share of the Gaussians at either end of an axis that do not decide where the grid is."""
+_MARGIN = 0.08
+"""Room around the bulk of the Gaussians, as a share of its longest extent."""
+_SEEN_BY = 0.035
+"""Share of the views that look towards a cell which must see it: a few look through gaps between Gaussians."""
+_BEHIND = 2.0
+"""Truncations behind the seen surface up to which a view says that a cell is inside. With one, errors of depth draw the
+surface inwards, because all of the space in front counts; without a limit, hollows close that some views miss."""
+_DOUBT = 0.5
+"""Standard deviations between views by which depth must exceed the hull to cut it: masks err less than depths."""
+_FAR = 1e6
+_APART = 0.02
+"""Share of the way to its neighbours by which a vertex leaves the place that it shares with another."""
+_ROUNDS_APART = 8
+"""Times that this is tried: a vertex may move to where another one is."""
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """How a surface is reconstructed.
+
+    Attributes:
+        voxels: Grid cells along the longest extent.
+        truncation: Depth behind the surface that one view speaks for, in cells.
+        blur: Standard deviation of the smoothing of the distances, in cells.
+        dissent: Views that may show a point as background and be overruled: there are errors in masks.
+        faces: Most faces of the result.
+    """
+
+    voxels: int = 192
+    truncation: float = 3.0
+    blur: float = 0.5
+    dissent: int = 2
+    faces: int = 10_000
+
+    def __post_init__(self) -> None:
+        if not 16 <= self.voxels <= 512:
+            raise InputError(f"voxels must be from 16 to 512 (got {self.voxels})")
+        if self.faces < 100:
+            raise InputError(f"faces must be at least 100 (got {self.faces})")
+        if not 0 <= self.dissent <= 3:
+            raise InputError(f"dissent must be from 0 to 3 (got {self.dissent})")
+
+
+def reconstruct_surface(
+    splats: Splats,
+    cameras: Sequence[Camera],
+    masks: Sequence[Float32Array] | None = None,
+    settings: SurfaceSettings = SurfaceSettings(),
+    *,
+    floor: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> trimesh.Trimesh:
+    """Surface of the splats in their own frame.
+
+    Args:
+        splats: One object, isolated; or surroundings.
+        cameras: Around it.
+        masks: Share of each pixel of their pictures that is the object, (H, W) each; None leaves the hull out, as
+            surroundings need.
+        settings: Resolution and size.
+        floor: Height z of the table that the object stands on, if it does.
+        progress: Told after every view how many of how many are done.
+
+    Returns:
+        A watertight mesh where masks close it.
+
+    Raises:
+        InputError: If there are no cameras or splats, or nothing that all masks show as object.
+    """
+    if not cameras or not len(splats):
+        raise InputError(f"a surface needs cameras and splats (got {len(cameras)} and {len(splats)})")
+    grid = _Grid.around(splats, settings)
+    masked = masks is not None
+    state = grid.start(settings.dissent + 1 if masked else 0)
+    for number, camera in enumerate(cameras):
+        grid.fuse(state, splats, camera, None if masks is None else masks[number])
+        if progress is not None:
+            progress(number + 1, len(cameras))
+    distance, known = grid.combine(state, settings.blur)
+    if floor is not None:
+        distance = np.minimum(distance, grid.heights() - np.float32(floor))
+    # A border outside closes the surface at the edge of the grid.
+    padded, known = np.pad(distance, 1, constant_values=-grid.truncation), np.pad(known, 1, constant_values=masked)
+    try:
+        triangulate: Any = marching_cubes
+        vertices, faces, _, _ = triangulate(padded, 0.0, gradient_direction="ascent", mask=known)
+    except (ValueError, RuntimeError):
+        raise InputError(
+            "no surface lies inside the masks of all views: do masks, cameras and splats belong together?"
+        ) from None
+    surface = trimesh.Trimesh(grid.low + (vertices - 0.5) * grid.cell, faces)
+    if not masked:
+        return simplify_surface(surface, settings.faces)
+    return _untouched(_outer_shell(simplify_surface(_outer_shell(surface), settings.faces)))
+
+
+def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
+    """At most ``faces`` faces by quadric error (Garland and Heckbert 1997); what is watertight stays so.
+
+    Collapses that pinch a closed surface are undone by a simplification that keeps it a manifold, to within a tolerance
+    that grows until the faces are few enough, or as few as the shape has at a tenth of its size. Where a closed surface
+    then touches itself it is drawn apart, so that it is one also for readers that weld vertices.
+    """
+    if len(surface.faces) <= faces:
+        return surface
+    simple = surface.simplify_quadric_decimation(face_count=faces)
+    if not surface.is_watertight:
+        return simple
+    if not simple.is_volume:
+        vertices, triangles = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
+        solid = manifold3d.Manifold(manifold3d.Mesh(vertices, triangles))
+        tolerance = 1e-4 * surface.scale
+        while solid.num_tri() > faces and tolerance < 0.1 * surface.scale:
+            solid = solid.simplify(tolerance)
+            tolerance *= 1.1
+        mesh = solid.to_mesh()
+        simple = trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
+    return _untouched(simple)
+
+
+def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed surface whose vertices all lie apart in single precision, as files store them.
+
+    Vertices in one place belong to sheets that touch there: each moves a little towards its own neighbours.
+    """
+    vertices = np.array(surface.vertices)
+    one, other = surface.edges.T
+    counts = np.bincount(one, minlength=len(vertices))
+    for _ in range(_ROUNDS_APART):
+        _, place, shared = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True, return_counts=True)
+        touching = shared[place] > 1
+        if not touching.any():
+            break
+        # An edge of a closed surface is listed once in either direction.
+        sums = np.column_stack([np.bincount(one, vertices[other, k], len(vertices)) for k in range(3)])
+        middle = sums[touching] / counts[touching, None]
+        vertices[touching] += _APART * (middle - vertices[touching])
+    return trimesh.Trimesh(vertices, surface.faces, process=False)
+
+
+def _outer_shell(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The largest closed part: without crumbs beside the object and cavities inside, which nobody has seen."""
+    parts = surface.split(only_watertight=True)
+    return max(parts, key=lambda part: float(part.volume), default=surface)
+
+
+@dataclass(eq=False)
+class _State:
+    """Values of every cell.
+
+    Attributes:
+        hull: The smallest distances to silhouettes found so far [m], ascending; empty without masks.
+        total: Sum of the truncated distances behind the seen surface [m].
+        squares: Sum of their squares [m^2].
+        count: Number of views in these.
+        towards: Number of views that see a surface in the cell's direction.
+    """
+
+    hull: list[Any]
+    total: Any
+    squares: Any
+    count: Any
+    towards: Any
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Cubic cells; the array's axes are x, y, z.
+
+    Attributes:
+        low: Corner of the grid [m], shape (3,).
+        cell: Edge of a cell [m].
+        shape: Number of cells along x, y, z.
+        truncation: Largest distance that is told apart [m].
+    """
+
+    low: Float64Array
+    cell: float
+    shape: tuple[int, int, int]
+    truncation: float
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.shape))
+
+    @classmethod
+    def around(cls, splats: Splats, settings: SurfaceSettings) -> _Grid:
+        low, high = np.quantile(splats.means.astype(np.float64), (_BULK, 1 - _BULK), axis=0)
+        margin = _MARGIN * float((high - low).max()) + 2 * float(np.median(splats.scales.max(axis=1)))
+        low, high = low - margin, high + margin
+        cell = float((high - low).max()) / settings.voxels
+        shape = np.maximum(np.ceil((high - low) / cell).astype(int), 1)
+        return cls(low, cell, (int(shape[0]), int(shape[1]), int(shape[2])), settings.truncation * cell)
+
+    def heights(self) -> Float32Array:
+        """Height z of the middles of the layers of cells, shape (cells along z,)."""
+        return np.asarray(self.low[2] + self.cell * (np.arange(self.shape[2]) + 0.5), dtype=np.float32)
+
+    def start(self, silhouettes: int) -> _State:
+        ensure_variant()
+        nothing = dr.zeros(mi.Float, self.count)
+        return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], *[nothing] * 4)
+
+    def fuse(self, state: _State, splats: Splats, camera: Camera, mask: Float32Array | None) -> None:
+        """Add what one view says."""
+        from mitsplat.plugins.splat_proxy import view_of
+
+        layers = render_splats(splats, camera, quality="fast")
+        depth = np.where(layers.alpha > _OPAQUE, layers.depth, 0.0).astype(np.float32)
+        view = view_of(make_sensor(camera))
+        x, y, z = self._in_camera(camera)
+        ahead = z > view.near_plane
+        u, v = x / z, y / z
+        if camera.distortion:
+            u, v, _ = view.distort(u, v)
+        own = view._opaque
+        pixel = mi.Point2f(u * own["fx"] + own["cx"], v * own["fy"] + own["cy"])
+        width, height = dr.opaque(mi.Float, camera.width), dr.opaque(mi.Float, camera.height)
+        ahead &= (pixel.x >= 0) & (pixel.y >= 0) & (pixel.x < width) & (pixel.y < height)
+        span = dr.opaque(mi.Float, self.truncation)
+        if mask is not None:
+            silhouette = _bilinear(_signed_distance(mask), camera, pixel, ahead)[0]
+            away = dr.select(ahead, silhouette * z / own["fx"], _FAR)
+            for k, held in enumerate(state.hull):
+                state.hull[k], away = dr.minimum(held, away), dr.maximum(held, away)
+            dr.eval(state.hull)
+        seen, low, high = _bilinear(depth, camera, pixel, ahead)
+        # Between a surface and what lies behind its edge nothing is interpolated.
+        behind = z - seen
+        valid = ahead & (low > 0) & (high - low < span) & (behind < _BEHIND * span)
+        behind = dr.select(valid, dr.clip(behind, -span, span), 0)
+        state.total = state.total + behind
+        state.squares = state.squares + dr.square(behind)
+        state.count = state.count + dr.select(valid, 1, 0)
+        state.towards = state.towards + dr.select(ahead & (low > 0), 1, 0)
+        dr.eval(state.total, state.squares, state.count, state.towards)
+
+    def combine(self, state: _State, blur: float) -> tuple[Float32Array, BoolArray]:
+        """Distance to the surface of every cell [m], positive inside, and whether it is known, of shape ``shape``."""
+        count = np.array(state.count)
+        mean, squares = (np.array(sums) / np.maximum(count, 1) for sums in (state.total, state.squares))
+        # What nobody looked at is inside the object as far as the hull reaches.
+        known = count > (_SEEN_BY * np.array(state.towards) if state.hull else 0)
+        distance = np.where(known, mean, self.truncation)
+        if state.hull:
+            distance = distance + _DOUBT * np.sqrt(np.maximum(squares - mean * mean, 0))
+            distance = np.minimum(distance, np.clip(np.array(state.hull[-1]), -self.truncation, self.truncation))
+            known = np.ones_like(known)
+        # Marching cubes looks at all eight corners, and the blur at neighbours.
+        known = binary_erosion(known.reshape(self.shape), np.ones((3, 3, 3)), border_value=1)
+        shaped = distance.reshape(self.shape).astype(np.float32)
+        smooth = gaussian_filter(shaped, blur, mode="nearest") if blur > 0 else shaped
+        return smooth, known
+
+    def _in_camera(self, camera: Camera) -> tuple[Any, Any, Any]:
+        """Camera coordinates of the middles of all cells [m]."""
+        index = dr.arange(mi.UInt32, self.count)
+        nz, nyz = self.shape[2], self.shape[1] * self.shape[2]
+        i, rest = index // nyz, index % nyz
+        j, k = rest // nz, rest % nz
+        pose = camera.camera_from_world
+        step = pose[:3, :3] * self.cell
+        corner = pose[:3, :3] @ (self.low + 0.5 * self.cell) + pose[:3, 3]
+        cells = mi.Float(i), mi.Float(j), mi.Float(k)
+        found = []
+        for row in range(3):
+            value = dr.opaque(mi.Float, float(corner[row]))
+            for column in range(3):
+                value = dr.fma(dr.opaque(mi.Float, float(step[row, column])), cells[column], value)
+            found.append(value)
+        return found[0], found[1], found[2]
+
+
+def _signed_distance(mask: Float32Array) -> Float32Array:
+    """Distance of every pixel's centre to the outline [px], positive inside the mask."""
+    inside = (mask >= 0.5).astype(np.uint8)
+    if not inside.any():
+        return np.full(mask.shape, -_FAR, dtype=np.float32)
+    if inside.all():
+        return np.full(mask.shape, _FAR, dtype=np.float32)
+    within, without = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (inside, 1 - inside))
+    # The transform measures to the centres of the pixels on the other side, half a pixel beyond the outline.
+    return np.where(inside > 0, within - 0.5, 0.5 - without).astype(np.float32)
+
+
+def _bilinear(image: Float32Array, camera: Camera, pixel: Any, active: Any) -> tuple[Any, Any, Any]:
+    """Interpolated value at pixel positions, and the least and largest of the four that it comes from."""
+    flat = mi.Float(np.ravel(image))
+    width = dr.opaque(mi.UInt32, camera.width)
+    last_x, last_y = dr.opaque(mi.Float, camera.width - 1), dr.opaque(mi.Float, camera.height - 1)
+    x = dr.clip(pixel.x - 0.5, 0, last_x)
+    y = dr.clip(pixel.y - 0.5, 0, last_y)
+    x0, y0 = dr.floor(x), dr.floor(y)
+    x1, y1 = dr.minimum(x0 + 1, last_x), dr.minimum(y0 + 1, last_y)
+
+    def at(column: Any, row: Any) -> Any:
+        return dr.gather(mi.Float, flat, mi.UInt32(row) * width + mi.UInt32(column), active)
+
+    a, b, c, d = at(x0, y0), at(x1, y0), at(x0, y1), at(x1, y1)
+    value = dr.lerp(dr.lerp(a, b, x - x0), dr.lerp(c, d, x - x0), y - y0)
+    return value, dr.minimum(dr.minimum(a, b), dr.minimum(c, d)), dr.maximum(dr.maximum(a, b), dr.maximum(c, d))

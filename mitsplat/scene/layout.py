@@ -1,0 +1,113 @@
+"""Where the objects of a scene lie, and what was measured of that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mitsplat.arrays import Float64Array
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One object of a layout.
+
+    Attributes:
+        id: Instance id, from 1.
+        asset: Index into the scene's assets.
+        class_index: Index into the scene's class names.
+        world_from_object: Rigid transform of the asset's frame, shape (4, 4).
+    """
+
+    id: int
+    asset: int
+    class_index: int
+    world_from_object: Float64Array
+
+
+@dataclass(frozen=True)
+class RestCertificate:
+    """What was measured of a layout at rest; penetration and gap on the true meshes, not on their convex pieces.
+
+    Attributes:
+        rested: Whether everything was within its limit.
+        inside: Whether no object left the scene's enclosure, or what else there is to lie on.
+        overflow: Whether any contact was dropped for want of room.
+        time_to_rest: Simulated time after which every object stayed where it was [s].
+        max_speed, max_spin: Residual motion of the fastest object a second later [m/s, rad/s].
+        surface_motion: Farthest that a point of any surface moved in that second [m].
+        collider_penetration: Depth of the deepest object in a collider [m].
+        pair_penetration: Depth of the deepest object in another [m].
+        support_gap: Distance of the most isolated object from what is nearest to it [m]; 0 if all touch.
+        standoff: How far the convex pieces of any object stand off its true mesh [m], which bounds the gaps.
+        attempts: Draws of poses that it took.
+        refused: Why each earlier draw was refused.
+    """
+
+    rested: bool
+    inside: bool
+    overflow: bool
+    time_to_rest: float
+    max_speed: float
+    max_spin: float
+    surface_motion: float
+    collider_penetration: float
+    pair_penetration: float
+    support_gap: float
+    standoff: float
+    attempts: int
+    refused: tuple[str, ...] = ()
+
+
+NOTHING_TO_REST = RestCertificate(
+    rested=True,
+    inside=True,
+    overflow=False,
+    time_to_rest=0.0,
+    max_speed=0.0,
+    max_spin=0.0,
+    surface_motion=0.0,
+    collider_penetration=0.0,
+    pair_penetration=0.0,
+    support_gap=0.0,
+    standoff=0.0,
+    attempts=0,
+)
+"""Of a layout that physics had no part in: one without objects, or one whose poses are made up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where the objects of one layout lie."""
+
+    index: int
+    instances: tuple[Instance, ...]
+    certificate: RestCertificate
+
+    def to_json(self) -> dict[str, Any]:
+        """The layout as JSON values; floats survive the round trip exactly."""
+        return {
+            "index": self.index,
+            "instances": [
+                {**vars(instance), "world_from_object": instance.world_from_object.tolist()}
+                for instance in self.instances
+            ],
+            "certificate": {**asdict(self.certificate), "refused": list(self.certificate.refused)},
+        }
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Layout:
+        """The layout that :meth:`to_json` described."""
+        return cls(
+            index=stored["index"],
+            instances=tuple(
+                Instance(**{**entry, "world_from_object": np.array(entry["world_from_object"], dtype=np.float64)})
+                for entry in stored["instances"]
+            ),
+            certificate=RestCertificate(
+                **{**stored["certificate"], "refused": tuple(stored["certificate"]["refused"])}
+            ),
+        )

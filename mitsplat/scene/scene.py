@@ -1,0 +1,426 @@
+"""A scene ready to be settled and rendered, and the plan of each of its frames.
+
+(seed, frame index) decide a plan entirely: every random value has a stream of its own, named by its purpose, so that
+adding one never shifts another, and any worker may plan any frame in any order.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, SupportsIndex
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array
+from mitsplat.asset import Asset, read_mesh
+from mitsplat.camera import Camera, interpolate_poses, look_at_pose
+from mitsplat.errors import InputError
+from mitsplat.file_kinds import refuse_others
+from mitsplat.files import is_inside
+from mitsplat.scene.spec import (
+    AreaLight,
+    Bin,
+    Box,
+    CameraHemisphere,
+    CameraOrbit,
+    CameraPath,
+    CameraSpec,
+    Composite,
+    Enclosure,
+    EnvironmentLight,
+    Intrinsics,
+    LightKey,
+    LightSpec,
+    ObjectPose,
+    ObjectSpec,
+    Output,
+    PointLight,
+    PoseKey,
+    Randomise,
+    Region,
+    SceneSpec,
+    Settle,
+    Shape,
+    SpotLight,
+)
+from mitsplat.scene.untrusted_images import check_image
+from mitsplat.scene.walls import bin_walls, enclosure_walls
+from mitsplat.yaml_input import key_place, load_yaml
+
+__all__ = [
+    "AreaLight",
+    "Bin",
+    "Box",
+    "CameraHemisphere",
+    "CameraOrbit",
+    "CameraPath",
+    "CameraSpec",
+    "Composite",
+    "Enclosure",
+    "EnvironmentLight",
+    "FramePlan",
+    "Intrinsics",
+    "LightKey",
+    "LightSpec",
+    "ObjectPose",
+    "ObjectSpec",
+    "Output",
+    "PointLight",
+    "PoseKey",
+    "Randomise",
+    "Region",
+    "Scene",
+    "SceneSpec",
+    "Settle",
+    "Shape",
+    "SpotLight",
+    "bin_walls",
+    "layout_of",
+    "load_scene",
+    "plan_frame",
+    "random_stream",
+    "scene_json_schema",
+]
+
+
+_DRAWN = (
+    *("exposure", "vignetting", "motion_blur", "motion_angle", "iso"),
+    *("white_balance", "hue", "saturation", "jpeg"),
+)
+"""What is drawn anew for every frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene file with everything that it refers to.
+
+    Attributes:
+        spec: What the file says, its enclosure written out as shapes.
+        path: The scene file.
+        environment: The surroundings, or None.
+        assets: Asset of each entry of ``spec.objects``, with its scale and class name applied.
+        shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
+        class_names: Sorted; the position in it is the class index.
+        images: Files of the images that lights name, by those names.
+    """
+
+    spec: SceneSpec
+    path: Path
+    environment: Asset | None
+    assets: tuple[Asset, ...]
+    shape_meshes: tuple[trimesh.Trimesh, ...]
+    class_names: tuple[str, ...]
+    images: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def num_frames(self) -> int:
+        """Layouts times views; frames of one layout are neighbours."""
+        return self.spec.output.layouts * self.spec.output.views
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlan:
+    """Everything about a frame but where its objects came to rest.
+
+    Attributes:
+        index: Index of the frame.
+        layout, view: Index of its layout, and of the view in it.
+        split: Split that the whole layout belongs to.
+        camera: Where the image is taken from.
+        next_camera: Where the layout's next image is taken from, None for its last.
+        lights: Lights as they are in this frame: paths and random factors applied.
+        draws: Random values by name, see :func:`mitsplat.frames.camera_response.develop`.
+        seed: Seed of the pixel noise.
+    """
+
+    index: int
+    layout: int
+    view: int
+    split: Literal["train", "val"]
+    camera: Camera
+    next_camera: Camera | None
+    lights: tuple[LightSpec, ...]
+    draws: dict[str, float]
+    seed: int
+
+
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
+    """Read a scene file and every asset and mesh that it names.
+
+    Args:
+        path: The YAML file.
+        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+        allow_outside: Whether it may name assets, meshes and images outside of its folder.
+
+    Raises:
+        InputError: If the file or something that it names is missing or breaks a rule.
+    """
+    path = Path(path)
+    refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
+    spec = load_yaml(path, SceneSpec, overrides=overrides)
+    if not allow_outside:
+        _confine(spec, path)
+    folder = path.parent
+    images: dict[str, Path] = {}
+    for position, light in enumerate(spec.lights):
+        if isinstance(light, EnvironmentLight) and light.image is not None:
+            images[light.image] = folder / light.image
+            with _blaming(path, "lights", position, "image"):
+                if not images[light.image].is_file():
+                    raise InputError(f"{images[light.image]}: no such file")
+                check_image(images[light.image])
+    environment = None
+    if spec.environment is not None:
+        with _blaming(path, "environment"):
+            environment = _metric(Asset.load(folder / spec.environment))
+    assets = _load_objects(spec, path)
+    shape_meshes = []
+    for position, shape in enumerate(spec.shapes):
+        with _blaming(path, "shapes", position, "mesh"):
+            shape_meshes.append(_shape_mesh(shape, folder))
+    if spec.enclosure is not None:
+        supports = [mesh for shape, mesh in zip(spec.shapes, shape_meshes, strict=True) if shape.collider]
+        if spec.environment_collides and environment is not None and environment.mesh is not None:
+            supports.append(environment.mesh)
+        walls = enclosure_walls(spec.enclosure, spec, assets, supports)
+        shape_meshes += [_shape_mesh(wall, folder) for wall in walls]
+        spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
+    return Scene(
+        spec=spec,
+        path=path,
+        environment=environment,
+        assets=assets,
+        shape_meshes=tuple(shape_meshes),
+        class_names=tuple(sorted({asset.class_name for asset in assets})),
+        images=images,
+    )
+
+
+def _confine(spec: SceneSpec, path: Path) -> None:
+    """Refuse what is named outside of the scene's folder."""
+    named: list[tuple[tuple[str | int, ...], str | None]] = [(("environment",), spec.environment)]
+    named += [(("objects", position, "asset"), entry.asset) for position, entry in enumerate(spec.objects)]
+    named += [(("shapes", position, "mesh"), shape.mesh) for position, shape in enumerate(spec.shapes)]
+    named += [(("lights", i, "image"), getattr(light, "image", None)) for i, light in enumerate(spec.lights)]
+    for keys, name in named:
+        if name is not None and not is_inside(path.parent, name):
+            with _blaming(path, *keys):
+                raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
+
+
+def whole(index: SupportsIndex, name: str) -> int:
+    """An index that an integer of any kind gives.
+
+    Raises:
+        InputError: If it is something else, such as text.
+    """
+    try:
+        return operator.index(index)
+    except TypeError:
+        raise InputError(f"{name} must be a whole number (got {index!r})") from None
+
+
+def layout_of(scene: Scene, index: int) -> int:
+    """Layout that frame ``index`` shows."""
+    index = whole(index, "frame")
+    if not 0 <= index < scene.num_frames:
+        raise InputError(f"{scene.path}: frame must be in 0 to {scene.num_frames - 1} (got {index})")
+    return index // scene.spec.output.views
+
+
+def plan_frame(scene: Scene, index: int) -> FramePlan:
+    """The plan of frame ``index``, from (seed, index) alone."""
+    index = whole(index, "frame")
+    spec, layout = scene.spec, layout_of(scene, index)
+    view = index - layout * spec.output.views
+    time = view / max(1, spec.output.views - 1)
+    ranges = spec.randomise
+    return FramePlan(
+        index=index,
+        layout=layout,
+        view=view,
+        split=_split(layout, spec.output.validation),
+        camera=_camera(spec, view, index),
+        next_camera=_camera(spec, view + 1, index + 1) if view + 1 < spec.output.views else None,
+        lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
+        draws={
+            name: float(random_stream(spec.seed, name, index).uniform(*bounds))
+            for name in _DRAWN
+            if (bounds := (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)) is not None
+        },
+        seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
+    )
+
+
+def random_stream(seed: int, purpose: str, index: int) -> np.random.Generator:
+    """Random numbers for one purpose in one frame or layout, independent of those for every other."""
+    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), index]))
+
+
+def scene_json_schema() -> dict[str, Any]:
+    """JSON Schema of a scene file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
+
+
+@contextmanager
+def _blaming(path: Path, *keys: str | int) -> Iterator[None]:
+    """Begin the sentence of an InputError with the key of the scene file that led to it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{key_place(path, keys)}: {error}") from error
+
+
+def _load_objects(spec: SceneSpec, path: Path) -> tuple[Asset, ...]:
+    """Asset of each entry; entries that differ in nothing but count and class share its arrays."""
+    loaded: dict[tuple[str, float | None, float], Asset] = {}
+    assets = []
+    for position, entry in enumerate(spec.objects):
+        key = (entry.asset, entry.size, entry.scale)
+        if key not in loaded:
+            with _blaming(path, "objects", position, "asset"):
+                asset = Asset.load(path.parent / entry.asset)
+                asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
+                loaded[key] = asset if entry.scale == 1.0 else asset.scaled(entry.scale)
+                _check_fit(loaded[key], spec.region)
+        assets.append(replace(loaded[key], class_name=entry.class_name or loaded[key].class_name))
+    return tuple(assets)
+
+
+def _metric(asset: Asset) -> Asset:
+    """The asset, unless nothing says how large it is."""
+    if asset.units == "unknown":
+        raise InputError(
+            f"asset {asset.name!r} is of unknown units: give its longest extent [m] as size, here or in asset.yaml"
+        )
+    return asset
+
+
+def _check_fit(asset: Asset, region: Region) -> None:
+    """Refuse an object that physics cannot move, or that could not lie in the region on its largest side."""
+    if asset.kind != "object" or asset.mesh is None:
+        raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh to be dropped")
+    footprint = np.sort(asset.mesh.extents)[1:]
+    space = np.sort(np.subtract(region.max, region.min)[:2])
+    if (footprint > space).any():
+        raise InputError(
+            f"asset {asset.name!r} must fit into the region of {space[0]:.3g} x {space[1]:.3g} m "
+            f"(it measures {footprint[0]:.3g} x {footprint[1]:.3g} m)"
+        )
+
+
+def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
+    """The shape in world space."""
+    if shape.bin is not None:
+        walls: trimesh.Trimesh = trimesh.boolean.union(list(bin_walls(shape.bin)))
+        return walls
+    if shape.box is None:
+        return read_mesh(folder / str(shape.mesh))
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
+    transform[:3, 3] = shape.box.position
+    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
+    return box
+
+
+def _split(layout: int, validation: float) -> Literal["train", "val"]:
+    """Split of a layout, the same however many follow it: the second layout is the first of the smaller split.
+
+    Among the first n layouts, floor(1 + (n - 2) share) belong to the smaller split.
+    """
+    share = min(validation, 1.0 - validation)
+    before, after = (math.floor(1.0 + (count - 2) * share) for count in (layout, layout + 1))
+    return "val" if (after > before) == (validation <= 0.5) else "train"
+
+
+def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> LightSpec:
+    """Light ``position`` at ``time`` in [0, 1] of its path, times the layout's random factor."""
+    light = spec.lights[position]
+    strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
+    state: dict[str, Any] = {strength: getattr(light, strength)}
+    if not isinstance(light, EnvironmentLight) and light.path:
+        times = np.linspace(0.0, 1.0, len(light.path))
+        strengths = [key.intensity or state[strength] for key in light.path]
+        positions = np.array([key.position or light.position for key in light.path])
+        state = {
+            strength: float(np.interp(time, times, strengths)),
+            "position": tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3)),
+            "path": (),
+        }
+        if light.temperature is not None:
+            warmth = [1.0 / (key.temperature or light.temperature) for key in light.path]
+            state["temperature"] = float(1.0 / np.interp(time, times, warmth))
+    factors = random_stream(spec.seed, f"light intensity {position}", layout)
+    state[strength] *= float(factors.uniform(*spec.randomise.light_intensity))
+    return light.model_copy(update=state)
+
+
+def _camera(spec: SceneSpec, view: int, index: int) -> Camera:
+    """Camera of frame ``index``, which is ``view`` of its layout."""
+    camera, views = spec.camera, spec.output.views
+    if isinstance(camera, CameraHemisphere):
+        pose = _hemisphere_pose(camera, spec.seed, index)
+    else:
+        if isinstance(camera, CameraOrbit):
+            pose = _orbit_pose(camera, view, views)
+        else:
+            keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
+            pose = interpolate_poses(keys, view / max(1, views - 1))[0]
+        pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
+    return _camera_at(pose, camera.intrinsics, spec.output)
+
+
+def _camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Camera:
+    width, height = intrinsics.size or (output.width, output.height)
+    if intrinsics.fov_x is not None:
+        fx = 0.5 * width / float(np.tan(0.5 * np.radians(intrinsics.fov_x)))
+    else:
+        fx = float(intrinsics.fx or 0.0)
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fx if intrinsics.fy is None else intrinsics.fy,
+        cx=width / 2 if intrinsics.cx is None else intrinsics.cx,
+        cy=height / 2 if intrinsics.cy is None else intrinsics.cy,
+        world_from_camera=pose,
+        distortion=intrinsics.distortion,
+        near=intrinsics.near,
+        lens=intrinsics.lens,
+        aperture_radius=intrinsics.aperture,
+        focus_distance=intrinsics.focus,
+    )
+    return camera.resized(output.width, output.height)
+
+
+def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
+    """A full circle ends one step before its start; a part of one ends at its end."""
+    steps = views if abs(camera.sweep) == 360 else max(1, views - 1)
+    azimuth = np.radians(camera.start + camera.sweep * view / steps)
+    offset = (camera.radius * np.cos(azimuth), camera.radius * np.sin(azimuth), camera.height)
+    return look_at_pose(np.add(camera.target, offset), camera.target)
+
+
+def _hemisphere_pose(camera: CameraHemisphere, seed: int, index: int) -> Float64Array:
+    def draw(name: str, low: float, high: float) -> float:
+        return float(random_stream(seed, f"camera {name}", index).uniform(low, high))
+
+    radius = draw("radius", *camera.radius)
+    azimuth, roll = np.radians(draw("azimuth", *camera.azimuth)), np.radians(draw("roll", *camera.roll))
+    # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
+    sine = draw("elevation", *np.sin(np.radians(camera.elevation)))
+    cosine = np.sqrt(1.0 - sine * sine)
+    jitter = camera.target_jitter * random_stream(seed, "camera target", index).standard_normal(3)
+    target = np.add(camera.target, jitter)
+    eye = target + radius * np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
+    pose = look_at_pose(eye, target)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll).as_matrix()
+    return pose

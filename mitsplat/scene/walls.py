@@ -1,0 +1,96 @@
+"""Walls that decide where objects may be: those of bins, and those that an enclosure is written out as."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array
+from mitsplat.scene.spec import Bin, Box, Enclosure, Region, SceneSpec, Shape
+
+if TYPE_CHECKING:
+    from mitsplat.asset import Asset
+
+
+ENCLOSURE = "enclosure "
+"""How the names of the shapes begin that an enclosure is written out as."""
+
+PILE_HEIGHT = 1.0
+"""How far above the drop region the objects of a pile may start [m]."""
+
+
+def enclosure_walls(
+    enclosure: Enclosure, spec: SceneSpec, assets: Sequence[Asset], supports: Sequence[trimesh.Trimesh]
+) -> list[Shape]:
+    """The enclosure as five invisible boxes: walls from its floor up to the region's top or a pile's, and a lid.
+
+    Without a margin of its own the largest object finds room between region and walls, but no wall stands where there
+    is nothing to lie on before it.
+    """
+    inner_low, inner_high = np.array(spec.region.min), np.array(spec.region.max)
+    if enclosure.margin is not None:
+        low, high = inner_low - enclosure.margin, inner_high + enclosure.margin
+    else:
+        margin = max((float(asset.mesh.extents.max()) for asset in assets if asset.mesh is not None), default=0.0)
+        bounds = np.array([mesh.bounds for mesh in supports] or [(inner_low, inner_high)])
+        low = np.minimum(inner_low, np.maximum(inner_low - margin, bounds[:, 0].min(axis=0)))
+        high = np.maximum(inner_high, np.minimum(inner_high + margin, bounds[:, 1].max(axis=0)))
+    low[2], high[2] = enclosure.floor, inner_high[2]
+    if spec.settle.arrangement == "pile":
+        high[2] += PILE_HEIGHT
+    middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
+    walls = []
+    for name, axis, side in (("-x", 0, -1), ("+x", 0, 1), ("-y", 1, -1), ("+y", 1, 1), ("lid", 2, 1)):
+        position = middle.copy()
+        position[axis] += side * (size[axis] + thickness) / 2
+        extents = size + 2 * thickness
+        extents[axis] = thickness
+        extents[2] = thickness if name == "lid" else size[2]
+        box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
+        walls.append(Shape(name=f"{ENCLOSURE}{name}", box=box))
+    return walls
+
+
+def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
+    """The five boxes that a bin consists of, in world space."""
+    width, depth, height = shape.size
+    edge = shape.thickness
+    # Walls along x are as long as the floor; those along y stand between them, so that no faces coincide.
+    walls = [((width + 2 * edge, depth + 2 * edge, edge), (0.0, 0.0, -edge / 2))]
+    walls += [((width + 2 * edge, edge, height), (0.0, side * (depth + edge) / 2, height / 2)) for side in (-1, 1)]
+    walls += [((edge, depth, height), (side * (width + edge) / 2, 0.0, height / 2)) for side in (-1, 1)]
+    turn = Rotation.from_euler("z", shape.rotate_z, degrees=True).as_matrix()
+    boxes = []
+    for size, middle in walls:
+        transform = np.eye(4)
+        transform[:3, :3], transform[:3, 3] = turn, turn @ middle + shape.position
+        boxes.append(trimesh.creation.box(extents=size, transform=transform))
+    return tuple(boxes)
+
+
+def enclosed_bounds(
+    region: Region, bounds: Sequence[Float64Array], walls: Sequence[int]
+) -> tuple[Float64Array, Float64Array]:
+    """Corners of what centres of mass must stay in: the outer faces of the walls beside the region, else all colliders.
+
+    Args:
+        region: Where objects start.
+        bounds: Bounding box of each collider, shape (2, 3) [m].
+        walls: Positions of the colliders that are an enclosure.
+    """
+    low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
+    high[2] = max(high[2], region.max[2])
+    for axis in (0, 1):
+        across = 1 - axis
+        for wall in (bounds[position] for position in walls):
+            if wall[0][across] > region.min[across] or wall[1][across] < region.max[across]:
+                continue
+            if wall[0][axis] >= region.max[axis]:
+                high[axis] = min(high[axis], wall[1][axis])
+            if wall[1][axis] <= region.min[axis]:
+                low[axis] = max(low[axis], wall[0][axis])
+    return low, high

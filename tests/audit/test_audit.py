@@ -1,0 +1,423 @@
+"""The audit: a clean dataset passes, and each planted fault is found though its hash says that all is well."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from pycocotools import mask as coco_mask
+
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.errors import InputError
+from mitsplat.files import Record
+from tests.cli.test_cli import run
+
+
+def records_of(root: Path) -> list[Record]:
+    return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
+
+
+def store(root: Path, records: list[Record]) -> None:
+    """Write the manifest with the hashes of the files as they are, and its lines' own."""
+    for record in records:
+        for file in record["files"]:
+            record["files"][file] = hashlib.sha256((root / file).read_bytes()).hexdigest()
+    store_lines(root, records)
+
+
+def store_lines(root: Path, records: list[Record]) -> None:
+    lines = []
+    for record in records:
+        text = json.dumps({key: value for key, value in record.items() if key != "check"}, separators=(",", ":"))
+        lines.append(f'{text[:-1]},"check":"{hashlib.sha256(text.encode()).hexdigest()[:16]}"}}\n')
+    (root / "manifest.jsonl").write_text("".join(lines))
+
+
+def first(records: list[Record]) -> Any:
+    return records[0]["labels"]["instances"][0]
+
+
+def decode(records: list[Record], label: Any, key: str = "rle") -> np.ndarray:
+    width, height = records[0]["labels"]["size"]
+    return np.asarray(coco_mask.decode({"size": [height, width], "counts": label[key]}))
+
+
+def encode(mask: np.ndarray) -> str:
+    return str(coco_mask.encode(np.asfortranarray(mask))["counts"].decode())
+
+
+def test_a_clean_dataset_has_no_violations(clean: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = audit_dataset(clean)
+    assert found.violations == ()
+    assert found.frames == 6 and found.instances > 10
+    assert run("audit", clean) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "violations: 0"
+
+
+def lose_a_label(root: Path, records: list[Record]) -> None:
+    path = root / "labels/train/000000.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
+
+
+def swap_a_class(root: Path, records: list[Record]) -> None:
+    path = root / "labels/train/000000.txt"
+    path.write_text(str(1 - int(path.read_text()[0])) + path.read_text()[1:])
+
+
+def move_a_polygon(root: Path, records: list[Record]) -> None:
+    path = root / "labels/train/000000.txt"
+    head, *rest = path.read_text().splitlines()
+    kind, *values = head.split()
+    moved = [kind, *(f"{float(value) + (0.04 if i % 2 == 0 else 0):.6f}" for i, value in enumerate(values))]
+    path.write_text("\n".join([" ".join(moved), *rest]) + "\n")
+
+
+def fill_a_hole(root: Path, records: list[Record]) -> None:
+    """The manifest's mask has a hole, the polygon does not."""
+    label = first(records)
+    mask = decode(records, label)
+    x0, y0, x1, y1 = label["box"]
+    mask[(y0 + y1) // 2 - 2 : (y0 + y1) // 2 + 3, (x0 + x1) // 2 - 2 : (x0 + x1) // 2 + 3] = 0
+    label |= {"rle": encode(mask), "area": int(mask.sum())}
+    label["visible_fraction"] = round(label["area"] / label["amodal_area"], 6)
+
+
+def overlap_masks(root: Path, records: list[Record]) -> None:
+    one, other = records[0]["labels"]["instances"][:2]
+    other |= {key: one[key] for key in ("rle", "box", "area", "amodal_rle", "amodal_box", "amodal_area")}
+    other |= {key: one[key] for key in ("silhouette_area", "silhouette_box", "visible_fraction", "truncation")}
+
+
+def claim_visibility(root: Path, records: list[Record]) -> None:
+    first(records)["visible_fraction"] = 0.5
+
+
+def deny_truncation(root: Path, records: list[Record]) -> None:
+    first(records)["silhouette_area"] += 100
+
+
+def scale_a_pose(root: Path, records: list[Record]) -> None:
+    first(records)["world_from_object"][0][0] = 1.5
+
+
+def merge_ids(root: Path, records: list[Record]) -> None:
+    path = root / "instances/train/000000.png"
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture[picture == 2] = 1
+    cv2.imwrite(str(path), picture)
+
+
+def resize_an_image(root: Path, records: list[Record]) -> None:
+    path = root / "images/train/000000.png"
+    cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (32, 24)))
+
+
+def repeat_an_image(root: Path, records: list[Record]) -> None:
+    shutil.copyfile(root / "images/train/000000.png", root / "images/train/000001.png")
+
+
+def leak_a_layout(root: Path, records: list[Record]) -> None:
+    record = next(record for record in records if record["layout"] == records[0]["layout"] and record["view"] == 1)
+    record["split"] = "val"
+
+
+def paint_a_class(root: Path, records: list[Record]) -> None:
+    path = root / "semantic/train/000000.png"
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), np.where(picture == 1, 2, picture).astype(np.uint8))
+
+
+def erase_depth(root: Path, records: list[Record]) -> None:
+    path = root / "depth/train/000000.png"
+    cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+
+def erode_a_bop_mask(root: Path, records: list[Record]) -> None:
+    path = root / "bop/train/000000/mask_visib/000000_000000.png"
+    cv2.imwrite(str(path), cv2.erode(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.ones((3, 3))))
+
+
+def widen_a_box(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-detect/labels/train/000000.txt"
+    values = path.read_text().split()
+    path.write_text(path.read_text().replace(values[3], f"{float(values[3]) * 1.1:.6f}", 1))
+
+
+def turn_a_rotated_box(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-obb/labels/train/000000.txt"
+    kind, *values = path.read_text().splitlines()[0].split()
+    turned = " ".join([kind, *(f"{float(value) + 0.02 * (i in (0, 4)):.6f}" for i, value in enumerate(values))])
+    path.write_text("\n".join([turned, *path.read_text().splitlines()[1:]]) + "\n")
+
+
+def flip_a_keypoint(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-pose/labels/train/000000.txt"
+    head, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([head[:-1] + str((int(head[-1]) + 1) % 3), *rest]) + "\n")
+
+
+def shift_segments(root: Path, records: list[Record]) -> None:
+    path = root / "panoptic/train/000000.png"
+    cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), 3, axis=1))
+
+
+def name_another_class(root: Path, records: list[Record]) -> None:
+    path = root / "voc/Annotations/000000.xml"
+    name = first(records)["class"]
+    path.write_text(path.read_text().replace(f"<name>{name}</name>", "<name>screw</name>", 1))
+
+
+def count_from_zero(root: Path, records: list[Record]) -> None:
+    path = root / "voc/Annotations/000000.xml"
+    x0 = first(records)["box"][0]
+    path.write_text(path.read_text().replace(f"<xmin>{x0 + 1}</xmin>", f"<xmin>{x0}</xmin>", 1))
+
+
+def deny_occlusion(root: Path, records: list[Record]) -> None:
+    path = root / "voc/Annotations/000000.xml"
+    path.write_text(path.read_text().replace("<occluded>0</occluded>", "<occluded>1</occluded>", 1))
+
+
+def write_nan(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-obb/labels/train/000000.txt"
+    values = path.read_text().split(" ")
+    path.write_text(" ".join([values[0], "nan", *values[2:]]))
+
+
+def shorten_a_line(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-detect/labels/train/000000.txt"
+    head, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([" ".join(head.split()[:4]), *rest]) + "\n")
+
+
+def forget_a_depth(root: Path, records: list[Record]) -> None:
+    del records[0]["files"]["depth/train/000000.png"]
+
+
+def forget_a_bop_mask(root: Path, records: list[Record]) -> None:
+    del records[0]["files"]["bop/train/000000/mask/000000_000000.png"]
+
+
+def claim_a_polygon(root: Path, records: list[Record]) -> None:
+    first(records)["polygon_iou"] = 0.5
+
+
+def model_in_metres(root: Path, records: list[Record]) -> None:
+    path = root / "bop/models/obj_000001.ply"
+    mesh = trimesh.load_mesh(path)
+    mesh.apply_scale(0.001)
+    mesh.export(path)
+
+
+FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
+    lose_a_label: ("labels/train/000000.txt", "lines for"),
+    swap_a_class: ("labels/train/000000.txt", "class is"),
+    move_a_polygon: ("labels/train/000000.txt", "does not give its mask back"),
+    fill_a_hole: ("labels/train/000000.txt", "does not give its mask back"),
+    overlap_masks: ("manifest.jsonl, frame 0", "belong to more than one instance"),
+    claim_visibility: ("manifest.jsonl, frame 0", "its visible fraction is"),
+    deny_truncation: ("manifest.jsonl, frame 0", "its truncation is"),
+    scale_a_pose: ("manifest.jsonl, frame 0", "its pose is not a rotation"),
+    merge_ids: ("instances/train/000000.png", "pixels differ from the masks"),
+    resize_an_image: ("images/train/000000.png", "is 32x24 px"),
+    repeat_an_image: ("images/train/000001.png", "is the same picture as"),
+    leak_a_layout: ("manifest.jsonl", "are in both train and val"),
+    paint_a_class: ("semantic/train/000000.png", "differ from the masks' classes"),
+    erase_depth: ("depth/train/000000.png", "have no depth"),
+    erode_a_bop_mask: ("bop/train/000000/mask_visib/000000_000000.png", "differ from the manifest's mask"),
+    widen_a_box: ("yolo-detect/labels/train/000000.txt", "is not its box"),
+    turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is no rectangle"),
+    flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints are not"),
+    name_another_class: ("voc/Annotations/000000.xml", "class is screw"),
+    count_from_zero: ("voc/Annotations/000000.xml", "its box is not that of its mask"),
+    deny_occlusion: ("voc/Annotations/000000.xml", "its flags are not"),
+    write_nan: ("yolo-obb/labels/train/000000.txt", "not finite"),
+    shorten_a_line: ("yolo-detect/labels/train/000000.txt", "is not its box"),
+    shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
+    forget_a_depth: ("manifest.jsonl, frame 0", "lists no file of the format depth"),
+    forget_a_bop_mask: ("manifest.jsonl, frame 0", "bop by the name bop/train/000000/mask/000000_000000.png"),
+    claim_a_polygon: ("labels/train/000000.txt", "the IoU of its polygon is"),
+    model_in_metres: ("bop/models/models_info.json", "does not give the measures of bop/models/obj_000001.ply"),
+}
+
+
+@pytest.mark.parametrize("plant", FAULTS, ids=lambda plant: plant.__name__)
+def test_a_planted_fault_is_found(
+    dataset: Path, plant: Callable[[Path, list[Record]], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = records_of(dataset)
+    plant(dataset, records)
+    store(dataset, records)
+    assert run("audit", dataset) == 1
+    file, text = FAULTS[plant]
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith(f"{file}: ") and text in line for line in lines), lines
+
+
+@pytest.mark.parametrize("file", ["images/train/000000.png", "flow/train/000000.flo", "layers/train/000000.exr"])
+def test_a_file_that_changed_or_is_missing_is_found(dataset: Path, file: str) -> None:
+    path = dataset / file
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    assert (file, "is not what was written: its SHA-256 differs from the manifest's") in audit_dataset(
+        dataset
+    ).violations
+    path.unlink()
+    assert (file, "is missing") in audit_dataset(dataset).violations
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "place"),
+    [
+        ("annotations/instances_train.json", lambda c: c["annotations"][0]["bbox"].__setitem__(0, 1), "bbox is [1, "),
+        ("annotations/instances_train.json", lambda c: c["annotations"][0].update(category_id=9), "category_id"),
+        ("annotations/amodal_train.json", lambda c: c["annotations"].pop(), "annotations"),
+        ("annotations/panoptic_train.json", lambda c: c["categories"][0].update(name="x"), "categories[0]: name"),
+        ("bop/train/000000/scene_gt.json", lambda c: c["0"][0]["cam_t_m2c"].__setitem__(2, 5.0), "cam_t_m2c is"),
+        ("bop/train/000000/scene_gt_info.json", lambda c: c["0"][0].update(visib_fract=0.1), "visib_fract"),
+    ],
+)
+def test_annotations_that_disagree_with_the_manifest_are_found(
+    dataset: Path, file: str, change: Callable[[Any], None], place: str
+) -> None:
+    content = json.loads((dataset / file).read_text())
+    change(content)
+    (dataset / file).write_text(json.dumps(content))
+    (found,) = audit_dataset(dataset).violations
+    assert found[0] == file and place in found[1]
+
+
+def test_permuted_class_names_are_found(dataset: Path) -> None:
+    path = dataset / "data.yaml"
+    path.write_text(path.read_text().replace("bolt", "x").replace("nut", "bolt").replace("x", "nut"))
+    assert [file for file, _ in audit_dataset(dataset).violations] == ["data.yaml"]
+
+
+STRAY = (
+    *("annotations/instances_test.json", "bop/models/obj_000009.ply", "bop/train/000000/mask/000000_000009.png"),
+    *(
+        "bop/train/000000/rgb/000099.png",
+        "bop/train/000009/scene_gt.json",
+        "colmap/images.txt",
+        "depth/train/000099.png",
+    ),
+    *("flow/train/000001.flo", "images/train/000099.png", "images/val/000000.png", "instances/train/000099.png"),
+    *("labels/train/000099.txt", "layers/train/000099.exr", "layouts/0009.json", "normals/train/000099.png"),
+    *("panoptic/train/000099.png", "semantic/train/000099.png", "voc/Annotations/000099.xml"),
+    *("voc/JPEGImages/000099.png", "yolo-detect/labels/train/000099.txt", "yolo-obb/images/train/000099.png"),
+    "yolo-pose/images/train/000099.png",
+)
+"""Files that no frame owns, in the folder of every format; the dataset has no COLMAP cameras."""
+
+
+def test_files_of_no_frame_are_found(dataset: Path) -> None:
+    for file in STRAY:
+        (dataset / file).parent.mkdir(parents=True, exist_ok=True)
+        (dataset / file).write_text("")
+    (dataset / "labels/train.cache").write_text("")  # Ultralytics leaves it there
+    (dataset / "notes.txt").write_text("mine")
+    found = audit_dataset(dataset).violations
+    assert found == tuple((file, "belongs to no frame of the manifest") for file in STRAY)
+
+
+WHOLE = (
+    *(f"annotations/{n}_{s}.json" for n in ("instances", "amodal", "panoptic", "poses") for s in ("train", "val")),
+    *("data.yaml", "yolo-detect/data.yaml", "yolo-obb/data.yaml", "yolo-pose/data.yaml", "voc/labelmap.txt"),
+    *("voc/ImageSets/Main/train.txt", "voc/ImageSets/Main/val.txt", "layouts/0000.json", "layouts/0002.json"),
+    *(f"bop/train/000000/scene_{part}.json" for part in ("camera", "gt", "gt_info")),
+    *("bop/models/models_info.json", "bop/models/obj_000001.ply", "contact_sheet.jpg"),
+)
+
+
+def test_missing_files_that_describe_frames_are_found(dataset: Path) -> None:
+    for file in WHOLE:
+        (dataset / file).unlink()
+    found = dict(audit_dataset(dataset).violations)
+    assert set(found) == set(WHOLE)
+    assert all(text.startswith("is missing") for text in found.values())
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"{", b"[1, 2]", b'{"images": 3, "annotations": [3], "frames": [{}]}', b"\xff"]
+)
+def test_damaged_annotations_are_found(dataset: Path, damage: bytes) -> None:
+    """Whatever is in them: one sentence for each file and no traceback."""
+    files = [file for file in WHOLE if file.endswith((".json", ".yaml", ".txt"))]
+    for file in files:
+        (dataset / file).write_bytes(damage)
+    found = {file for file, _ in audit_dataset(dataset).violations}
+    assert set(files) - found <= {"voc/ImageSets/Main/val.txt"}
+
+
+def test_entries_of_no_frame_are_found(dataset: Path) -> None:
+    """At the end, in the middle, and twice."""
+    for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
+        content = json.loads((dataset / name).read_text())
+        entries = content["frames" if "poses" in name else "annotations"]
+        copied = json.loads(json.dumps(entries[-1]))
+        copied["id" if "poses" in name else "image_id"] = 77
+        entries.append(copied)
+        (dataset / name).write_text(json.dumps(content))
+    gt = dataset / "bop/train/000000/scene_gt.json"
+    gt.write_text(gt.read_text().replace('"1": ', '"0": '))
+    found = audit_dataset(dataset).violations
+    text = "has an entry of frame 77, which is not in the manifest at its place"
+    for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
+        assert (name, text) in found
+    assert ("bop/train/000000/scene_gt.json", "has 2 entries of frame 0") in found
+    assert ("bop/train/000000/scene_gt.json", "has 0 entries of frame 1") in found
+    assert ("annotations/instances_val.json", "id 4 is not above those before it") not in found
+
+
+def test_a_damaged_manifest_is_found(dataset: Path) -> None:
+    with (dataset / "manifest.jsonl").open("a") as file:
+        file.write('{"index": 7}\n')
+    (found,) = [text for file, text in audit_dataset(dataset).violations]
+    assert found.startswith("line 7 is not the record of a frame")
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "text"),
+    [
+        (("labels", "instances", 0, "box"), [0, 0, 0, 0], "instance 1: rle: its box must lie in the image"),
+        (("labels", "instances", 0, "amodal_box"), [0, 0, 1000, 9], "amodal_rle: its box must lie in the image"),
+        (("labels", "instances", 0, "rle"), "", "must be the code of a mask in its box (got '' for"),
+        (("labels", "instances", 0, "rle"), "1", "must be the code of a mask in its box"),
+        (("labels", "instances", 0, "silhouette_area"), 0, "silhouette_area: Input should be greater"),
+        (("labels", "instances", 0, "class_index"), 2, "class_index must be below 2 (got 2)"),
+        (("labels", "instances", 0, "asset"), 9, "asset must be below 2 (got 9)"),
+        (("labels", "instances", 0, "keypoints"), [[1.0, 1.0, 2.0]] * 3, "keypoints must be those of its class"),
+        (("labels", "size"), [32, 24], "labels.size must be the camera's"),
+        (("camera", "intrinsics"), [[1.0]], "camera.intrinsics"),
+        (("environment",), None, "environment must be a segment"),
+        (("depth_scale",), None, "depth_scale must be stated"),
+        (("files",), {}, "files must list the frame's image"),
+        (("split",), "test", "split: Input should be 'train' or 'val'"),
+    ],
+)
+def test_a_record_that_nothing_can_rely_on_is_one_violation(
+    dataset: Path, keys: tuple[Any, ...], value: Any, text: str
+) -> None:
+    records = records_of(dataset)
+    place: Any = records[0]
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = value
+    store_lines(dataset, records)
+    found = [said for file, said in audit_dataset(dataset).violations if file == "manifest.jsonl"]
+    assert len(found) == 1 and found[0].startswith("line 1 is not the record of a frame (") and text in found[0]
+
+
+def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="must be a dataset of mitsplat"):
+        audit_dataset(tmp_path)
+    (tmp_path / "dataset.json").write_text('{"mitsplat": "0.0.1", "scene": {}}')
+    with pytest.raises(InputError, match="must be a dataset of this version of mitsplat"):
+        audit_dataset(tmp_path)

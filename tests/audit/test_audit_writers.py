@@ -1,0 +1,461 @@
+"""The audit beside writers that are wrong: each writes a whole dataset, consistent in its fault, and is found out."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pycocotools import mask as coco_mask
+from scipy.spatial.transform import Rotation
+
+import mitsplat
+from mitsplat import camera
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.dataset.write import write_dataset
+from mitsplat.formats import bop, coco, colmap, maps, voc, yolo
+from mitsplat.formats import registry as writers
+from mitsplat.labels import labels as label
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec import FORMATS, Intrinsics
+from tests.conftest import BOTH, small_scene
+from tests.drawn import large_boxes, render_boxes, scatter_boxes
+
+Patch = Callable[[pytest.MonkeyPatch], None]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return small_scene(tmp_path_factory.mktemp("scene"), large_boxes(), BOTH, layouts=3, views=2)
+
+
+def write(scene: Scene, out: Path, formats: list[str], **options: Any) -> Path:
+    output = scene.spec.output.model_copy(update={"formats": tuple(formats)})
+    changed = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
+    return write_dataset(changed, out, render=render_boxes, settle=scatter_boxes, **options).path
+
+
+def changing(owner: Any, name: str, change: Callable[..., Any]) -> Patch:
+    """``change(what the writer made, its arguments)`` in the place of what the writer made."""
+    made = getattr(owner, name)
+
+    def wrapped(*args: Any, **options: Any) -> Any:
+        return change(made(*args, **options), *args)
+
+    return lambda patch: patch.setattr(owner, name, wrapped)
+
+
+def each_annotation(change: Callable[[dict[str, Any]], object]) -> Patch:
+    def change_all(made: Any, *args: Any) -> Any:
+        for entry in made:
+            change(entry)
+            yield entry
+
+    return changing(coco, "annotations_of", change_all)
+
+
+def each_segment(change: Callable[[dict[str, Any]], object]) -> Patch:
+    def change_all(made: dict[str, Any], *args: Any) -> Any:
+        for segment in made["segments_info"]:
+            change(segment)
+        return made
+
+    return changing(coco, "panoptic_annotation", change_all)
+
+
+def each_entry(owner: Any, name: str, change: Callable[[dict[str, Any]], object]) -> Patch:
+    def change_all(made: Any, *args: Any) -> Any:
+        for entry in made:
+            change(entry)
+        return made
+
+    return changing(owner, name, change_all)
+
+
+def entry(owner: Any, name: str, change: Callable[[dict[str, Any]], object]) -> Patch:
+    def changed(made: Any, *args: Any) -> Any:
+        change(made)
+        return made
+
+    return changing(owner, name, changed)
+
+
+def task(name: str, change: Callable[[Any], Any]) -> Patch:
+    """Other numbers on every line of a YOLO task [px]."""
+    real = yolo.TASKS[name]
+    return lambda patch: patch.setitem(yolo.TASKS, name, yolo.Task(real.folder, lambda it: change(real.numbers(it))))
+
+
+def by_rows(code: dict[str, Any]) -> dict[str, Any]:
+    """The code of the same mask, its runs counted along rows instead of columns."""
+    mask = coco_mask.decode(code)
+    turned = np.asfortranarray(mask.ravel(order="C").reshape(mask.shape, order="F"))
+    return {"size": code["size"], "counts": coco_mask.encode(turned)["counts"].decode()}
+
+
+def inverse(flat: list[float]) -> list[float]:
+    return list(np.array(flat).reshape(3, 3).T.ravel())
+
+
+class Swapped(Rotation):
+    """Scalar first where COLMAP's writer takes it for last."""
+
+    @classmethod
+    def from_matrix(cls, matrix: Any) -> Any:
+        from types import SimpleNamespace
+
+        x, y, z, w = Rotation.from_matrix(matrix).as_quat()
+        return SimpleNamespace(as_quat=lambda: (w, x, y, z))
+
+
+def with_camera(change: Callable[[camera.Camera], Any]) -> Patch:
+    """Another camera in a module that writes cameras."""
+
+    def patch(monkeypatch: pytest.MonkeyPatch) -> None:
+        for owner in (coco, bop, colmap):
+            real = owner.camera_of
+            monkeypatch.setattr(owner, "camera_of", lambda record, real=real: change(real(record)))
+
+    return patch
+
+
+def world_for_camera(it: camera.Camera) -> camera.Camera:
+    return replace(it, world_from_camera=it.camera_from_world)
+
+
+def millimetres_for_metres(it: camera.Camera) -> camera.Camera:
+    pose = np.array(it.world_from_camera)
+    pose[:3, 3] *= 1000
+    return replace(it, world_from_camera=pose)
+
+
+def swap(entry: dict[str, Any], one: str, other: str) -> None:
+    entry[one], entry[other] = entry[other], entry[one]
+
+
+def add_to(place: list[Any], position: int, amount: float) -> None:
+    place[position] += amount
+
+
+def models_in_metres(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(bop, "MILLIMETRES", 1.0)  # poses as well, all of it consistent
+
+
+def record_camera(change: Callable[[Any], Any]) -> Patch:
+    """A manifest that states another camera than that of the picture, for every format to follow."""
+    real = writers.write_frame
+
+    def write_frame(frame: Any, *args: Any) -> Any:
+        frame.camera = change(frame.camera)
+        return real(frame, *args)
+
+    return lambda patch: patch.setattr("mitsplat.dataset.frame_job.write_frame", write_frame)
+
+
+def farther(it: camera.Camera) -> camera.Camera:
+    return replace(it, fx=it.fx * 1.01, fy=it.fy * 1.01)
+
+
+COCO, AMODAL = "annotations/instances_train.json", "annotations/amodal_train.json"
+PANOPTIC, POSES = "annotations/panoptic_train.json", "annotations/poses_train.json"
+GT, INFO, BOP_CAMERA = (f"bop/train/000000/scene_{part}.json" for part in ("gt", "gt_info", "camera"))
+OTHER = {1: 2, 2: 1, 3: 3}
+
+FAULTS: dict[str, tuple[str, Patch, str, str]] = {
+    "coco: box one too far": ("coco", each_annotation(lambda e: add_to(e["bbox"], 0, 1)), COCO, "bbox is"),
+    "coco: box to its last pixel": ("coco", each_annotation(lambda e: add_to(e["bbox"], 2, -1)), COCO, "bbox is"),
+    "coco: box as corners": (
+        "coco",
+        each_annotation(lambda e: (add_to(e["bbox"], 2, e["bbox"][0]), add_to(e["bbox"], 3, e["bbox"][1]))),
+        COCO,
+        "bbox is",
+    ),
+    "coco: runs along rows": (
+        "coco",
+        each_annotation(lambda e: e.update(segmentation=by_rows(e["segmentation"]))),
+        COCO,
+        "differs from its mask",
+    ),
+    "coco: size as width, height": (
+        "coco",
+        each_annotation(lambda e: e["segmentation"]["size"].reverse()),
+        COCO,
+        "not a run-length code",
+    ),
+    "coco: classes swapped": (
+        "coco",
+        each_annotation(lambda e: e.update(category_id=OTHER[e["category_id"]])),
+        COCO,
+        "category_id is",
+    ),
+    "coco: classes from zero": ("coco", each_annotation(lambda e: e.update(category_id=0)), COCO, "category_id is"),
+    "coco: one id for all": ("coco", each_annotation(lambda e: e.update(id=1)), COCO, "id 1 is not above"),
+    "coco: area of the box": (
+        "coco",
+        each_annotation(lambda e: e.update(area=e["bbox"][2] * e["bbox"][3])),
+        COCO,
+        "area is",
+    ),
+    "amodal: seen for covered": (
+        "amodal",
+        each_annotation(lambda e: swap(e, "segmentation", "visible_segmentation")),
+        AMODAL,
+        "differs from its mask",
+    ),
+    "panoptic: box one too far": ("panoptic", each_segment(lambda e: add_to(e["bbox"], 1, 1)), PANOPTIC, "bbox is"),
+    "panoptic: classes swapped": (
+        "panoptic",
+        each_segment(lambda e: e.update(category_id=OTHER[e["category_id"]])),
+        PANOPTIC,
+        "category_id is",
+    ),
+    "panoptic: blue for red": (
+        "panoptic",
+        changing(coco, "panoptic_image", lambda made, *args: made[..., ::-1]),
+        "panoptic/train/000000.png",
+        "differ from the masks",
+    ),
+    "panoptic: environment one too far": (
+        "panoptic",
+        entry(coco, "environment_segment", lambda e: add_to(e["box"], 2, -1)),
+        "panoptic/train/000000.png",
+        "its environment has the box",
+    ),
+    "poses: world for camera": ("poses", with_camera(world_for_camera), POSES, "camera_from_object is not"),
+    "poses: millimetres": ("poses", with_camera(millimetres_for_metres), POSES, "camera_from_object is not"),
+    "voc: pixels from zero": (
+        "voc",
+        changing(voc, "annotation", lambda made, *args: made.replace("<xmin>", "<xmin>1")),
+        "voc/Annotations/000000.xml",
+        "its box is not",
+    ),
+    "voc: flags swapped": (
+        "voc",
+        changing(voc, "flags", lambda made, *args: (not made[0], not made[1])),
+        "voc/Annotations/000000.xml",
+        "its flags are not",
+    ),
+    "bop: millimetres and metres": ("bop", models_in_metres, GT, "cam_t_m2c is"),
+    "bop: world for camera": ("bop", with_camera(world_for_camera), GT, "cam_R_m2c is"),
+    "bop: rotation transposed": (
+        "bop",
+        each_entry(bop, "pose_entries", lambda e: e.update(cam_R_m2c=inverse(e["cam_R_m2c"]))),
+        GT,
+        "cam_R_m2c is",
+    ),
+    "bop: objects from zero": (
+        "bop",
+        each_entry(bop, "pose_entries", lambda e: e.update(obj_id=e["obj_id"] - 1)),
+        GT,
+        "obj_id is",
+    ),
+    "bop: box one too wide": (
+        "bop",
+        each_entry(bop, "info_entries", lambda e: add_to(e["bbox_visib"], 2, 1)),
+        INFO,
+        "bbox_visib is",
+    ),
+    "bop: counts swapped": (
+        "bop",
+        each_entry(bop, "info_entries", lambda e: e.update(px_count_valid=e["px_count_visib"] - 1)),
+        INFO,
+        "px_count_valid is",
+    ),
+    "bop: principal point at +0.5": (
+        "bop",
+        entry(bop, "camera_entry", lambda e: add_to(e["cam_K"], 2, 0.5)),
+        BOP_CAMERA,
+        "cam_K is",
+    ),
+    "bop: masks swapped": (
+        "bop",
+        changing(
+            bop,
+            "mask_pictures",
+            lambda made, *args: [({"mask": "mask_visib"}.get(folder, "mask"), *rest) for folder, *rest in made],
+        ),
+        "bop/train/",
+        "differ from the manifest's mask",
+    ),
+    "bop: models in metres": (
+        "bop",
+        changing(bop, "write_models", lambda made, root, meshes: bop_models(root, [m.copy() for m in meshes], 0.001)),
+        "bop/models/obj_000001.ply",
+        "does not fit its silhouettes",
+    ),
+    "colmap: scalar first for last": (
+        "colmap",
+        lambda patch: patch.setattr(colmap, "Rotation", Swapped),
+        "colmap/images.txt",
+        "its pose is not",
+    ),
+    "colmap: world for camera": ("colmap", with_camera(world_for_camera), "colmap/images.txt", "its pose is not"),
+    "colmap: principal point at 0": (
+        "colmap",
+        with_camera(lambda it: replace(it, cx=it.cx - 0.5)),
+        "colmap/images.txt",
+        "its camera is not",
+    ),
+    "yolo: one pixel off": ("yolo", task("yolo", lambda made: made + 1.0), "labels/train/000000.txt", "give its mask"),
+    "yolo: x and y swapped": (
+        "yolo",
+        task("yolo", lambda made: made[:, ::-1]),
+        "labels/train/000000.txt",
+        "its polygon",
+    ),
+    "yolo: class names swapped": (
+        "yolo",
+        changing(writers, "data_yaml", lambda made, *args: made.replace("0:", "2:").replace("1:", "0:")),
+        "data.yaml",
+        "names are",
+    ),
+    "yolo-detect: corner for middle": (
+        "yolo-detect",
+        task("yolo-detect", lambda made: made - np.array([made[2] / 2, made[3] / 2, 0, 0])),
+        "yolo-detect/labels/train/000000.txt",
+        "is not its box",
+    ),
+    "yolo-obb: pixels' centres": (
+        "yolo-obb",
+        task("yolo-obb", lambda made: made.mean(axis=0) + 0.85 * (made - made.mean(axis=0))),
+        "yolo-obb/labels/train/000000.txt",
+        "pixels lie outside",
+    ),
+    "yolo-obb: twice as large": (
+        "yolo-obb",
+        task("yolo-obb", lambda made: made.mean(axis=0) + 1.4 * (made - made.mean(axis=0))),
+        "yolo-obb/labels/train/000000.txt",
+        "fits",
+    ),
+    "instances: classes for ids": (
+        "instances",
+        changing(maps, "instance_picture", lambda made, *args: np.minimum(made, 2)),
+        "instances/train/000000.png",
+        "differ from the masks",
+    ),
+    "semantic: classes from zero": (
+        "semantic",
+        changing(maps, "semantic_picture", lambda made, *args: np.where(made > 0, made - 1, made)),
+        "semantic/train/000000.png",
+        "differ from the masks' classes",
+    ),
+    "depth: metres": (
+        "depth",
+        changing(maps, "depth_picture", lambda made, *args: np.maximum(made // 1000, made > 0).astype(np.uint16)),
+        "manifest.jsonl",
+        "depth pictures put",
+    ),
+    "exr: distances for depths": (
+        "exr depth",
+        changing(maps, "depth_picture", lambda made, *args: (made + 20 * (made > 0)).astype(np.uint16)),
+        "depth/train/000000.png",
+        "another depth",
+    ),
+    "normals: blue for red": (
+        "exr normals",
+        changing(maps, "normal_picture", lambda made, *args: made[..., ::-1]),
+        "normals/train/000000.png",
+        "differ from the normals",
+    ),
+    "flow: backwards": (
+        "depth flow",
+        changing(maps, "optical_flow", lambda made, *args: -made),
+        "flow/train/000000.flo",
+        "do not move",
+    ),
+    "manifest: runs along rows": (
+        "instances",
+        changing(label, "encode_mask", lambda made, mask, box, size: rows_of(made, size)),
+        "manifest.jsonl",
+        "",
+    ),
+    "manifest: world for camera": (
+        "yolo",
+        record_camera(world_for_camera),
+        "manifest.jsonl, frame 0",
+        "off the scene's orbit",
+    ),
+    "manifest: focal length": ("yolo", record_camera(farther), "manifest.jsonl, frame 0", "its intrinsics are not"),
+}
+
+
+def bop_models(root: Path, meshes: list[Any], scale: float) -> None:
+    for mesh in meshes:
+        mesh.apply_scale(scale)
+    REAL_MODELS(root, meshes)
+
+
+REAL_MODELS = bop.write_models
+
+
+def rows_of(code: str, size: tuple[int, int]) -> str:
+    return str(by_rows({"size": [size[1], size[0]], "counts": code})["counts"])
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_writer_is_found(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+    formats, patch, file, text = FAULTS[fault]
+    with monkeypatch.context() as patched:
+        patch(patched)
+        out = write(scene, tmp_path / "out", formats.split())
+    found = audit_dataset(out).violations
+    assert any(where.startswith(file) and text in said for where, said in found), found
+
+
+def test_right_writers_pass(scene: Scene, tmp_path: Path) -> None:
+    """All formats together, of shards that were merged."""
+    formats = list(FORMATS)
+    shards = [write(scene, tmp_path / str(number), formats, shard=Shard(number, 2)) for number in (1, 2)]
+    merge_shards(shards, tmp_path / "out")
+    assert audit_dataset(tmp_path / "out").violations == ()
+
+
+def test_poses_that_are_not_those_of_the_layout_are_found(scene: Scene, tmp_path: Path) -> None:
+    out = write(scene, tmp_path / "out", ["yolo"])
+    (out / "layouts/0000.json").write_text((out / "layouts/0001.json").read_text())
+    said = [text for _, text in audit_dataset(out).violations]
+    assert any("has another pose than in layouts/0000.json" in text for text in said)
+    assert "is of layout 1" in said
+
+
+WRITERS = ("formats", "frames", "labels", "masks", "render")
+"""Where labels are made and written."""
+
+
+def test_the_audit_shares_nothing_with_the_writers() -> None:
+    package = Path(mitsplat.__file__).parent
+    readers = [path for path in (package / "audit").glob("*.py") if path.stem not in ("report", "svg_charts")]
+    assert len(readers) > 8
+    for path in (*readers, package / "dataset/schema.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mitsplat"):
+                taken = {f"{node.module}.{alias.name}".split(".")[1] for alias in node.names}
+                assert not taken & set(WRITERS), (path, node.lineno)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"lens": "fisheye", "fx": 40.0, "fy": 41.0, "cx": 31.0, "cy": 25.0, "distortion": (0.02, -0.01, 0.003, 0.001)},
+        {"fov_x": 70.0, "distortion": (0.05, -0.02, 0.002, -0.001, 0.01, 0.003, 0.002, 0.001)},
+    ],
+    ids=["fisheye", "distorted"],
+)
+def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
+    """Right writers pass, and coefficients in the wrong order do not, whatever reads them."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=2, views=2)
+    seen = scene.spec.camera.model_copy(update={"intrinsics": Intrinsics(**lens)})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))
+    out = write(scene, tmp_path / "out", ["colmap", "depth", "exr", "flow", "poses"])
+    assert audit_dataset(out).violations == ()
+    path = out / "colmap/cameras.txt"
+    words = path.read_text().split()
+    words[8], words[9] = words[9], words[8]
+    path.write_text(" ".join(words) + "\n")
+    assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}

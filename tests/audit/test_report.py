@@ -1,0 +1,151 @@
+"""The report page: complete, alone, and usable by keyboard and screen reader; charts count right."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.audit.report import SAMPLES, write_report
+from mitsplat.audit.svg_charts import bars, columns, heat_map, histogram
+from tests.audit.test_audit import records_of, store, swap_a_class
+from tests.cli.test_cli import run
+
+
+class Page(HTMLParser):
+    """Elements with their attributes, and the text of each."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in ("meta", "img", "input", "rect", "path", "line", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in ("meta", "img", "input", "rect", "path", "line", "br"):
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open and "script" not in self.open:
+            self.text += data
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+@pytest.fixture
+def page(clean: Path, tmp_path: Path) -> Page:
+    path, _ = write_report(clean, tmp_path / "report.html")
+    return Page(path.read_text())
+
+
+def test_the_page_says_what_the_dataset_is(page: Page) -> None:
+    for text in ("small", "4 train, 2 val", "64 x 48 px", "No violations in", "Seed", "hidden", "yolo-pose"):
+        assert text in page.text
+    assert Path(sys.argv[0]).name in page.text  # the command that made it
+    assert len(page.all("img")) == min(SAMPLES, 6)
+    captions = (
+        "Instances by class",
+        "Instances per image",
+        "Where boxes lie",
+        "How large boxes are",
+        "Visible fraction",
+    )
+    for caption in (*captions, "Truncation", "Agreement", "Brightness of pixels", "Seconds per frame by stage"):
+        assert caption in page.text
+
+
+def test_the_page_needs_nothing_else(page: Page) -> None:
+    for tag, attributes in page.elements:
+        for name in ("src", "href", "srcset", "data", "action"):
+            if name in attributes:
+                assert attributes[name].startswith("data:"), (tag, attributes[name])
+    assert not page.all("link") and not page.all("iframe")
+
+
+def test_the_page_is_well_formed_and_named_for_screen_readers(page: Page) -> None:
+    assert page.open == []
+    assert page.all("html")[0]["lang"] == "en"
+    assert len(page.all("h1")) == 1 and len(page.all("main")) == 1
+    assert all(image["alt"] for image in page.all("img"))
+    for drawing in page.all("svg"):
+        assert drawing.get("aria-hidden") == "true" or (drawing["role"] == "img" and drawing["aria-label"])
+    ids = {attributes["id"] for _, attributes in page.elements if "id" in attributes}
+    assert {section["aria-labelledby"] for section in page.all("section")} <= ids
+    assert len(page.all("input")) == len(page.all("label")) == 4  # each inside its label, in a named fieldset
+    assert len(page.all("fieldset")) == len(page.all("legend")) == 1
+    assert not any("tabindex" in attributes and attributes["tabindex"] != "0" for _, attributes in page.elements)
+
+
+def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium on this machine")
+    path, _ = write_report(clean, tmp_path / "report.html")
+    press = (
+        "<script>for (const key of ['mask', 'box']) document.querySelector(`[data-overlay=${key}]`).click();"
+        "document.body.dataset.shown = [...document.querySelectorAll('.picture .box')]"
+        ".every(e => getComputedStyle(e).display === 'inline');"
+        "document.body.dataset.hidden = [...document.querySelectorAll('.picture .mask')]"
+        ".every(e => getComputedStyle(e).display === 'none');</script></body>"
+    )
+    path.write_text(path.read_text().replace("</body>", press))
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
+    done = subprocess.run([chromium, *options, path.as_uri()], capture_output=True, text=True, timeout=120, check=True)
+    body = re.search(r"<body[^>]*>", done.stdout)
+    assert body is not None and 'data-shown="true"' in body[0] and 'data-hidden="true"' in body[0]
+
+
+def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    records = records_of(dataset)
+    swap_a_class(dataset, records)
+    (dataset / "images/train/<b>.png").write_bytes(b"")
+    store(dataset, records)
+    assert run("report", dataset) == 0
+    assert capsys.readouterr().out == f"report: {dataset / 'report.html'} (2 violations)\n"
+    text = (dataset / "report.html").read_text()
+    assert "2 violations" in text and "images/train/&lt;b&gt;.png" in text and "class is" in text
+    assert "<b>.png" not in text
+
+
+def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:
+    (dataset / "images/train/000000.png").unlink()
+    with (dataset / "manifest.jsonl").open("a") as file:
+        file.write("{\n")
+    page, audit = write_report(dataset)
+    assert len(audit.violations) >= 2
+    text = page.read_text()
+    assert "Frame 0: its image cannot be read" in text and "line 7 is not the record" in text
+
+
+class TestCharts:
+    def test_a_histogram_counts_every_value_once(self) -> None:
+        text = histogram("shares", [0.0, 0.05, 0.5, 1.0, 1.0], bins=10, bounds=(0, 1))
+        counts = dict(re.findall(r'<th scope="row">([^<]+)</th><td>(\d+)</td>', text))
+        assert counts == {"0 to 0.1": "2", "0.5 to 0.6": "1", "0.9 to 1": "2"}
+
+    def test_heights_are_in_proportion(self) -> None:
+        heights = [float(h) for h in re.findall(r'class="bar"[^>]* height="([\d.]+)"', columns("c", [1, 4, 2], "abc"))]
+        np.testing.assert_allclose(np.array(heights) / heights[1], (0.25, 1, 0.5), atol=0.01)
+        widths = [float(w) for w in re.findall(r'class="bar"[^>]* width="([\d.]+)"', bars("c", {"a": 3, "b": 6}))]
+        assert widths[0] == pytest.approx(widths[1] / 2)
+
+    def test_a_heat_map_puts_points_where_they_are(self) -> None:
+        text = heat_map("m", [99.0, 99.0, 1.0], [49.0, 49.0, 1.0], size=(100, 50), cells=(10, 5), axes="px")
+        assert "<td>10, 5: 2</td>" in text and "<td>2 of 50</td>" in text
+
+    @pytest.mark.parametrize("chart", [bars("c", {}), histogram("c", []), columns("c", [0], ["0"])])
+    def test_nothing_is_no_error(self, chart: str) -> None:
+        assert Page(chart).open == []

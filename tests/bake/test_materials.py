@@ -1,0 +1,195 @@
+"""One object in several formats, and what users say of its surface: the same colours must reach the splats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
+from mitsplat.bake.materials import Finish, read_material
+from mitsplat.bake.parts import Part, read_parts
+from mitsplat.bake.report import write_bake_report
+from mitsplat.colour import decode_srgb
+from mitsplat.errors import InputError
+
+COLOUR = (200, 120, 40)
+QUICK = BakeSettings(gaussians=300, sh_degree=0, directions=8, samples=4, fit_steps=0, fit_views=1, verify_views=1)
+
+
+def box(visual: object = None) -> trimesh.Trimesh:
+    """A box whose faces share no vertices."""
+    mesh = trimesh.creation.box((0.04, 0.03, 0.02))
+    return trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False, visual=visual)
+
+
+def write_obj(folder: Path, lines: str, *, name: str = "box") -> Path:
+    """The box as an OBJ whose MTL says ``lines``, with a texture of one colour to name."""
+    Image.new("RGB", (8, 8), COLOUR).save(folder / "colour.png")
+    (folder / f"{name}.mtl").write_text(f"newmtl paint\n{lines}\n")
+    rows = [f"mtllib {name}.mtl", *("v {:.6f} {:.6f} {:.6f}".format(*corner) for corner in box().vertices)]
+    rows += ["vt 0.1 0.1", "vt 0.9 0.1", "vt 0.5 0.9", "usemtl paint"]
+    rows += [f"f {3 * k + 1}/1 {3 * k + 2}/2 {3 * k + 3}/3" for k in range(12)]
+    (folder / f"{name}.obj").write_text("\n".join(rows))
+    return folder / f"{name}.obj"
+
+
+def part_of(folder: Path, lines: str, **finish: object) -> Part:
+    (part,) = read_parts(write_obj(folder, lines), finish=Finish(**finish))  # type: ignore[arg-type]
+    return part
+
+
+def colour_of(part: Part) -> np.ndarray:
+    """Mean linear colour."""
+    if part.colours is not None:
+        return np.asarray(part.colours.mean(axis=(0, 1)))
+    return np.asarray(decode_srgb(part.texture / 255.0).mean(axis=(0, 1)))
+
+
+@pytest.fixture(scope="module")
+def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
+    """The box in one colour, as a scan in OBJ, as GLB, as PLY with vertex colours, and as STL with ``--colour``."""
+    folder = tmp_path_factory.mktemp("formats")
+    image, uv = Image.new("RGB", (8, 8), COLOUR), np.tile([[0.1, 0.1], [0.9, 0.1], [0.5, 0.9]], (12, 1))
+    matt = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    box(TextureVisuals(uv=uv, material=matt)).export(folder / "box.glb")
+    painted = box()
+    painted.visual.vertex_colors = (*COLOUR, 255)
+    painted.export(folder / "box.ply")
+    box().export(folder / "box.stl")
+    write_obj(folder, "map_Kd colour.png")
+    finishes = {
+        "obj": Finish(),
+        "glb": Finish(specular=0.0),
+        "ply": Finish(),
+        "stl": Finish(colour="#c87828"),
+    }
+    return {
+        kind: bake_asset(folder / f"box.{kind}", name="box", settings=QUICK, finish=finish)
+        for kind, finish in finishes.items()
+    }
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "stl"])
+def test_one_object_in_any_format_bakes_alike(bakes: dict[str, BakeResult], kind: str) -> None:
+    """Of a face that sees nothing but light of radiance 1, the radiance is the albedo: the mean over it agrees."""
+    found, wanted = (bakes[name].views[0] for name in (kind, "glb"))
+    assert -10 * np.log10(((found.splats - wanted.splats) ** 2).mean()) > 40
+    assert -10 * np.log10(((found.mesh - wanted.mesh) ** 2).mean()) > 40
+
+
+def test_splats_are_as_bright_as_the_texture_of_the_file(bakes: dict[str, BakeResult], tmp_path: Path) -> None:
+    assert bakes["obj"].brightness == pytest.approx(1.0, abs=0.05)
+    assert bakes["glb"].brightness == pytest.approx(1.0, abs=0.05)
+    assert bakes["ply"].brightness is None
+    dark = bake_asset(write_obj(tmp_path, "Kd 0.4 0.4 0.4\nmap_Kd colour.png"), name="box", settings=QUICK)
+    assert dark.brightness == pytest.approx(decode_srgb(0.4), rel=0.1)
+    assert "as bright as the textures of the file" in dark.warnings[0]
+
+
+def test_report_shows_mesh_beside_splats(bakes: dict[str, BakeResult], tmp_path: Path) -> None:
+    page = write_bake_report(tmp_path, bakes["obj"]).read_text()
+    assert page.count("<img") == 3
+    for figure in ("40 x 30 x 20 mm", "0.024 kg", "1, at most 0.00 mm outside of the mesh", "Nothing to note"):
+        assert figure in page
+
+
+@pytest.mark.parametrize(
+    ("lines", "colour", "gloss"),
+    [
+        ("map_Kd colour.png", decode_srgb(np.array(COLOUR) / 255), (False, 0.0, 1.0)),
+        ("map_Kd colour.png\nKd 1 1 1", decode_srgb(np.array(COLOUR) / 255), (False, 0.0, 1.0)),
+        ("Kd 0.4 0.4 0.4", decode_srgb(np.full(3, 0.4)), (False, 0.0, 1.0)),
+        ("Ka 0 0 0", np.full(3, 0.5), (False, 0.0, 1.0)),
+        ("Kd 1 1 1\nKs 0.5 0.5 0.5\nNs 30\nillum 2", np.ones(3), (True, 0.0, 0.5)),
+        ("Kd 1 1 1\nKs 0.5 0.5 0.5\nNs 30\nillum 1", np.ones(3), (False, 0.0, 1.0)),
+        ("Kd 1 1 1\nPr 0.3\nPm 1", np.ones(3), (True, 1.0, 0.3)),
+    ],
+)
+def test_mtl_means_what_it_says(tmp_path: Path, lines: str, colour: np.ndarray, gloss: tuple[object, ...]) -> None:
+    part = part_of(tmp_path, lines)
+    np.testing.assert_allclose(colour_of(part), colour, atol=0.005)
+    assert (part.shiny, part.metallic, pytest.approx(part.roughness)) == gloss
+    assert part.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        ("Kd 1 1 1\nd 0.5", "transparent"),
+        ("Kd 1 1 1\nTr 0.5", "transparent"),
+        ("Kd 1 1 1\nmap_Ke colour.png", "shines by itself"),
+        ("Kd 1 1 1\nmap_Pr colour.png\nmap_Bump colour.png", "map_bump, map_pr are left out"),
+    ],
+)
+def test_what_an_mtl_says_in_vain_is_told(tmp_path: Path, lines: str, sentence: str) -> None:
+    (warning,) = part_of(tmp_path, lines).warnings
+    assert sentence in warning
+
+
+def test_factors_and_vertex_colours_of_gltf_are_linear(tmp_path: Path) -> None:
+    """glTF 2.0: 3.9.2 and 3.7.2.1."""
+    grey = PBRMaterial(baseColorFactor=[128, 128, 128, 255], metallicFactor=0.0, roughnessFactor=1.0)
+    box(TextureVisuals(material=grey)).export(tmp_path / "factor.glb")
+    (part,) = read_parts(tmp_path / "factor.glb")
+    np.testing.assert_allclose(colour_of(part), 128 / 255, atol=1e-6)
+    painted = box()
+    painted.visual.vertex_colors = (128, 128, 128, 255)
+    painted.export(tmp_path / "colours.glb")
+    painted.export(tmp_path / "colours.ply")
+    for suffix, colour in (("glb", 128 / 255), ("ply", decode_srgb(128 / 255))):
+        (part,) = read_parts(tmp_path / f"colours.{suffix}")
+        np.testing.assert_allclose(colour_of(part), colour, atol=1e-6)
+
+
+def test_texture_without_factor_counts_as_it_is_in_memory_too() -> None:
+    image = Image.new("RGB", (4, 4), COLOUR)
+    np.testing.assert_array_equal(read_material(SimpleMaterial(image=image)).factor, 1.0)
+    given = read_material(SimpleMaterial(image=image, diffuse=[51, 51, 51, 255]))
+    np.testing.assert_allclose(given.factor, decode_srgb(0.2), rtol=1e-6)
+
+
+def test_finish_replaces_what_the_file_says(tmp_path: Path) -> None:
+    part = part_of(tmp_path, "map_Kd colour.png", colour=(0.2, 0.4, 0.6))
+    np.testing.assert_allclose(colour_of(part), decode_srgb(np.array([0.2, 0.4, 0.6])))
+    assert (part.texture, part.shiny) == (None, False)
+    part = part_of(tmp_path, "map_Kd colour.png", metallic=1.0, roughness=0.2)
+    assert part.texture is not None
+    assert (part.shiny, part.metallic, part.roughness) == (True, 1.0, 0.2)
+    assert part.specular == pytest.approx(decode_srgb(np.array(COLOUR) / 255).mean(), abs=0.01)
+    part = part_of(tmp_path, "Kd 1 1 1\nPr 0.3", specular=0.0)
+    assert (part.shiny, part.specular) == (False, 0.0)
+    assert part_of(tmp_path, "Kd 1 1 1", specular=0.08).specular == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize(
+    ("finish", "sentence"),
+    [
+        ({"colour": "no such"}, "colour must be a name or #rrggbb, such as steelblue .got 'no such'."),
+        ({"colour": (0.2, 0.4, 2.0)}, "colour must be red, green and blue from 0 to 1"),
+        ({"roughness": -0.1}, "roughness must be from 0 to 1 .got -0.1."),
+        ({"metallic": 2.0}, "metallic must be from 0 to 1 .got 2."),
+        ({"metallic": float("nan")}, "metallic must be from 0 to 1 .got nan."),
+        ({"specular": 0.5}, "specular must be from 0 to 0.08 .got 0.5. .more is a metal: give metallic 1."),
+    ],
+)
+def test_impossible_finishes_are_refused(finish: dict[str, object], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Finish(**finish)  # type: ignore[arg-type]
+
+
+def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -> None:
+    path = write_obj(tmp_path, "map_Kd absent.png")
+    with pytest.raises(
+        InputError, match=r"box\.mtl: its texture absent\.png is missing; put it there, or give a colour"
+    ):
+        read_parts(path)
+    assert read_parts(path, finish=Finish(colour="red"))
+    (tmp_path / "box.mtl").unlink()
+    with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing"):
+        read_parts(path)

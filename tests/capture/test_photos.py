@@ -1,0 +1,123 @@
+"""Photographs as they come: turned, reduced, copied, and named with a reason where they are of no use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Photo
+from mitsplat.capture.photos import Prepared, prepare_photos, undistort
+from mitsplat.errors import InputError
+
+
+def texture(seed: int = 0, size: tuple[int, int] = (60, 80)) -> np.ndarray:
+    coarse = np.random.default_rng(seed).integers(0, 256, (size[0] // 2, size[1] // 2, 3), dtype=np.uint8)
+    return coarse.repeat(2, axis=0).repeat(2, axis=1)
+
+
+def prepare(folder: Path, **options: object) -> tuple[dict[str, Prepared], dict[str, str]]:
+    prepared, rejected = prepare_photos(folder, folder.parent / "copies", **{"max_size": 1000, **options})  # type: ignore[arg-type]
+    return {photo.name: photo for photo in prepared}, rejected
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(3):
+        Image.fromarray(texture(number)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_baked_in(folder: Path, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    exif[ExifTags.Base.Model] = "Box"
+    Image.fromarray(texture()).save(folder / "turned.png", exif=exif)
+    photo = prepare(folder)[0]["turned.png"]
+    # What each value says to do with the stored pixels (EXIF 2.3, 4.6.4).
+    stored = texture()
+    upright = [
+        stored, stored[:, ::-1], stored[::-1, ::-1], stored[::-1],
+        stored.swapaxes(0, 1), np.rot90(stored, -1), stored[::-1, ::-1].swapaxes(0, 1), np.rot90(stored, 1),
+    ]  # fmt: skip
+    with Image.open(photo.file) as copy:
+        np.testing.assert_array_equal(np.asarray(copy), upright[orientation - 1])
+        assert copy.getexif().get(ExifTags.Base.Orientation, 1) == 1
+        assert copy.getexif()[ExifTags.Base.Model] == "Box"
+    assert photo.size == upright[orientation - 1].shape[1::-1]
+    assert photo.orientation == orientation
+    raw = prepare_photos(folder, folder.parent / "raw", max_size=1000, upright=False)[0][-1]
+    with Image.open(raw.file) as copy:
+        np.testing.assert_array_equal(np.asarray(copy), stored)
+
+
+def test_what_needs_no_change_is_copied_byte_by_byte(folder: Path) -> None:
+    (folder / "below").mkdir()
+    Image.fromarray(texture(9)).save(folder / "below/a.JPG", "JPEG", quality=70)
+    photos, rejected = prepare(folder)
+    assert rejected == {}
+    assert photos["below/a.JPG"].file.name == "below__a.JPG"
+    assert photos["below/a.JPG"].file.read_bytes() == (folder / "below/a.JPG").read_bytes()
+    assert photos["0.png"].file.read_bytes() == (folder / "0.png").read_bytes()
+
+
+def test_large_photos_are_reduced_and_sizes_may_be_mixed(folder: Path) -> None:
+    Image.fromarray(texture(7, (120, 400))).save(folder / "large.png")
+    photos, _ = prepare(folder, max_size=100)
+    assert photos["large.png"].size == (100, 30)
+    assert photos["0.png"].size == (80, 60)
+    assert photos["large.png"].lens != photos["0.png"].lens == photos["1.png"].lens
+
+
+def test_16_bit_grey_is_not_clipped(folder: Path) -> None:
+    grey = (texture()[..., 0].astype(np.uint16) << 8) + 77
+    Image.fromarray(grey).save(folder / "deep.png")
+    with Image.open(prepare(folder)[0]["deep.png"].file) as copy:
+        np.testing.assert_array_equal(np.asarray(copy)[..., 1], texture()[..., 0])
+
+
+def test_useless_photos_are_named_with_a_reason(folder: Path) -> None:
+    Image.fromarray(texture(5)).save(folder / "whole.jpg")
+    data = (folder / "whole.jpg").read_bytes()
+    (folder / "torn.jpg").write_bytes(data[: len(data) // 2])
+    (folder / "text.jpg").write_text("no image")
+    (folder / "phone.heic").write_bytes(b"\0" * 20)
+    (folder / "notes.txt").write_text("not looked at")
+    Image.fromarray(cv2.GaussianBlur(texture(6), (0, 0), 4)).save(folder / "moved.png")
+    Image.fromarray(texture(6) // 100).save(folder / "night.png")
+    Image.fromarray(255 - texture(6) // 100).save(folder / "flash.png")
+    photos, rejected = prepare(folder)
+    assert set(photos) == {"0.png", "1.png", "2.png", "whole.jpg"}
+    assert set(rejected) == {"torn.jpg", "text.jpg", "phone.heic", "moved.png", "night.png", "flash.png"}
+    assert rejected["torn.jpg"].startswith("it cannot be read (")
+    assert rejected["phone.heic"] == "HEIC files are not read; export it as JPEG or PNG"
+    assert rejected["moved.png"].startswith("it is blurred (sharpness ")
+    assert rejected["night.png"] == "it is too dark (100% of it is black)"
+    assert rejected["flash.png"] == "it is too bright (100% of it is white)"
+
+
+def test_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="gone: no such folder of photographs"):
+        prepare_photos(tmp_path / "gone", tmp_path / "out", max_size=100)
+
+
+def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:
+    """A picture that encodes the direction of every pixel is undistorted: pixels must show their own direction."""
+    camera = Camera(160, 120, 130.0, 128.0, 82.0, 59.0, np.eye(4), distortion=(-0.2, 0.05, 0.001, -0.002))
+    y, x = np.mgrid[:120, :160] + 0.5
+    slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()])).reshape(120, 160, 2)
+    code = np.dstack([128 + 150 * slopes, np.full((120, 160), 128)])
+    Image.fromarray(np.rint(code).clip(0, 255).astype(np.uint8)).save(tmp_path / "a.png")
+    photo = undistort(Photo("a.png", tmp_path / "a.png", camera))
+    assert photo.camera.distortion == ()
+    shown = 255 * photo.picture()[0]
+    slopes = photo.camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()])).reshape(120, 160, 2)
+    assert np.abs(shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].max() < 1.2  # a pixel is 1.15 of code
+    assert np.abs((shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].mean()) < 0.05

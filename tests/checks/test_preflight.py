@@ -1,0 +1,134 @@
+"""The preflight: a good asset and scene pass, and each planted fault is found, with a word on what to do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from ruamel.yaml import YAML
+
+from mitsplat.asset import Asset
+from mitsplat.checks.preflight import check_asset, check_scene
+from mitsplat.scene.scene import load_scene
+from mitsplat.splats import Splats
+from tests.cli.test_cli import run
+from tests.conftest import box_asset
+
+
+def solid(count=2000, size=(0.06, 0.04, 0.05)):
+    """A box with Gaussians all over its surface."""
+    mesh = trimesh.creation.box(size)
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=1)
+    splats = Splats(
+        means=points,
+        quats=np.tile([0.0, 0, 0, 1], (count, 1)),
+        scales=np.full((count, 3), 0.035 * max(size)),
+        opacities=np.full(count, 0.9),
+        sh=np.zeros((count, 1, 3)),
+    )
+    return Asset("box", "box", splats, mesh, (mesh,))
+
+
+def wrong(findings):
+    return {finding.name: finding for finding in findings if not finding.ok}
+
+
+def test_a_good_asset_passes():
+    assert wrong(check_asset(solid())) == {}
+    surroundings = replace(
+        solid(size=(2, 3, 0.5)), kind="environment", splats=solid(size=(2, 3, 0.5)).splats, pieces=()
+    )
+    assert wrong(check_asset(surroundings)) == {}
+
+
+def changed(splats, rows, **values):
+    arrays = {name: np.array(getattr(splats, name)) for name in ("means", "quats", "scales", "opacities", "sh")}
+    for name, value in values.items():
+        arrays[name][:rows] = value
+    return Splats(**arrays)
+
+
+GOOD = solid()
+OPEN = trimesh.Trimesh(GOOD.mesh.vertices, GOOD.mesh.faces[1:], process=False)
+FAULTS = {
+    "units": (GOOD.transformed(np.diag([1000, 1000, 1000, 1])), "is units: 0.001 missing"),
+    "units ": (replace(GOOD, units="unknown"), "give it as size"),
+    "up axis": (replace(solid(size=(2, 0.3, 3)), kind="environment"), "set up: y"),
+    "needles": (replace(GOOD, splats=changed(GOOD.splats, 60, scales=(0.02, 0.001, 0.001))), "mitsplat mesh"),
+    "floaters": (replace(GOOD, splats=changed(GOOD.splats, 30, means=GOOD.splats.means[:30] * 9)), "mitsplat mesh"),
+    "opacity": (replace(GOOD, splats=changed(GOOD.splats, 900, opacities=1e-3)), "prune"),
+    "spherical harmonics": (
+        replace(GOOD, splats=replace(GOOD.splats, sh=np.zeros((2000, 4, 3)))),
+        "store degree 0",
+    ),
+    "splats": (replace(GOOD, splats=changed(GOOD.splats, 2000, opacities=0.1)), "anew"),
+    "overlap": (replace(GOOD, mesh=GOOD.mesh.copy().apply_translation((0.03, 0, 0))), "register"),
+    "offset": (replace(GOOD, mesh=GOOD.mesh.copy().apply_translation((0.005, 0, 0))), "register"),
+    "watertightness": (replace(GOOD, mesh=OPEN), "close it"),
+    "mass": (replace(GOOD, mass=50.0), "density"),
+    "colliders": (replace(GOOD, pieces=(GOOD.mesh.slice_plane((0, 0, 0), (1, 0, 0), cap=True),)), "remove pieces"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_found(name):
+    asset, remedy = FAULTS[name]
+    found = wrong(check_asset(asset))
+    assert remedy in found[name.strip()].remedy
+    assert set(found) <= {name.strip(), "offset", "overlap", "colliders"}  # a moved mesh is all three
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("room", lambda data: data["objects"][0].update(count=[900, 9000])),
+        ("support", lambda data: data.update(shapes=[], enclosure={"floor": -0.1})),
+        ("sight", lambda data: data["camera"].update(target=[0, 0, 5], height=0.1, radius=0.2)),
+        ("light", lambda data: data.update(lights=[])),
+    ],
+)
+def test_a_fault_of_a_scene_is_found(scene_data, write_scene, name, change):
+    good = wrong(check_scene(load_scene(write_scene(scene_data))))
+    assert name not in good
+    change(scene_data)
+    found = wrong(check_scene(load_scene(write_scene(scene_data))))
+    assert set(found) - set(good) == {name}
+    assert found[name].remedy
+
+
+def test_assets_of_one_name_do_not_hide_each_other(tmp_path):
+    bad = replace(GOOD, splats=changed(GOOD.splats, 900, opacities=1e-3))
+    bad.save(tmp_path / "bad")
+    GOOD.save(tmp_path / "good")
+    data = {
+        "name": "both",
+        "objects": [{"asset": "bad"}, {"asset": "good"}],
+        "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+    }
+    YAML(typ="safe", pure=True).dump(data, tmp_path / "scene.yaml")
+    assert "box: opacity" in wrong(check_scene(load_scene(tmp_path / "scene.yaml")))
+
+
+def test_an_object_that_cannot_fit_is_refused(scene_data, write_scene, capsys):
+    scene_data["region"] = {"min": [-0.005, -0.005, 0], "max": [0.005, 0.005, 0.2]}
+    assert run("check", write_scene(scene_data)) == 2
+    assert "must fit into the region" in capsys.readouterr().err
+
+
+def test_the_command(tmp_path, capsys):
+    GOOD.save(tmp_path / "good")
+    assert run("check", tmp_path / "good") == 0
+    assert "ok    mass: 0.12 kg, of 1000 kg/m^3" in capsys.readouterr().out
+    replace(GOOD, mesh=OPEN).save(tmp_path / "open")
+    assert run("check", tmp_path / "open") == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert "      to do: close it" in lines[lines.index("look  watertightness: open") + 1]
+
+
+def test_what_cannot_be_read_is_one_sentence(tmp_path, capsys):
+    box_asset("nut").save(tmp_path / "nut")
+    splats = tmp_path / "nut/splats.ply"
+    splats.write_bytes(splats.read_bytes()[:-4] + np.float32(np.nan).tobytes())
+    assert run("check", tmp_path / "nut") == 2
+    assert "quats must be finite (got nan at row 11)" in capsys.readouterr().err

@@ -1,0 +1,278 @@
+"""What must hold in a process that has only just imported mitsplat: entry points, threads, variants, faults."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mitsplat
+from mitsplat.errors import InputError
+from mitsplat.scene.scene import load_scene
+from tests.conftest import WriteScene, box_asset
+
+ROOT = Path(__file__).parents[2]
+
+BEGIN = """
+import sys
+import numpy as np
+import mitsplat as ms
+
+def ball(k=0):
+    return ms.Splats(
+        means=np.float32([[0.02 * k, 0, 0]]), quats=np.float32([[0, 0, 0, 1]]), scales=np.full((1, 3), 0.1, np.float32),
+        opacities=np.float32([0.9]), sh=np.zeros((1, 1, 3), np.float32),
+    )
+
+camera = ms.Camera.look_at((0, 0, -1), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=50)
+"""
+
+
+def fresh(
+    code: str, *arguments: object, folder: Path | None = None, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run code in a process of its own; Dr.Jit finds its LLVM even where Mitsuba is imported before mitsplat."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    environment = {**os.environ, **variables}
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=400, check=False
+    )
+
+
+CALLS = {
+    "Asset": "ms.Asset.load('assets/nut')",
+    "Camera": "camera.project(np.zeros((1, 3)))",
+    "Frame": "ms.Frame",
+    "InputError": "ms.InputError('x')",
+    "Labels": "ms.Labels",
+    "Layers": "ms.Layers",
+    "Layout": "ms.Layout",
+    "Quality": "ms.Quality()",
+    "Scene": "ms.Scene",
+    "SceneSpec": "ms.SceneSpec.model_json_schema()",
+    "Splats": "ms.Splats.load('assets/nut/splats.ply')",
+    "bake_asset": "assert len(bake('part.stl').asset.splats)",
+    "Renderer": "assert ms.Renderer(ms.load_scene('scene.yaml')).render(0).image.any()",
+    "load_scene": "ms.load_scene('scene.yaml')",
+    "render_frame": "assert ms.render_frame(ms.load_scene('scene.yaml'), 0).image.any()",
+    "render_splats": "assert ms.render_splats(ball(), camera).alpha.any()",
+    "settle_layout": "assert ms.settle_layout(ms.load_scene('scene.yaml'), 0).certificate.rested",
+    "write_dataset": "assert ms.write_dataset(ms.load_scene('scene.yaml'), 'out', frames=1, workers=1).frames == 1",
+}
+"""Each public name, used as the first thing in a process."""
+
+FURTHER = {
+    **{f"bake {kind}": f"assert len(bake('part.{kind}').asset.splats)" for kind in ("obj", "glb", "ply")},
+    "bake studio": "assert len(bake('part.stl', light='studio').asset.splats)",
+    "modules": "import importlib; [importlib.import_module(name) for name in modules]",
+}
+
+FORKS = (
+    BEGIN
+    + """
+import json, os, traceback
+import mitsuba, pkgutil
+assert mitsuba.variant() is None
+modules = [f"mitsplat.{m.name}" for m in pkgutil.iter_modules(ms.__path__) if m.name not in ("sfm_child", "plugins")]
+
+def bake(file, **options):
+    from mitsplat.bake.bake import BakeSettings
+    few = BakeSettings(
+        gaussians=30, sh_degree=0, directions=4, samples=1, bounces=1, fit_steps=0, verify_views=0, sharpening=0
+    )
+    return ms.bake_asset(file, name="part", kind="environment", settings=few, **options)
+
+failed = {}
+for name, call in json.loads(sys.argv[1]).items():
+    end, begin = os.pipe()
+    child = os.fork()
+    if not child:
+        try:
+            exec(call)
+            status = 0
+        except BaseException:
+            os.write(begin, traceback.format_exc()[-1500:].encode())
+            status = 1
+        os._exit(status)
+    os.close(begin)
+    said = os.fdopen(end).read()
+    status = os.waitpid(child, 0)[1]
+    if status:
+        failed[name] = f"{status}: {said}"
+print(json.dumps(failed))
+"""
+)
+"""Every call in a fork of a process that has imported mitsplat and chosen no variant, as good as one of its own."""
+
+
+def small(scene: dict[str, object]) -> dict[str, object]:
+    return scene | {"settle": {"stepper": "mujoco"}, "output": {"width": 32, "height": 24, "layouts": 3, "views": 1}}
+
+
+@pytest.fixture
+def desk(scene_data: dict[str, object], write_scene: WriteScene, tmp_path: Path) -> Path:
+    write_scene(small(scene_data))
+    for kind in ("stl", "obj", "glb", "ply"):
+        box_asset("part").mesh.export(tmp_path / f"part.{kind}")
+    return tmp_path
+
+
+def test_every_public_name_can_be_the_first_that_is_used(desk: Path) -> None:
+    assert sorted(CALLS) == mitsplat.__all__
+    done = fresh(FORKS, json.dumps(CALLS | FURTHER), folder=desk)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1]) == {}
+
+
+# Threads
+
+
+def test_first_renders_from_several_threads(desk: Path) -> None:
+    """Each has what it has alone: neither the plugins nor what is on the device may be half made by another one."""
+    code = """
+import threading
+scene = ms.load_scene("scene.yaml")
+jobs = [lambda k=k: ms.render_splats(ball(k), camera).alpha for k in range(3)]
+jobs += [lambda k=k: ms.render_frame(scene, k).instance for k in range(3)]
+found, start = {}, threading.Barrier(len(jobs))
+
+def work(k):
+    start.wait()
+    try:
+        found[k] = jobs[k]()
+    except Exception as error:
+        found[k] = repr(error)
+
+threads = [threading.Thread(target=work, args=(k,)) for k in range(len(jobs))]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+for k, job in enumerate(jobs):
+    assert not isinstance(found[k], str), found[k]
+    assert np.array_equal(found[k], job()), k
+"""
+    done = fresh(BEGIN + code, folder=desk)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+# Variants
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_variant_that_cannot_run_the_plugins_is_refused_and_stays(before: bool) -> None:
+    chosen = "import mitsuba as mi; mi.set_variant('scalar_rgb')\n"
+    code = """
+try:
+    ms.render_splats(ball(), camera)
+except ms.InputError as error:
+    print(error)
+print(mi.variant())
+with mi.scoped_set_variant("llvm_ad_rgb"):
+    alone = ms.render_splats(ball(), camera).alpha
+assert mi.variant() == "scalar_rgb"
+with mi.scoped_set_variant("llvm_ad_rgb"):
+    assert alone.any() and np.array_equal(alone, ms.render_splats(ball(), camera).alpha)
+try:
+    mi.load_dict({"type": "splat_proxy"})
+except RuntimeError as error:
+    print(str(error).splitlines()[-1])
+"""
+    done = fresh(chosen + BEGIN + code if before else BEGIN + chosen + code)
+    assert done.returncode == 0, done.stderr[-2000:]
+    refused, variant, plugin = done.stdout.splitlines()
+    assert refused.startswith("Mitsuba's variant must be llvm_ad_rgb or cuda_ad_rgb for mitsplat (got scalar_rgb)")
+    assert variant == "scalar_rgb"
+    assert "plugin 'splat_proxy' needs the variant llvm_ad_rgb or cuda_ad_rgb (got scalar_rgb)" in plugin
+
+
+# Faults
+
+FAULT = """
+from mitsplat.cli import main
+from mitsplat.capture import targets as board
+
+def write_pdf(*args):
+    raise ZeroDivisionError("on purpose\\nat length")
+
+board.Board.write_pdf = write_pdf
+main(["board", "-o", "board.pdf"])
+"""
+
+
+def test_a_fault_is_a_sentence_and_a_log(tmp_path: Path) -> None:
+    done = fresh(FAULT, folder=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"), MITSPLAT_TRACEBACK="")
+    assert done.returncode == 70
+    assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+    log = re.search(r"ZeroDivisionError: on purpose \(the log is (.+)\)$", done.stderr.strip())[1]
+    assert Path(log).is_relative_to(tmp_path / "cache")
+    assert "in write_pdf" in Path(log).read_text() and f"mitsplat {mitsplat.__version__}" in Path(log).read_text()
+
+
+def test_the_log_goes_where_it_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    places = {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path), "MITSPLAT_TRACEBACK": "1"}
+    done = fresh(FAULT, folder=tmp_path, **places)
+    assert done.returncode == 70
+    assert "in write_pdf" in done.stderr  # for developers
+    assert Path(re.search(r"the log is (.+)\)$", done.stderr.strip())[1]).parent == tmp_path
+
+
+WORKER = """
+import sys
+from mitsplat.dataset import write as dataset
+from mitsplat.cli import main
+
+class Broken:
+    def __call__(self, index, note, /):
+        raise KeyError("on purpose")
+
+def broken(*args, **kwargs):
+    from mitsplat.engine.pool import run_apart
+    next(run_apart(Broken()))
+
+if __name__ == "__main__":
+    dataset.write_dataset = broken
+    main(["render", "scene.yaml", *sys.argv[1:]])
+"""
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_a_fault_in_a_worker_process_is_one_too(desk: Path, options: tuple[str, ...]) -> None:
+    (desk / "broken.py").write_text(WORKER)
+    done = subprocess.run(
+        [sys.executable, "broken.py", *options], cwd=desk, capture_output=True, text=True, timeout=400, check=False
+    )
+    assert done.returncode == 70
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]
+    told = json.loads(last)["message"] if options else last
+    assert "FrameError: frame 0 failed: KeyError: 'on purpose'" in told
+    log = Path(re.search(r"the log is (.+)\)$", told)[1]).read_text()
+    assert 'raise KeyError("on purpose")' in log
+
+
+def test_a_reader_that_leaves_early_is_no_fault() -> None:
+    command = f"{sys.executable} -m mitsplat.cli schema | head -c 1; echo; echo ${{PIPESTATUS[0]}}"
+    code = "from mitsplat.cli import main; main(['schema'])"
+    command = f'{sys.executable} -c "{code}" | true; true'
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=100, check=False)
+    assert done.stderr == ""
+
+
+# Sentences
+
+
+def test_readme_shows_what_a_wrong_scene_is_told(scene_data: dict[str, object], write_scene: WriteScene) -> None:
+    shown = re.search(
+        r"^    (scenes/cell\.yaml:\d+: objects\[2\]\.count: .*)$", (ROOT / "README.md").read_text(), re.M
+    )[1]
+    wrong = [{"asset": "assets/nut"}, {"asset": "assets/bolt"}, {"asset": "assets/nut", "count": -3}]
+    path = write_scene(scene_data | {"objects": wrong})
+    line = next(n for n, text in enumerate(path.read_text().splitlines(), 1) if "count: -3" in text)
+    with pytest.raises(InputError) as told:
+        load_scene(path)
+    assert str(told.value) == shown.replace("scenes/cell.yaml:17:", f"{path}:{line}:")

@@ -1,0 +1,168 @@
+"""What a scene reads decides whether its dataset can be resumed: every file of every entry, whatever its name."""
+
+import re
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from ruamel.yaml import YAML
+
+from mitsplat.asset import Asset
+from mitsplat.dataset.inputs import describe_inputs
+from mitsplat.errors import InputError
+from mitsplat.frames.mitsuba_xml import export_xml
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.scene import load_scene
+from mitsplat.splats import Splats
+from tests.conftest import box_asset
+from tests.dataset.test_write import never_render, write
+
+SCENE = {
+    "name": "all inputs",
+    "environment": "assets/room",
+    "objects": [
+        {"asset": "assets/nut"},
+        {"asset": "assets/other_nut"},  # of the same name
+        {"asset": "assets/loose", "size": 0.04},
+        {"asset": "assets/loose", "size": 0.05},
+        {"asset": "assets/nut", "class_name": "large", "scale": 2},
+    ],
+    "shapes": [
+        {"name": "nut", "mesh": "table.ply", "visible": True},  # as the assets are called
+        {"name": "assets/sky.png", "mesh": "stand.obj", "visible": True},
+    ],
+    "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
+    "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
+    "lights": [{"kind": "point", "position": [0, 0, 1]}, {"kind": "environment", "image": "assets/sky.png"}],
+    "output": {"width": 64, "height": 48, "layouts": 2, "views": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A scene of everything that can be read, and its dataset of one frame."""
+    folder = tmp_path_factory.mktemp("inputs")
+    points = {"top": (0.0, 0.0, 0.005), "tip": (0.01, 0.0, 0.0)}
+    for name, size in (("nut", 0.02), ("other_nut", 0.03)):
+        replace(box_asset("nut", (size, 0.03, 0.01)), keypoints=points).save(folder / "assets" / name)
+    replace(box_asset("loose"), class_name="nut", units="unknown", keypoints=points).save(folder / "assets/loose")
+    replace(box_asset("nut", (1.0, 1.0, 0.5)), kind="environment", white=3.0).save(folder / "assets/room")
+    trimesh.creation.box((1, 1, 0.1)).export(folder / "table.ply")
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(folder / "stand.obj")
+    cv2.imwrite(str(folder / "assets/sky.png"), np.full((4, 8, 3), 90, dtype=np.uint8))
+    YAML(typ="safe", pure=True).dump(SCENE, folder / "scene.yaml")
+    write(load_scene(folder / "scene.yaml"), folder / "out", frames=1)
+    return folder
+
+
+@pytest.fixture
+def copy(made, tmp_path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "copy"))
+
+
+def colour(path: Path) -> None:
+    """One Gaussian of a PLY gets another red."""
+    splats = Asset.load(path.parent).splats
+    sh = splats.sh.copy()
+    sh[3, 0, 0] += 0.25
+    replace(splats, sh=sh).save(path)
+
+
+def bend(path: Path) -> None:
+    """The first vertex of a mesh moves by a little of its size, to the inside."""
+    mesh = trimesh.load_mesh(path, process=False)
+    mesh.vertices[0] *= 0.99
+    mesh.export(path)
+
+
+def repaint(path: Path) -> None:
+    picture = cv2.imread(str(path))
+    picture[0, 0, 0] += 1
+    cv2.imwrite(str(path), picture)
+
+
+def say(before: str, after: str):
+    def edit(path: Path) -> None:
+        text = path.read_text()
+        assert text.count(before) == 1
+        path.write_text(text.replace(before, after))
+
+    return edit
+
+
+OBJECTS = {"nut": (0, 4), "other_nut": (1,), "loose": (2, 3)}
+EDITS = [
+    *((f"assets/{name}/splats.ply", colour, f"objects[{at[0]}].splats") for name, at in OBJECTS.items()),
+    *((f"assets/{name}/mesh.ply", bend, f"objects[{at[0]}].mesh") for name, at in OBJECTS.items()),
+    *((f"assets/{name}/pieces.ply", bend, f"objects[{at[0]}].pieces") for name, at in OBJECTS.items()),
+    *(
+        (f"assets/{name}/asset.yaml", say("friction: 0.5", "friction: 0.7"), f"objects[{at[0]}].friction")
+        for name, at in OBJECTS.items()
+    ),
+    ("assets/other_nut/asset.yaml", say("name: nut\n", "name: nut2\n"), "assets"),
+    ("assets/other_nut/asset.yaml", say("class: nut", "class: large"), "objects[1].class_name"),
+    ("assets/other_nut/asset.yaml", say("density: 1000.0", "mass: 0.5"), "objects[1].mass"),
+    ("assets/other_nut/asset.yaml", say("- 0.005", "- 0.004"), "objects[1].keypoints.top"),
+    ("assets/other_nut/asset.yaml", say("roughness: 0.4", "roughness: 0.3"), "objects[1].roughness"),
+    ("assets/other_nut/asset.yaml", say("specular: 0.04", "specular: 0.05"), "objects[1].specular"),
+    ("assets/other_nut/asset.yaml", say("capture_light: uniform", "capture_light: scene"), "objects[1].capture_light"),
+    ("assets/room/asset.yaml", say("white: 3.0", "white: 2.0"), "environment.white"),
+    ("assets/room/splats.ply", colour, "environment.splats"),
+    ("assets/room/mesh.ply", bend, "environment.mesh"),
+    ("assets/room/pieces.ply", bend, "environment.pieces"),
+    ("table.ply", bend, "shapes[0]"),
+    ("stand.obj", bend, "shapes[1]"),
+    ("assets/sky.png", repaint, "lights[1].image"),
+]
+
+
+@pytest.mark.parametrize(("file", "edit", "key"), EDITS, ids=[f"{file} {key}" for file, _, key in EDITS])
+def test_an_edit_of_any_file_is_refused_by_its_place(copy, file, edit, key):
+    edit(copy / file)
+    with pytest.raises(InputError) as caught:
+        write(load_scene(copy / "scene.yaml"), copy / "out", render=never_render)
+    key = key if key == "assets" else f"inputs.{key}"
+    assert str(caught.value).startswith(f"{copy / 'out'} cannot be resumed: {key}")
+    assert str(caught.value).endswith("; overwrite it or choose another")
+
+
+def test_what_is_not_read_may_change(copy):
+    """A remark, a file that nothing names, and the time of a file are not content."""
+    with (copy / "assets/nut/asset.yaml").open("a") as file:
+        file.write("# seen\n")
+    (copy / "assets/nut/notes.txt").write_text("")
+    (copy / "table.ply").touch()
+    assert write(load_scene(copy / "scene.yaml"), copy / "out").rendered == 1
+
+
+def test_places_of_one_asset_are_told_apart(made):
+    found = describe_inputs(load_scene(made / "scene.yaml"))
+    assert len({found[f"objects[{i}]"]["splats"] for i in range(5)}) == 5
+    assert found["objects[0]"]["class_name"] == "nut"
+    assert found["objects[4]"]["class_name"] == "large"
+    assert set(found["environment"]) == {f.name for f in fields(Asset)} - {"folder"}
+
+
+def test_an_exported_scene_holds_every_asset_of_one_name_as_it_is_now(copy, tmp_path, monkeypatch):
+    """Also where an earlier export left files, and where a name is none for a file."""
+    monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", every_entry)
+    for name in ("nut", "a/b"):
+        for folder in ("nut", "other_nut"):
+            file = copy / "assets" / folder / "asset.yaml"
+            file.write_text(re.sub("^name: .*", f"name: {name}", file.read_text(), flags=re.MULTILINE))
+        colour(copy / "assets/other_nut/splats.ply")
+        scene = load_scene(copy / "scene.yaml")
+        export_xml(scene, 0, tmp_path / "frame.xml")
+        for position, asset in enumerate(scene.assets):
+            kept = Splats.load(tmp_path / f"frame_files/object_{position}.ply")
+            np.testing.assert_array_equal(kept.sh, asset.splats.sh)
+            np.testing.assert_array_equal(kept.means, asset.splats.means)
+
+
+def every_entry(scene, index):
+    poses = (Instance(i + 1, i, 0, np.eye(4)) for i in range(len(scene.assets)))
+    return Layout(index, tuple(poses), NOTHING_TO_REST)

@@ -1,0 +1,202 @@
+"""Runs that would end in nothing, or in more than the machine holds, are refused before they start, with the cause."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mitsplat.camera import Camera
+from mitsplat.checks.preflight import check_scene
+from mitsplat.dataset import prospects
+from mitsplat.dataset import write as dataset
+from mitsplat.dataset.prospects import doubts, points_inside, refuse, run_faults, sees
+from mitsplat.dataset.write import write_dataset
+from mitsplat.errors import InputError
+from mitsplat.frames import speed_accuracy as chart
+from mitsplat.scene.layout import NOTHING_TO_REST, Layout
+from mitsplat.scene.scene import load_scene
+from tests.bodies import pose_at
+from tests.cli.test_cli import run
+from tests.dataset.test_write import render, settle
+
+
+def path_of(*eyes, target=(0, 0, 0.02), **intrinsics):
+    """A camera on a path that looks from each eye to a target."""
+    lens = {"intrinsics": intrinsics} if intrinsics else {}
+    return {"kind": "path", "keys": [{"eye": list(eye), "target": list(target)} for eye in eyes], **lens}
+
+
+ABOVE, INSIDE = (0.3, 0.3, 0.4), (0.1, 0.1, -0.05)
+TABLE = {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}
+BIN, NARROW = ({"name": "bin", "bin": {"size": [0.012, depth, 0.03]}} for depth in (0.03, 0.015))
+HOPELESS = {
+    "inside": ({"camera": path_of(INSIDE, (0.2, 0, -0.05))}, "camera: every view is from inside of shape 'table'"),
+    "away": ({"camera": path_of(ABOVE, target=(3, 3, 4))}, "camera: no view shows any place that objects can reach"),
+    "near": ({"camera": path_of(ABOVE, fov_x=60, near=5)}, r"near: must be nearer .*, 1\.\d+ m \(got 5\)"),
+    "narrow": ({"camera": path_of(ABOVE, fx=1e9)}, r"camera.intrinsics: an image shows at most .*e-08 m"),
+    "far": ({"camera": path_of((200, 0, 200), fov_x=60)}, r"no object covers more than .* \(labels.min_pixels is 16\)"),
+    "tiny": ({"output": {"width": 1, "height": 1}}, "an image of 1 px cannot show labels.min_pixels = 16"),
+    "huge": ({"output": {"width": 16000, "height": 16000}}, r"16000x16000 px takes at least 95.9 GiB of memory \(8.0"),
+    "ids": ({"objects": [{"asset": "assets/nut", "count": 10**8}]}, r"objects: .* at most 65535 .*\(got 100000000\)"),
+    "room": ({"objects": [{"asset": "assets/nut", "count": 9000}]}, r"9000 objects of 54 l .* \(it has 28.8 l\)"),
+    "frames": ({"output": {"layouts": 10**9, "views": 10**9}}, "layouts x views must be at most 2147483647"),
+    "disk": ({"output": {"layouts": 10**5, "views": 10**4}}, r"1000000000 images take at least 7629.4 GiB \(10.0 GiB"),
+    "buried": ({"region": {"min": [-0.1, -0.1, -0.09], "max": [0.1, 0.1, -0.01]}}, "inside of .*, 'table'"),
+    "nothing below": ({"region": {"min": [1, 1, 0.1], "max": [1.2, 1.2, 0.2]}}, "nothing that collides is below it"),
+    "below": ({"region": {"min": [0, 0, -0.5], "max": [0.2, 0.2, -0.3]}}, "nothing that collides is below it"),
+    "steps": ({"settle": {"timestep": 1e-9}}, r"max_time / timestep must be at most .* \(got 6 s / 1e-09 s\)"),
+}
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """One with 8 GiB of memory and 10 of disk."""
+    monkeypatch.setattr(prospects, "unused_memory", lambda: 8.0)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2**40, 0, 10 * 2**30))
+
+
+def scene_with(scene_data, write_scene, change):
+    return load_scene(write_scene({**scene_data, **change}))
+
+
+@pytest.mark.parametrize("name", HOPELESS)
+@pytest.mark.usefixtures("machine")
+def test_what_cannot_work_is_refused(name, scene_data, write_scene):
+    assert list(run_faults(load_scene(write_scene(scene_data)))) == []
+    change, cause = HOPELESS[name]
+    scene = scene_with(scene_data, write_scene, change)
+    with pytest.raises(InputError, match=f"^{scene.path}: .*{cause}"):
+        refuse(scene, run_faults(scene))
+
+
+@pytest.mark.usefixtures("machine")
+def test_check_and_render_say_the_same(scene_data, write_scene, tmp_path, capsys):
+    path = write_scene({**scene_data, "camera": path_of(INSIDE)})
+    said = "camera: every view is from inside of shape 'table', which hides all objects"
+    assert run("check", path) == 1
+    assert f"look  sight: {said}\n      to do: move camera out of it\n" in capsys.readouterr().out
+    for command in (("render", path, "-o", tmp_path / "out"), ("render", path, "--tolerance", "0.1")):
+        assert run(*command) == 2
+        assert f"{path}: {said}; move camera out of it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    buried = write_scene({**scene_data, **HOPELESS["buried"][0]})
+    for command in (("preview", buried, "-o", tmp_path / "one.png"), ("settle", buried)):
+        assert run(*command) == 2
+        assert "region: lies inside of what collides" in capsys.readouterr().err
+    scene_data["camera"]["intrinsics"] = {"fx": 60, "distortion": [0.1, 0, 0, 0]}
+    scene_data["output"]["formats"] = ["bop"]
+    assert run("check", write_scene(scene_data)) == 1
+    assert "look  formats: " in capsys.readouterr().out
+    assert run("render", path, "--workers", 1000, "-o", tmp_path / "out") == 2
+
+
+@pytest.mark.usefixtures("machine")
+def test_what_may_work_is_not_refused(scene_data, write_scene):
+    """Closed rooms around camera and objects, near planes before them, close-ups, background without objects."""
+    room = {"name": "room", "box": {"size": [3, 3, 3], "position": [0, 0, 1.39]}, "visible": True, "collider": False}
+    fine = [
+        {"shapes": [*scene_data["shapes"], room]},
+        {"camera": path_of((0.3, 0.3, 0.4), INSIDE)},
+        {"camera": path_of(ABOVE, fov_x=60, near=0.3)},
+        {"camera": path_of((0.03, 0.0, 0.03), fov_x=20)},
+        {"camera": path_of((0.0, 0.0, 9.0), fov_x=3)},
+        {"objects": [], "camera": path_of(ABOVE, target=(3, 3, 4))},
+        {"shapes": [*scene_data["shapes"], BIN]},
+        {"region": {"min": [-0.2, -0.2, -0.05], "max": [0.2, 0.2, 0.1]}},
+        {"objects": [{"asset": "assets/nut", "poses": [{"position": [0, 0, 0.1]}]}]},
+    ]
+    for change in fine:
+        assert list(run_faults(scene_with(scene_data, write_scene, change))) == [], change
+
+
+TOLD = "views", "lights", "bin"
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({"camera": path_of(ABOVE, ABOVE, INSIDE, INSIDE)}, "of 12 views [2-6] are from inside"),
+        ({"lights": [{"kind": "point", "position": [0, 0, -0.05]}]}, r"lights\[0\] is inside of shape 'table'"),
+        ({"shapes": [{"name": "table", "box": TABLE, "visible": True}, NARROW]}, "'nut' does not fit into 'bin'"),
+    ],
+)
+def test_what_is_hardly_meant_is_told(change, found, scene_data, write_scene, machine):
+    assert all(finding.ok for finding in doubts(load_scene(write_scene(scene_data))))
+    scene_data["output"] = {**scene_data["output"], "layouts": 1, "views": 12}
+    scene = scene_with(scene_data, write_scene, change)
+    (finding,) = (finding for finding in check_scene(scene) if finding.name in TOLD and not finding.ok)
+    assert re.match(found, finding.text)
+
+
+def test_points_inside():
+    """Of a ring: in its ring and not in its hole, whichever way it is wound; of an open box, where most of it is."""
+    ring = trimesh.creation.annulus(r_min=0.5, r_max=1.0, height=0.4)
+    points = np.array([[0, 0, 0], [0.75, 0, 0], [0, -0.75, 0.1], [0.75, 0, 0.3], [0.4, 0, 0.0], [5, 0, 0]])
+    expected = [False, True, True, False, False, False]
+    turn = pose_at((1, 2, 3), Rotation.from_rotvec((0.3, 1, -2)))
+    for mesh in (ring, trimesh.Trimesh(ring.vertices, ring.faces[:, ::-1])):
+        assert points_inside(mesh, points).tolist() == expected
+        moved = points @ turn[:3, :3].T + turn[:3, 3]
+        assert points_inside(mesh.copy().apply_transform(turn), moved).tolist() == expected
+
+
+def test_sees():
+    """Against many points of boxes anywhere, for lenses of all widths."""
+    rng, cases = np.random.default_rng(4), []
+    for _ in range(200):
+        eye, target = rng.normal(size=(2, 3))
+        size = 10 ** rng.uniform(-1, 0.5, 3)
+        low = rng.normal(size=3) - size / 2
+        near = rng.uniform(0.01, 1)
+        camera = Camera.look_at(eye, target, width=200, height=150, fov_x=rng.uniform(5, 120), near=near)
+        pixels, depth = camera.project(low + rng.uniform(size=(20000, 3)) * size)
+        with np.errstate(invalid="ignore"):
+            in_image, nearby = (
+                ((pixels > -margin) & (pixels < np.add((200, 150), margin))).all(axis=1) & (depth > near)
+                for margin in (0, 20)
+            )
+        if in_image.mean() > 0.002 or not nearby.any():
+            cases.append(bool(in_image.any()))
+            assert sees(camera, low, low + size) == cases[-1]
+    assert 40 < sum(cases) < len(cases) - 40
+
+
+@pytest.mark.parametrize("tolerance", ["-1", "nan"])
+def test_a_tolerance_is_refused_before_anything_is_rendered(
+    tolerance, scene_data, write_scene, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.setattr(chart, "_run_alone", lambda *args: pytest.fail("rendered"))
+    path = write_scene(scene_data)
+    assert run("render", path, f"--tolerance={tolerance}", "-o", tmp_path / "out") == 2
+    assert run("chart", path, f"--tolerance={tolerance}", "-o", tmp_path / "chart.png") == 2
+    assert capsys.readouterr().err.count(f"tolerance must be at least 0 (got {float(tolerance)})") == 2
+
+
+def test_a_dataset_without_any_label_is_told(scene_data, write_scene, tmp_path, monkeypatch, capsys):
+    """Status 4, and why; not where there is nothing to label, nor for a shard, whose others may have labels."""
+    laid_out = settle
+
+    def away(scene, index, *, layout):
+        frame = render(scene, index, layout=layout)
+        nothing = np.zeros_like(frame.instance)
+        dropped = {**frame.labels.dropped, "outside": len(layout.instances)}
+        frame.labels = type(frame.labels)(frame.labels.width, frame.labels.height, (), dropped)
+        frame.instance, frame.proxy_instance = nothing, nothing
+        return frame
+
+    def write(scene, out, **options):
+        return write_dataset(scene, out, **options, render=away, settle=laid_out)
+
+    monkeypatch.setattr(dataset, "write_dataset", write)
+    path = write_scene(scene_data)
+    assert run("render", path, "-o", tmp_path / "out", "--workers", 1) == 4
+    told = capsys.readouterr()
+    assert "0 labelled instances" in told.out
+    assert "no image has a label (not labelled: " in told.err
+    assert "outside)" in told.err
+    assert run("render", path, "-o", tmp_path / "part", "--workers", 1, "--shard", "1/2") == 0
+    laid_out = lambda scene, index, **_: Layout(index, (), NOTHING_TO_REST)  # noqa: E731
+    assert run("render", path, "-o", tmp_path / "empty", "--workers", 1) == 0

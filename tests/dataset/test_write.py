@@ -1,0 +1,447 @@
+"""Dataset folders: content, resumption, interruption and refusals, with a synthetic renderer for the real one."""
+
+import hashlib
+import json
+import os
+import shutil
+import socket
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from pycocotools.coco import COCO
+from ruamel.yaml import YAML
+
+from mitsplat.dataset import folder, manifest
+from mitsplat.dataset.manifest import Manifest
+from mitsplat.dataset.write import write_dataset
+from mitsplat.engine.pool import FrameError
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.files import SPLITS
+from mitsplat.formats.yolo import data_yaml
+from mitsplat.frames.layer_sheet import layer_sheet
+from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
+from mitsplat.labels.overlay import class_colour, draw_labels
+from mitsplat.masks import Silhouette
+from mitsplat.scene.layout import Instance, Layout, RestCertificate
+from mitsplat.scene.scene import load_scene, plan_frame, random_stream
+
+PARSE_LINE = manifest.parse_line
+CERTIFICATE = RestCertificate(
+    rested=True,
+    inside=True,
+    overflow=False,
+    time_to_rest=1.5,
+    max_speed=0.0,
+    max_spin=0.0,
+    surface_motion=0.0,
+    collider_penetration=1e-5,
+    pair_penetration=0.0,
+    support_gap=0.0,
+    standoff=0.0,
+    attempts=2,
+    refused=("too deep",),
+)
+
+
+def settle(scene, index, *, progress):
+    """Three objects at random places; no physics."""
+    rng = random_stream(scene.spec.seed, "synthetic layout", index)
+    instances = []
+    for i in range(3):
+        pose = np.eye(4)
+        pose[:3, 3] = rng.uniform(-1, 1, 3)
+        instances.append(Instance(i + 1, i % len(scene.assets), i % len(scene.class_names), pose))
+    return Layout(index, tuple(instances), CERTIFICATE)
+
+
+def render(scene, index, *, layout):
+    """A disc per object on noise."""
+    plan = plan_frame(scene, index)
+    camera = plan.camera
+    rng = np.random.default_rng(plan.seed)
+    ids = np.zeros((camera.height, camera.width), dtype=np.int32)
+    for instance in layout.instances:
+        x, y = (instance.world_from_object[:2, 3] * 0.4 + 0.5) * (camera.width, camera.height)
+        cv2.circle(ids, (int(x), int(y)), 7, instance.id, cv2.FILLED)
+    image = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+    silhouettes = {int(i): Silhouette.cropped(ids == i, 0, 0) for i in np.unique(ids[ids > 0])}
+    return SimpleNamespace(
+        index=index,
+        plan=plan,
+        layout=layout,
+        camera=camera,
+        image=image,
+        rgb=image.astype(np.float32) / 255,
+        depth=ids.astype(np.float32),
+        instance=ids.astype(np.uint16),
+        proxy_instance=ids.astype(np.uint16),
+        normal=np.stack(np.meshgrid(range(camera.width), range(camera.height), [0.5]), -1)[:, :, 0].astype(np.float32),
+        light=np.ones((*ids.shape, 3), dtype=np.float32),
+        layers={"alpha": np.ones(ids.shape, dtype=np.float32)},
+        labels=label_instances(Truth(ids, ids, silhouettes, ids), layout.instances, scene.class_names, LabelRules()),
+        draws=plan.draws,
+        seconds={"march": 0.01},
+    )
+
+
+@dataclass(frozen=True)
+class RenderUntil:
+    """Renders as :func:`render`, but raises at one frame."""
+
+    index: int
+    error: type[BaseException]
+
+    def __call__(self, scene, index, *, layout):
+        if index == self.index:
+            raise self.error("stopped")
+        return render(scene, index, layout=layout)
+
+
+@pytest.fixture
+def scene(scene_data, write_scene):
+    scene_data["output"]["formats"] = ["yolo", "coco", "exr"]
+    return load_scene(write_scene(scene_data))
+
+
+def write(scene, out, **options):
+    return write_dataset(scene, out, **{"render": render, "settle": settle, **options})
+
+
+def contents(root, *, without=("timings.jsonl", "runs.jsonl", ".lock")):
+    """SHA-256 of every file that must not depend on how the dataset was made."""
+    files = (path for path in sorted(root.rglob("*")) if path.is_file() and path.name not in without)
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture
+def undisturbed(scene, tmp_path):
+    write(scene, tmp_path / "undisturbed")
+    return contents(tmp_path / "undisturbed")
+
+
+class TestContent:
+    def test_every_frame_has_its_files_and_a_line(self, scene, tmp_path):
+        told = []
+        summary = write(scene, tmp_path / "out", progress=lambda *event: told.append(event))
+        assert (summary.frames, summary.rendered) == (12, 12)
+        assert summary.images == {"train": 8, "val": 4}
+        assert summary.contact_sheet.is_file()
+        assert told[0] == (0, 12, "starting")
+        assert told[-1] == (12, 12, "frame 11")
+        assert sum("settling layout" in text for *_, text in told) == 3
+        records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+        assert [record["index"] for record in records] == list(range(12))
+        for record in records:
+            assert len(record["files"]) == 3
+            assert record["rest"]["refused"] == ["too deep"]
+            for file, digest in record["files"].items():
+                assert hashlib.sha256((tmp_path / "out" / file).read_bytes()).hexdigest() == digest
+        timings = [json.loads(line) for line in (tmp_path / "out/timings.jsonl").read_text().splitlines()]
+        assert all(set(line) == {"index", "march", "settle", "write"} for line in timings)
+
+    def test_the_manifest_is_read_once_to_open_and_once_to_end(self, scene, tmp_path, monkeypatch):
+        """Whatever the number of formats: reading and hashing it is most of what the end of a run takes."""
+        read = []
+        monkeypatch.setattr(manifest, "parse_line", lambda line: read.append(1) or PARSE_LINE(line))
+        write(scene, tmp_path / "out")
+        assert len(read) == 12
+        next((tmp_path / "out/images").rglob("000005.png")).unlink()
+        read.clear()
+        write(scene, tmp_path / "out")
+        assert len(read) == 24
+
+    def test_views_of_a_layout_share_their_split(self, scene, tmp_path):
+        write(scene, tmp_path / "out")
+        splits = {}
+        for record in Manifest(tmp_path / "out/manifest.jsonl"):
+            splits.setdefault(record["layout"], set()).add(record["split"])
+        assert all(len(found) == 1 for found in splits.values())
+        assert {split for found in splits.values() for split in found} == set(SPLITS)
+
+    def test_images_are_the_pixels_that_were_rendered(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        stored = cv2.imread(str(next((tmp_path / "out/images").rglob("000000.png"))))
+        expected = render(scene, 0, layout=settle(scene, 0, progress=print)).image
+        np.testing.assert_array_equal(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), expected)
+
+    def test_data_yaml_names_splits_relative_to_itself(self, scene, tmp_path):
+        write(scene, tmp_path / "out")
+        data = YAML(typ="safe").load(tmp_path / "out/data.yaml")
+        assert data == {"train": "images/train", "val": "images/val", "names": {0: "bolt", 1: "nut"}}
+        assert [path.name for path in (tmp_path / "out").glob("*.y*ml")] == ["data.yaml"]
+
+    def test_data_yaml_of_one_split_and_of_odd_names(self):
+        data = YAML(typ="safe").load(data_yaml(["no", "12", 'a "b": c'], ["train"]))
+        assert data["val"] == "images/train"
+        assert data["names"] == {0: "no", 1: "12", 2: 'a "b": c'}
+
+    def test_an_image_without_instances_has_an_empty_label(self, scene, tmp_path):
+        def empty(scene, index, *, layout):
+            frame = render(scene, index, layout=layout)
+            frame.labels = Labels(64, 48, (), {"hidden": 3})
+            return frame
+
+        summary = write(scene, tmp_path / "out", frames=1, render=empty)
+        assert (tmp_path / "out/labels/train/000000.txt").read_text() == ""
+        assert (summary.instances, summary.dropped) == ({}, {"hidden": 3})
+
+    def test_coco_reads_back_the_masks(self, scene, tmp_path, capsys):
+        write(scene, tmp_path / "out")
+        for split in SPLITS:
+            coco = COCO(tmp_path / f"out/annotations/instances_{split}.json")
+            records = {record["index"]: record for record in Manifest(tmp_path / "out/manifest.jsonl")}
+            assert sorted(coco.imgs) == [index for index, record in records.items() if record["split"] == split]
+            for index, image in coco.imgs.items():
+                assert (tmp_path / f"out/images/{split}" / image["file_name"]).is_file()
+                labels = Labels.from_json(records[index]["labels"])
+                annotations = coco.imgToAnns[index]
+                for annotation, entry in zip(annotations, labels.instances, strict=True):
+                    x, y, width, height = annotation["bbox"]
+                    mask = coco.annToMask(annotation)
+                    np.testing.assert_array_equal(mask[y : y + height, x : x + width], entry.mask)
+                    assert mask.sum() == annotation["area"] == entry.area
+                    assert coco.cats[annotation["category_id"]]["name"] == entry.class_name
+        capsys.readouterr()
+
+    def test_exr_holds_every_layer(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
+        with OpenEXR.File(str(tmp_path / "out/layers/train/000000.exr"), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+        single = {"R", "G", "B", "A", "Z", "instance", "proxy_instance"}
+        assert set(channels) == single | {f"normal.{axis}" for axis in "XYZ"} | {f"light.{axis}" for axis in "RGB"}
+        np.testing.assert_array_equal(channels["R"], frame.rgb[..., 0])
+        np.testing.assert_array_equal(channels["normal.Y"], frame.normal[..., 1])
+        np.testing.assert_array_equal(channels["instance"], frame.instance)
+        assert channels["instance"].dtype == np.uint32
+
+    def test_jpeg(self, scene_data, write_scene, tmp_path):
+        scene_data["output"]["image"] = "jpg"
+        write(load_scene(write_scene(scene_data)), tmp_path / "out", frames=1)
+        assert (tmp_path / "out/images/train/000000.jpg").read_bytes().startswith(b"\xff\xd8")
+
+    def test_the_scene_file_is_kept(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        assert (tmp_path / "out/scene/scene.yaml").read_bytes() == scene.path.read_bytes()
+        assert json.loads((tmp_path / "out/dataset.json").read_bytes())["scene"]["seed"] == 7
+
+
+class TestSameBytes:
+    def test_for_one_and_two_workers(self, scene, tmp_path, undisturbed):
+        write(scene, tmp_path / "out", workers=2)
+        assert contents(tmp_path / "out") == undisturbed
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+    def test_stopped_in_a_frame_and_resumed(self, scene, tmp_path, undisturbed, error):
+        out = tmp_path / "out"
+        with pytest.raises(error):
+            write(scene, out, render=RenderUntil(5, error))
+        assert len(Manifest(out / "manifest.jsonl")) == 5
+        assert write(scene, out).rendered == 7
+        assert contents(out) == undisturbed
+
+    def test_a_worker_that_fails_keeps_the_others_frames(self, scene, tmp_path, undisturbed):
+        out = tmp_path / "out"
+        with pytest.raises(FrameError, match="frame 5 failed"):
+            write(scene, out, render=RenderUntil(5, RuntimeError), workers=2)
+        kept = len(Manifest(out / "manifest.jsonl"))
+        assert kept >= 1
+        assert write(scene, out).rendered == 12 - kept
+        assert contents(out) == undisturbed
+
+    def test_stopped_between_image_and_label(self, scene, tmp_path, undisturbed, monkeypatch):
+        out = tmp_path / "out"
+
+        def fail(*args):
+            raise OSError(28, "No space left on device")
+
+        with monkeypatch.context() as patch, pytest.raises(MissingResourceError, match=r"No space .*: make room"):
+            patch.setattr("mitsplat.formats.registry.yolo_lines", fail)
+            write(scene, out)
+        assert (out / "images/train/000000.png").is_file()
+        assert not list(out.rglob("*.txt"))
+        assert not list(out.rglob(".*.part"))
+        assert write(scene, out).rendered == 12
+        assert contents(out) == undisturbed
+
+    @pytest.mark.parametrize("torn", [1, 40, 300])
+    def test_torn_last_lines(self, scene, tmp_path, undisturbed, torn):
+        out = tmp_path / "out"
+        write(scene, out, frames=6)
+        for name in ("manifest.jsonl", "timings.jsonl"):
+            lines = (out / name).read_bytes().splitlines(keepends=True)
+            (out / name).write_bytes(b"".join(lines[:-1]) + lines[-1][: min(torn, len(lines[-1]) - 1)])
+        assert write(scene, out).rendered == 7
+        assert contents(out) == undisturbed
+        for line in (out / "timings.jsonl").read_text().splitlines():
+            json.loads(line)
+
+    def test_a_frame_that_lost_a_file_is_made_again(self, scene, tmp_path, undisturbed):
+        out = tmp_path / "out"
+        write(scene, out)
+        next(out.rglob("000003.txt")).unlink()
+        assert write(scene, out).rendered == 1
+        assert contents(out) == undisturbed
+
+    def test_in_two_goes(self, scene, tmp_path, undisturbed):
+        write(scene, tmp_path / "out", frames=5)
+        summary = write(scene, tmp_path / "out")
+        assert (summary.frames, summary.rendered) == (12, 7)
+        assert contents(tmp_path / "out") == undisturbed
+
+    def test_with_layouts_added(self, scene, tmp_path, undisturbed):
+        out = tmp_path / "out"
+        write(load_scene(scene.path, overrides={"output.layouts": 2, "output.formats": scene.spec.output.formats}), out)
+        assert write(scene, out).rendered == 4
+        assert contents(out) == undisturbed
+
+    def test_partial_files_are_cleared(self, scene, tmp_path, undisturbed):
+        out = tmp_path / "out"
+        write(scene, out, frames=2)
+        (out / "images/train/.000002.png.123.part").write_bytes(b"half")
+        write(scene, out)
+        assert contents(out) == undisturbed
+
+    def test_views_of_a_layout_get_the_same_object(self, scene, tmp_path):
+        seen = []
+
+        def watch(scene, index, *, layout):
+            seen.append(layout)
+            return render(scene, index, layout=layout)
+
+        write(scene, tmp_path / "out", render=watch)
+        assert len(set(map(id, seen))) == 3
+
+    def test_settled_layouts_are_not_settled_again(self, scene, tmp_path):
+        def never(scene, index, *, progress):
+            raise AssertionError(index)
+
+        write(scene, tmp_path / "out", frames=3)
+        write(scene, tmp_path / "out", frames=4, settle=never)
+
+
+def never_render(scene, index, *, layout):
+    raise AssertionError("rendered although the output was refused")
+
+
+class TestRefusals:
+    def refuse(self, scene, out, message, **options):
+        with pytest.raises(InputError, match=message):
+            write(scene, out, render=never_render, **options)
+
+    def test_another_seed(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        other = load_scene(scene.path, overrides={"seed": 8})
+        self.refuse(other, tmp_path / "out", r"cannot be resumed: scene\.seed was 7 and is 8")
+
+    def test_another_size(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        other = load_scene(scene.path, overrides={"output.width": 80})
+        self.refuse(other, tmp_path / "out", r"scene\.output\.width was 64 and is 80")
+
+    def test_a_changed_asset(self, scene, scene_data, write_scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        shutil.rmtree(tmp_path / "assets/nut")
+        shutil.copytree(tmp_path / "assets/bolt", tmp_path / "assets/nut")
+        manual = tmp_path / "assets/nut/asset.yaml"
+        manual.write_text(manual.read_text().replace("bolt", "nut"))
+        self.refuse(load_scene(scene.path), tmp_path / "out", r"inputs\.objects\[0\]\.mesh was")
+
+    def test_overwriting_starts_anew(self, scene, tmp_path):
+        out = tmp_path / "out"
+        write(scene, out)
+        other = load_scene(scene.path, overrides={"seed": 8, "output.formats": ["yolo"]})
+        assert write(other, out, frames=2, overwrite=True).frames == 2
+        assert len(list(out.rglob("*.png"))) == 2
+        assert not (out / "annotations").exists()
+
+    def test_a_dataset_without_leave_to_resume(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        self.refuse(scene, tmp_path / "out", "already holds a dataset", resume=False)
+
+    @pytest.mark.parametrize("overwrite", [False, True])
+    @pytest.mark.parametrize("files", [["thesis.tex"], ["images/train/1.png", "labels/train/1.txt", "data.yaml"]])
+    def test_a_folder_of_something_else_stays_as_it_is(self, scene, tmp_path, files, overwrite):
+        out = tmp_path / "out"
+        for file in files:
+            (out / file).parent.mkdir(parents=True, exist_ok=True)
+            (out / file).write_text("years of work")
+        before = contents(out, without=())
+        self.refuse(scene, out, "must be empty or a dataset of mitsplat", overwrite=overwrite)
+        (out / "dataset.json").write_text("[]")
+        self.refuse(scene, out, "must be empty or a dataset of mitsplat", overwrite=overwrite)
+        (out / "dataset.json").write_text("{")
+        self.refuse(scene, out, r"dataset\.json cannot be read", overwrite=overwrite)
+        (out / "dataset.json").unlink()
+        assert contents(out, without=()) == before
+
+    def test_a_second_writer(self, scene, tmp_path):
+        out = tmp_path / "out"
+
+        def second(*args, **options):
+            self.refuse(
+                scene, out, rf"being written by another run \(process {os.getpid()} on {socket.gethostname()}\)"
+            )
+            return render(*args, **options)
+
+        write(scene, out, frames=1, render=second)
+
+    def test_a_file_in_the_way(self, scene, tmp_path):
+        (tmp_path / "out").write_text("")
+        self.refuse(scene, tmp_path / "out", "cannot write into .*out: File exists")
+        self.refuse(scene, tmp_path / "out/deeper", "cannot write into .*deeper: Not a directory")
+
+    def test_a_read_only_folder(self, scene, tmp_path, monkeypatch):
+        """Simulated: the tests may run as root, who may write anywhere."""
+
+        def denied(*args, **options):
+            raise PermissionError(13, "Permission denied", "out")
+
+        monkeypatch.setattr(folder, "write_text", denied)
+        self.refuse(scene, tmp_path / "out", r"out: cannot be written or read \(Permission denied\)")
+
+    def test_a_damaged_manifest(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=3)
+        manifest = tmp_path / "out/manifest.jsonl"
+        lines = manifest.read_text().splitlines()
+        manifest.write_text("\n".join([lines[0], "{", lines[2], ""]))
+        self.refuse(scene, tmp_path / "out", r"manifest\.jsonl, line 2: must be the record of a frame")
+
+    @pytest.mark.parametrize("frames", [0, 13])
+    def test_a_number_of_frames_that_is_not_there(self, scene, tmp_path, frames):
+        self.refuse(scene, tmp_path / "out", rf"frames must be between 1 and 12, .* \(got {frames}\)", frames=frames)
+        assert not (tmp_path / "out").exists()
+
+
+class TestPictures:
+    def test_masks_are_tinted_with_the_class_colour(self, scene):
+        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
+        frame.image[:] = 0
+        drawn = draw_labels(frame.image, frame.labels, opacity=1.0)
+        assert not frame.image.any()
+        entry = frame.labels.instances[0]
+        x0, y0, x1, y1 = entry.box
+        assert tuple(drawn[(y0 + y1) // 2, (x0 + x1) // 2]) == class_colour(entry.class_index)
+
+    def test_colours_of_many_classes_differ(self):
+        assert len({class_colour(i) for i in range(64)}) == 64
+
+    def test_layers_lie_side_by_side(self, scene):
+        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
+        frame.layers["highlight"] = np.zeros((48, 64, 3), dtype=np.float32)
+        sheet = layer_sheet(frame)
+        height, width = 48 + 24 + 6, 64 + 6
+        assert sheet.shape == (2 * height - 6, 3 * width - 6, 3)
+        tiles = [sheet[row : row + 48, left : left + 64] for row in (0, height) for left in (0, width, 2 * width)]
+        np.testing.assert_array_equal(tiles[0], frame.image)
+        np.testing.assert_array_equal(tiles[2].any(axis=-1), frame.instance > 0)
+        np.testing.assert_array_equal(tiles[3].any(axis=-1), frame.depth > 0)
+        assert (tiles[4] == 128).all() and not tiles[5].any()
+
+    def test_the_sheet_shows_a_spread_of_frames(self, scene, tmp_path):
+        summary = write(scene, tmp_path / "out")
+        assert cv2.imread(str(summary.contact_sheet)).shape[1] == 4 * 480 + 3 * 6

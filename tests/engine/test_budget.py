@@ -1,0 +1,114 @@
+"""The memory that workers are counted on to take: above real peaks, and following the scene."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.camera import Camera
+from mitsplat.checks import doctor
+from mitsplat.engine import pool as engine
+from mitsplat.engine.resources import WorkerMemory
+from mitsplat.frames import budget
+from mitsplat.frames.budget import worker_memory
+from mitsplat.scene.scene import load_scene
+from mitsplat.splats import Splats
+from tests.conftest import BOTH, nut_and_bolt, small_scene
+
+CHILD = """
+import sys, numpy as np
+from mitsplat.frames.budget import worker_memory
+from mitsplat.frames.frame import render_frame
+from mitsplat.scene.scene import load_scene
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+scene = load_scene(sys.argv[1])
+poses = [np.eye(4) for _ in range(6)]
+for i, pose in enumerate(poses):
+    pose[:2, 3] = 0.05 * i - 0.12, 0.02 * i
+layout = Layout(0, tuple(Instance(i + 1, i % 2, i % 2, pose) for i, pose in enumerate(poses)), NOTHING_TO_REST)
+for index in range(2):
+    render_frame(scene, index, layout=layout)
+peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+need = worker_memory(scene)
+print(int(peak.split()[1]) * 1024, need.own + need.shared)
+"""
+
+
+def floor(count: int, degree: int = 3) -> Splats:
+    rng = np.random.default_rng(0)
+    return Splats(
+        means=rng.uniform((-1, -1, -0.02), (1, 1, 0), (count, 3)),
+        quats=rng.normal(size=(count, 4)),
+        scales=rng.uniform(0.4, 1.4, (count, 3)) / np.sqrt(count),
+        opacities=rng.uniform(0.3, 1, count),
+        sh=rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3)),
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("budget")
+    boxes = nut_and_bolt()
+    boxes = [replace(box, splats=floor(2000).transformed(np.diag([0.02, 0.02, 0.02, 1.0]))) for box in boxes]
+    objects = [{**entry, "count": 3} for entry in BOTH]
+    return small_scene(folder, boxes, objects, layouts=1, views=2, width=320, height=240)
+
+
+@pytest.fixture(scope="module")
+def room(scene):
+    """The scene in surroundings of 200,000 Gaussians."""
+    return replace(scene, environment=replace(scene.assets[0], splats=floor(200_000), kind="environment"))
+
+
+def test_it_covers_the_peak_of_a_process_that_renders(room):
+    folder = room.path.parent
+    room.environment.save(folder / "assets/room")
+    text = room.path.read_text()
+    (folder / "room.yaml").write_text(f"{text}environment: assets/room\n")
+    said = subprocess.run([sys.executable, "-c", CHILD, folder / "room.yaml"], capture_output=True, check=True).stdout
+    peak, need = map(float, said.split()[-2:])
+    assert peak < need < 4 * peak
+
+
+def test_doctor_asks_for_what_the_default_scene_takes():
+    need = worker_memory(load_scene(Path(__file__).parents[2] / "scenes/workcell.yaml"))
+    assert 0.5 < (need.own + need.shared) / 2**30 / doctor.NEEDED_MEMORY < 1
+
+
+def test_it_grows_with_what_a_scene_holds(scene, room):
+    def changed(**output):
+        spec = room.spec
+        return replace(room, spec=spec.model_copy(update={"output": spec.output.model_copy(update=output)}))
+
+    def finer(samples):
+        rendering = room.spec.rendering.model_copy(update={"samples": samples})
+        return replace(room, spec=room.spec.model_copy(update={"rendering": rendering}))
+
+    need = worker_memory(room)
+    size = 200_000 * 4 * (3 + 4 + 3 + 1 + 48)
+    assert need.shared - worker_memory(scene).shared == size
+    assert need.own - worker_memory(scene).own > budget.COPIES * size
+    pixels = 320 * 240
+    assert worker_memory(changed(width=640)).own - need.own > budget.PER_RAY * pixels
+    assert worker_memory(finer(2)).own - need.own > 3 * budget.PER_RAY * pixels
+
+
+def test_pairs_of_gaussians_and_tiles_are_no_fewer_than_there_are():
+    """A disc that faces the camera covers the tiles that its outline's box meets at most, and some of them."""
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=64, height=48, fov_x=50)
+    for radius in (0.001, 0.02, 0.1):
+        one = Splats([[0.01, 0.02, 0]], [[0, 0, 0, 1]], [[radius, radius, 1e-4]], [0.9], np.zeros((1, 1, 3)))
+        side = 2 * budget._REACH * radius * camera.fx / 2 / 4
+        assert side**2 <= budget._pairs(one, camera, 1) <= (side + 1) ** 2 * 1.001
+    behind = Splats([[0, 0, -3.0]], [[0, 0, 0, 1]], [[0.1] * 3], [0.9], np.zeros((1, 1, 3)))
+    assert budget._pairs(behind, camera, 1) == 0
+
+
+@pytest.mark.parametrize(("own", "shared", "expected"), [(1, 0, 8), (2, 0, 5), (2, 5, 2), (20, 0, 1)])
+def test_as_many_workers_as_memory_holds(monkeypatch, own, shared, expected):
+    monkeypatch.setattr(engine, "unused_memory", lambda: 10.5)
+    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert engine.affordable_workers(WorkerMemory(own * 2**30, shared * 2**30)) == expected

@@ -1,0 +1,248 @@
+"""Faults while a dataset is written: kills, a full disk, files that vanish; the finished dataset loses no byte.
+
+Frames are synthetic; ``python -m benchmarks.scale.faults`` kills real renderings many times.
+"""
+
+import os
+import random
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from mitsplat.dataset.manifest import Manifest
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from tests.conftest import box_asset, small_scene
+from tests.dataset.test_write import contents, render, settle, write
+
+CHILD = """
+import sys
+sys.path.insert(0, {tests!r})
+from functools import partial
+from mitsplat.dataset import write as dataset
+from mitsplat.cli import main
+from tests.dataset.test_write import settle
+from tests.engine.test_faults import slow
+
+if __name__ == "__main__":
+    dataset._default_render = lambda: partial(slow, {seconds}, {stop})
+    dataset._default_settle = lambda: settle
+    main(sys.argv[1:])
+"""
+
+
+def slow(seconds, stop, scene, index, *, layout):
+    """A drawn frame, after a while; none once a folder holds so many, for whoever is to end the process may be late."""
+    if stop is not None and lines(Path(stop[0])) >= stop[1]:
+        time.sleep(3600)
+    time.sleep(seconds)
+    return render(scene, index, layout=layout)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    objects = [{"asset": "assets/nut", "count": 2}]
+    return small_scene(folder, [box_asset("nut")], objects, layouts=4, views=5, formats=["yolo", "coco", "exr"])
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    write(scene, folder)
+    return contents(folder)
+
+
+def command(tmp_path, *args, seconds=0.05, stop=None):
+    script = tmp_path / "child.py"
+    script.write_text(CHILD.format(tests=str(Path(__file__).parents[2]), seconds=seconds, stop=stop))
+    return [sys.executable, str(script), "render", *map(str, args)]
+
+
+def start(tmp_path, scene, out, *options, frames):
+    """The command line on so many synthetic frames, in a session of its own, as from a terminal."""
+    stop = str(out), lines(out) + frames
+    with (tmp_path / "said").open("w") as said:
+        return subprocess.Popen(
+            command(tmp_path, scene.path, "-o", out, *options, stop=stop),
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+            # Who starts the tests in the background has them, and what they start, ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+
+
+def lines(out):
+    path = out / "manifest.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def wait_for_frames(process, out, count):
+    end = time.monotonic() + 300
+    while lines(out) < count:
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.002)
+
+
+def test_killed_at_random_moments(scene, tmp_path, undisturbed):
+    """Three runs are killed while they write; the lock refuses others by name and goes with its holder."""
+    out, rng = tmp_path / "out", random.Random(8)
+    for options in (["--workers", "1"], ["--workers", "2"], ["--workers", "2"]):
+        process = start(tmp_path, scene, out, *options, frames=4)
+        wait_for_frames(process, out, lines(out) + 2)
+        with pytest.raises(InputError, match=rf"by another run \(process {process.pid} on {socket.gethostname()}\)"):
+            write(scene, out)
+        time.sleep(rng.uniform(0, 0.1))
+        process.kill()
+        process.wait()
+    kept = lines(out)
+    assert 6 <= kept < 20
+    assert write(scene, out).rendered <= 20 - kept + 1
+    assert contents(out) == undisturbed
+
+
+def test_interrupted(scene, tmp_path, undisturbed):
+    """Ctrl-C, which goes to all processes of a terminal, stops at once with status 130 and leaves nothing half done."""
+    out = tmp_path / "out"
+    process = start(tmp_path, scene, out, "--workers", 2, frames=4)
+    wait_for_frames(process, out, 3)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    assert "Traceback" not in (tmp_path / "said").read_text()
+    assert not list(out.rglob(".*.part"))
+    kept = lines(out)
+    assert write(scene, out).rendered == 20 - kept
+    assert contents(out) == undisturbed
+
+
+@dataclass(frozen=True)
+class KilledOnce:
+    """Renders, but the process of one frame is killed, as by the kernel when memory runs out."""
+
+    folder: Path
+    index: int
+
+    def __call__(self, scene, index, *, layout):
+        mark = self.folder / "killed"
+        if index == self.index and not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return render(scene, index, layout=layout)
+
+
+def test_a_worker_that_is_killed_costs_nothing(scene, tmp_path, undisturbed):
+    told = []
+    summary = write(
+        scene,
+        tmp_path / "out",
+        render=KilledOnce(tmp_path, 7),
+        workers=2,
+        progress=lambda *event: told.append(event[2]),
+    )
+    assert summary.rendered == 20
+    assert "the process making frame 7 was killed by SIGKILL: it is made again" in told
+    assert contents(tmp_path / "out") == undisturbed
+
+
+def test_no_room_in_a_file(scene, tmp_path, undisturbed):
+    """A limit on the size of files stops the run like a full disk does, also within the manifest's line."""
+    out = tmp_path / "out"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (3000, 20000, 40000):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            with pytest.raises(MissingResourceError, match="File too large: make room and run again"):
+                write(scene, out)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert not list(out.rglob(".*.part"))
+    write(scene, out)
+    assert contents(out) == undisturbed
+
+
+def mounted(tmp_path, options):
+    """A folder for a file system of its own, and how to begin a shell script that sees it."""
+    folder = tmp_path / "mounted"
+    folder.mkdir()
+    begin = f"mount -t tmpfs -o {options} tmpfs {folder} || exit 99\n"
+    if subprocess.run(["unshare", "-m", "sh", "-c", begin], capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount (root, or a container that may)")
+    return folder, begin
+
+
+def run_script(script):
+    return subprocess.run(["unshare", "-m", "sh", "-c", script], capture_output=True, text=True, check=False)
+
+
+def test_a_full_disk(scene, tmp_path, undisturbed):
+    """With 300 KiB the run ends with status 3 and one sentence; with room it goes on from what it has."""
+    folder, begin = mounted(tmp_path, "size=300k")
+    again = " ".join(command(tmp_path, scene.path, "-o", folder / "out", "--workers", 2, seconds=0))
+    done = run_script(
+        f"{begin}{again}\n[ $? = 3 ] || exit 98\nwc -l < {folder}/out/manifest.jsonl\n"
+        f"mount -o remount,size=20m {folder}\n{again} > /dev/null || exit 97\ncp -r {folder}/out {tmp_path}/out"
+    )
+    assert done.returncode == 0, done.stderr
+    sentence = next(line for line in done.stderr.splitlines() if line.startswith("mitsplat: "))
+    assert sentence.endswith("No space left on device: make room and run again; what is finished is kept")
+    assert "Traceback" not in done.stderr
+    assert 0 < int(done.stdout) < 20
+    assert contents(tmp_path / "out") == undisturbed
+
+
+def test_a_read_only_disk(scene, tmp_path):
+    folder, begin = mounted(tmp_path, "ro")
+    done = run_script(begin + " ".join(command(tmp_path, scene.path, "-o", folder / "out")))
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == f"mitsplat: cannot write into {folder / 'out'}: Read-only file system"
+
+
+@dataclass(frozen=True)
+class Remove:
+    """Renders, and removes a file of the dataset at frame 8."""
+
+    path: Path
+
+    def __call__(self, scene, index, *, layout):
+        if index == 8:
+            self.path.unlink()
+        return render(scene, index, layout=layout)
+
+
+@pytest.mark.parametrize(
+    ("file", "error"),
+    [
+        ("images/train/000002.png", PartialResultError),
+        ("labels/train/000002.txt", PartialResultError),
+        ("dataset.json", PartialResultError),
+        ("manifest.jsonl", InputError),
+    ],
+)
+def test_a_file_is_removed_while_running(scene, tmp_path, undisturbed, file, error):
+    out = tmp_path / "out"
+    with pytest.raises(error, match=rf"{file}: must not be (changed or )?removed while"):
+        write(scene, out, render=Remove(out / file))
+    if file == "dataset.json":  # without it the folder is no dataset, and is left alone
+        with pytest.raises(InputError, match="must be empty or a dataset"):
+            write(scene, out)
+        return
+    write(scene, out)
+    assert contents(out) == undisturbed
+
+
+def test_a_layout_is_removed_while_running(scene, tmp_path, undisturbed):
+    out = tmp_path / "out"
+    write(scene, out, render=Remove(out / "layouts/0001.json"))
+    assert len(Manifest(out / "manifest.jsonl")) == 20
+    write(scene, out, render=partial(slow, 0), settle=settle)
+    assert {key: value for key, value in contents(out).items() if key != "layouts/0001.json"} == {
+        key: value for key, value in undisturbed.items() if key != "layouts/0001.json"
+    }

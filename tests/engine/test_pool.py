@@ -1,0 +1,325 @@
+"""Frames in worker processes: order, notes, and what happens when a worker fails or dies."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mitsplat.engine import pool as engine
+from mitsplat.engine.pool import Finished, FrameError, LostWorkersError, run_frames, run_pool
+from mitsplat.errors import InputError
+
+LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
+
+
+@dataclass(frozen=True)
+class Make:
+    """Returns (index, process id); fails in a chosen way at one frame."""
+
+    fail_at: int = -1
+    how: str = ""
+    folder: Path = Path()
+
+    def __call__(self, index, note, /):
+        note(f"working on {index}")
+        if index == self.fail_at:
+            if self.how == "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "exits":
+                os._exit(3)
+            raise {"input": InputError, "bug": Unpicklable}[self.how](f"no {index}")
+        if self.how == "slow":
+            time.sleep(60)
+        return index, os.getpid()
+
+
+class Unpicklable(RuntimeError):
+    def __reduce__(self):
+        raise TypeError("not this one")
+
+
+def run(make, workers=1, layouts=LAYOUTS, note=lambda text: None):
+    with closing(run_frames(make, layouts, workers=workers, note=note)) as results:
+        return list(results)
+
+
+def test_one_worker_stays_in_this_process_and_in_order():
+    assert run(Make()) == [(index, os.getpid()) for index in range(9)]
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_workers_make_every_frame_once_and_nothing_remains(workers):
+    notes = []
+    made = run(Make(), workers, note=notes.append)
+    assert sorted(index for index, _ in made) == list(range(9))
+    processes = {process for _, process in made}
+    assert os.getpid() not in processes
+    assert sorted(notes) == [f"working on {index}" for index in range(9)]
+    for process in processes:
+        with pytest.raises(ProcessLookupError):
+            os.kill(process, 0)
+
+
+def test_a_worker_keeps_to_its_layout_while_there_are_others():
+    made = run(Make(), 2, {0: [0, 1, 2, 3], 1: [4, 5, 6, 7]})
+    first = {index: process for index, process in made if index in (0, 4)}
+    assert first[0] != first[4]
+
+
+def test_no_more_workers_than_frames_and_none_for_no_frames():
+    assert run(Make(), 8, {0: [5]}) == [(5, os.getpid())]
+    assert run(Make(), 8, {0: []}) == []
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_bad_input_keeps_its_sentence(workers):
+    with pytest.raises(InputError, match=r"^no 4$"):
+        run(Make(fail_at=4, how="input"), workers)
+
+
+def test_any_other_failure_names_the_frame_and_has_the_trace():
+    with pytest.raises(FrameError, match=r"^frame 4 failed: Unpicklable: no 4") as caught:
+        run(Make(fail_at=4, how="bug"), 2)
+    assert "in __call__" in caught.value.__notes__[0]
+
+
+@pytest.mark.parametrize(("how", "words"), [("killed", "was killed by SIGKILL"), ("exits", "ended with status 3")])
+def test_a_frame_that_ends_every_process_is_reported(how, words):
+    with pytest.raises(LostWorkersError, match=f"making frame 4 {words}, 3 times"):
+        run(Make(fail_at=4, how=how), 2)
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_frames_of_lost_workers_are_made_again(tmp_path, workers):
+    """Two frames kill the process that tries them first; every frame is made, once, and the losses are told."""
+    notes = []
+    made = run(KillOnce(tmp_path, (1, 7)), workers, note=notes.append)
+    assert sorted(made) == list(range(9))
+    told = [note for note in notes if "made again" in note]
+    assert sorted(told) == [f"the process making frame {i} was killed by SIGKILL: it is made again" for i in (1, 7)]
+
+
+@dataclass(frozen=True)
+class KillOnce:
+    """Kills its process at some frames, unless it has done so."""
+
+    folder: Path
+    frames: tuple[int, ...]
+
+    def __call__(self, index, note, /):
+        mark = self.folder / str(index)
+        if index in self.frames and not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return index
+
+
+def test_workers_end_with_their_parent(tmp_path):
+    """A parent that is killed leaves no process behind that could still write."""
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path\n"
+        "from mitsplat.engine.pool import run_frames\n"
+        "from tests.engine.test_pool import Linger\n"
+        "if __name__ == '__main__':\n"
+        "    list(run_frames(Linger(Path(sys.argv[2])), {0: [0, 1]}, workers=2, note=print))\n"
+    )
+    (tmp_path / "parent.py").write_text(script)
+    folder = tmp_path / "pids"
+    folder.mkdir()
+    parent = subprocess.Popen([sys.executable, tmp_path / "parent.py", str(Path(__file__).parents[2]), str(folder)])
+    wait_for(lambda: len(list(folder.iterdir())) == 2)
+    parent.kill()
+    parent.wait()
+    for path in folder.iterdir():
+        wait_for(lambda path=path: ended(path.name))
+
+
+def ended(process):
+    """Whether a process is gone, or a zombie; it may go while it is looked at."""
+    try:
+        return "Z" in Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def wait_for(condition, seconds=300):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@dataclass(frozen=True)
+class Linger:
+    """Says who it is and stays."""
+
+    folder: Path
+
+    def __call__(self, index, note, /):
+        (self.folder / str(os.getpid())).touch()
+        time.sleep(300)
+
+
+class Scripted:
+    """A pool whose workers take given times, one after the other on a clock of its own, for the growth of a staff."""
+
+    def __init__(self, seconds, joining=()):
+        self.seconds, self.joining, self.clock, self.most = seconds, list(joining), 0.0, 0
+        self.due: dict[int, tuple[float, int]] = {}
+        self.alive: set[int] = set()
+        self.hired = 0
+
+    def hire(self):
+        self.alive.add(self.hired)
+        self.hired += 1
+        self.most = max(self.most, len(self.alive))
+        return self.hired - 1
+
+    def dismiss(self, worker):
+        self.alive.remove(worker)
+
+    def give(self, worker, frame, layout):
+        self.due[worker] = self.clock + self.seconds(len(self.alive)), frame
+
+    def wait(self):
+        worker = min(self.due, key=self.due.__getitem__)
+        self.clock, frame = self.due.pop(worker)
+        yield worker, Finished(frame)
+
+    def openings(self):
+        return self.joining.pop(0) if self.joining else 0
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("seconds", "settled_at", "most"),
+    [
+        (lambda count: 1.0, 4, 4),  # every worker adds its full speed
+        (lambda count: float(count), 1, 2),  # they share one core: the second is dismissed
+        (lambda count: 1.0 if count <= 2 else 0.6 * count, 2, 3),  # the third does not pay
+    ],
+)
+def test_as_many_workers_as_pay(monkeypatch, seconds, settled_at, most):
+    pool = Scripted(seconds)
+    monkeypatch.setattr(engine.time, "monotonic", lambda: pool.clock)
+    made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
+    assert sorted(made) == list(range(400))
+    assert (len(pool.alive), pool.most) == (settled_at, most)
+
+
+def test_workers_are_hired_where_machines_join():
+    """None of them more than once, and none without a frame for it."""
+    pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
+    assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
+    assert pool.hired == 1 + 2 + 11  # by then 9 of 20 frames were given out
+
+
+class SlowPlan:
+    """The rule of the plan, readable: a worker's own layout, the first that nobody has, that with most left."""
+
+    def __init__(self, layouts):
+        self.waiting = {layout: list(frames) for layout, frames in layouts.items() if frames}
+        self.layouts = {}
+
+    def take(self, worker):
+        if not self.waiting:
+            return None
+        layout = self.layouts.get(worker)
+        if layout not in self.waiting:
+            free = [layout for layout in self.waiting if layout not in self.layouts.values()]
+            layout = free[0] if free else max(self.waiting, key=lambda layout: len(self.waiting[layout]))
+            self.layouts[worker] = layout
+        frame = self.waiting[layout].pop(0)
+        if not self.waiting[layout]:
+            del self.waiting[layout]
+        return layout, frame
+
+    def put_back(self, worker, frame):
+        self.waiting.setdefault(self.layouts[worker], []).insert(0, frame)
+        self.leave(worker)
+
+    def leave(self, worker):
+        del self.layouts[worker]
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    sizes=st.lists(st.integers(0, 6), max_size=9),
+    events=st.lists(st.tuples(st.integers(0, 4), st.sampled_from(["take"] * 6 + ["lost", "dismissed"])), max_size=80),
+)
+def test_the_plan_keeps_to_its_rule(sizes, events):
+    """Workers that take, are lost with their frame, and are dismissed, in any order."""
+    layouts = {7 * number: [100 * number + view for view in range(size)] for number, size in enumerate(sizes)}
+    fast, slow = engine._Plan(layouts), SlowPlan(layouts)
+    at_work = {}
+    for worker, event in events:
+        if event == "take":
+            task = slow.take(worker)
+            assert fast.take(worker) == task
+            at_work[worker] = task
+        elif at_work.get(worker) is not None:
+            for plan in (fast, slow):
+                plan.put_back(worker, at_work[worker][1]) if event == "lost" else plan.leave(worker)
+            del at_work[worker]
+        assert fast.left == sum(map(len, slow.waiting.values()))
+    rest = [(fast.take(9), slow.take(9)) for _ in range(fast.left + 1)]
+    assert all(one == other for one, other in rest) and rest[-1] == (None, None)
+
+
+class Counted(int):
+    """A layout's number that counts how often it is looked at."""
+
+    looks = 0
+
+    def __hash__(self):
+        Counted.looks += 1
+        return int.__hash__(self)
+
+    def __eq__(self, other):
+        Counted.looks += 1
+        return int.__eq__(self, other)
+
+
+def test_a_frame_of_many_layouts_costs_no_more_than_one_of_few():
+    """Looks at layouts for each frame; a layout goes to one worker, the last ones to several."""
+    looks = {}
+    for count in (100, 3200):
+        plan = engine._Plan({Counted(layout): range(3) for layout in range(count)})
+        Counted.looks = 0
+        for turn in range(plan.left):
+            plan.take(turn % 50)
+        looks[count] = Counted.looks / (3 * count)
+    assert looks[3200] < 1.2 * looks[100] < 15
+
+
+def test_few_frames_start_no_process():
+    assert run(Make(), None) == [(index, os.getpid()) for index in range(9)]
+
+
+def test_closing_stops_the_workers_at_once():
+    results = run_frames(Make(how="slow"), LAYOUTS, workers=2, note=lambda text: stop())
+    stopped = []
+
+    def stop():
+        stopped.append(time.monotonic())  # starting takes as long as it takes
+        raise KeyboardInterrupt
+
+    with closing(results), pytest.raises(KeyboardInterrupt):
+        next(results)
+    assert time.monotonic() - stopped[0] < 30
+
+
+def test_workers_must_be_positive():
+    with pytest.raises(InputError, match=r"workers must be at least 1 \(got 0\)"):
+        run(Make(), 0)

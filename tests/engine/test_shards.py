@@ -1,0 +1,320 @@
+"""Datasets made in parts, on Ray or by other numbers of workers are the same bytes as one run's."""
+
+import json
+import os
+import pickle
+import shutil
+import sys
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames
+from mitsplat.dataset.manifest import Manifest, encode_line
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.engine import ray as cluster
+from mitsplat.engine.pool import LostWorkersError
+from mitsplat.engine.ray import Cluster
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.formats.registry import Catalogue
+from mitsplat.frames.frame import Renderer
+from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.spec import FORMATS
+from tests.cli.test_cli import run
+from tests.conftest import BOTH, nut_and_bolt, small_scene
+from tests.dataset.test_write import contents, render, settle, write
+from tests.engine.test_faults import KilledOnce
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    return small_scene(folder, nut_and_bolt(), BOTH, layouts=3, views=4, formats=list(FORMATS))
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    write(scene, folder)
+    return contents(folder)
+
+
+def write_shards(scene, folder, count, **options):
+    shards = [folder / f"{number}" for number in range(1, count + 1)]
+    for number, shard in enumerate(shards, start=1):
+        write(scene, shard, shard=Shard(number, count), **options)
+    return shards
+
+
+class TestSameBytes:
+    @pytest.mark.parametrize("workers", [2, 7])
+    def test_of_several_workers(self, scene, tmp_path, whole, workers):
+        write(scene, tmp_path / "out", workers=workers)
+        assert contents(tmp_path / "out") == whole
+
+    @pytest.mark.parametrize("count", [1, 2, 3, 5])
+    def test_of_merged_shards_in_any_order(self, scene, tmp_path, whole, count):
+        shards = write_shards(scene, tmp_path / "shards", count)
+        assert merge_shards(shards[::-1], tmp_path / "out").frames == 12
+        assert contents(tmp_path / "out") == whole
+        assert len((tmp_path / "out/timings.jsonl").read_text().splitlines()) == 12
+
+    def test_of_a_merge_that_was_stopped(self, scene, tmp_path, whole):
+        shards = write_shards(scene, tmp_path / "shards", 3)
+
+        def stop(done, total, text):
+            if done == 5:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            merge_shards(shards, tmp_path / "out", progress=stop)
+        assert len(Manifest(tmp_path / "out/manifest.jsonl")) == 5
+        merge_shards(shards, tmp_path / "out")
+        assert contents(tmp_path / "out") == whole
+
+    def test_a_shard_can_be_resumed(self, scene, tmp_path, whole):
+        shards = write_shards(scene, tmp_path / "shards", 2)
+        next(shards[1].rglob("000011.txt")).unlink()
+        assert write(scene, shards[1], shard=Shard(2, 2)).rendered == 1
+        merge_shards(shards, tmp_path / "out")
+        assert contents(tmp_path / "out") == whole
+
+
+@pytest.mark.parametrize(("total", "views", "count"), [(12, 4, 3), (12, 4, 5), (10, 4, 3), (1, 4, 1), (1000, 1, 7)])
+def test_shards_divide_the_frames(total, views, count):
+    parts = [list(Shard(number, count).frames(total, views)) for number in range(1, count + 1)]
+    assert list(chain(*parts)) == list(range(total))
+    assert all(parts)
+    if -(-total // views) >= count:  # whole layouts
+        assert all(part[0] % views == 0 for part in parts)
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "1", "a/b", "1/0", "-1/2", ""])
+def test_a_shard_that_is_none(text):
+    with pytest.raises(InputError, match=r"a shard must be I/N"):
+        Shard.parse(text)
+
+
+class TestRefusals:
+    @pytest.fixture
+    def shards(self, scene, tmp_path):
+        return write_shards(scene, tmp_path / "shards", 3)
+
+    def refuse(self, shards, out, message):
+        with pytest.raises(InputError, match=message):
+            merge_shards(shards, out)
+
+    def test_a_missing_shard(self, shards, tmp_path):
+        self.refuse(shards[:2], tmp_path / "out", r"each of the 3 shards must be given once \(missing: \[3\]\)")
+        self.refuse([*shards, shards[0]], tmp_path / "out", "each shard must be given once")
+        assert not (tmp_path / "out").exists()
+
+    def test_an_unfinished_shard(self, shards, tmp_path):
+        manifest = shards[1] / "manifest.jsonl"
+        manifest.write_bytes(b"".join(manifest.read_bytes().splitlines(keepends=True)[:-1]))
+        self.refuse(
+            shards, tmp_path / "out", r"1 of 12 frames are in no shard, the first is 7: finish the shards first"
+        )
+
+    def test_a_damaged_file(self, shards, tmp_path):
+        picture = next((shards[1] / "images").rglob("000005.png"))
+        data = bytearray(picture.read_bytes())
+        data[-20] ^= 1
+        picture.write_bytes(data)
+        self.refuse(shards, tmp_path / "out", rf"{picture}: must have the SHA-256 [0-9a-f]+, as its manifest states")
+        assert not (tmp_path / "out" / picture.relative_to(shards[1])).exists()
+
+    def test_a_damaged_manifest(self, shards, tmp_path):
+        manifest = shards[2] / "manifest.jsonl"
+        data = bytearray(manifest.read_bytes())
+        data[100] ^= 1
+        manifest.write_bytes(data)
+        self.refuse(shards, tmp_path / "out", r"manifest\.jsonl, line 1: must be the record of a frame \(its checksum")
+
+    def test_another_scene(self, scene, shards, tmp_path):
+        other = load_scene(scene.path, overrides={"seed": 8})
+        write(other, shards[1], shard=Shard(2, 3), overwrite=True)
+        self.refuse(shards, tmp_path / "out", r"are not of one dataset: scene\.seed is 0 in the first, 8 in the second")
+
+    def test_another_division(self, scene, shards, tmp_path):
+        write(scene, tmp_path / "whole")
+        self.refuse([*shards, tmp_path / "whole"], tmp_path / "out", "must be of one division of one dataset")
+        with pytest.raises(InputError, match="cannot be resumed: it was shard 1/3 and is shard 2/3"):
+            write(scene, shards[0], shard=Shard(2, 3))
+        with pytest.raises(InputError, match="cannot be resumed: it was shard 1/3 and is a whole dataset"):
+            write(scene, shards[0])
+
+    def test_another_layout(self, shards, tmp_path):
+        shutil.copy(shards[0] / "layouts/0000.json", shards[1] / "layouts/0000.json")
+        with (shards[1] / "layouts/0000.json").open("a") as file:
+            file.write(" ")
+        self.refuse(shards, tmp_path / "out", "must be the same: one layout was settled in two ways")
+
+    def test_files_outside(self, shards, tmp_path):
+        """A manifest that names files elsewhere, with a checksum that fits."""
+        manifest = shards[0] / "manifest.jsonl"
+        records = list(Manifest(manifest))
+        (tmp_path / "secret").write_text("")
+        for name in ("../../secret", "../1/images/train/000000.png", "/etc/passwd"):
+            records[0]["files"] = {name: "0" * 64}
+            manifest.write_bytes(b"".join(map(encode_line, records)))
+            self.refuse(shards, tmp_path / "out", r"frame 0: (must be a file inside|files must not be named by \.\.)")
+
+    def test_itself(self, shards):
+        self.refuse(shards, shards[0], "must not be one of the shards")
+
+    def test_a_shard_that_is_being_written(self, scene, shards, tmp_path):
+        def merge(*args, **options):
+            self.refuse(shards, tmp_path / "out", f"is being written by another run \\(process {os.getpid()}")
+            return render(*args, **options)
+
+        next(shards[1].rglob("000006.txt")).unlink()
+        write(scene, shards[1], shard=Shard(2, 3), render=merge)
+
+
+def test_the_command(scene, tmp_path, whole, capsys):
+    shards = write_shards(scene, tmp_path / "shards", 2)
+    assert run("merge", *shards, "-o", tmp_path / "out", "--json") == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"dataset: {tmp_path / 'out'} (")
+    events = [json.loads(line) for line in err.splitlines()]
+    assert [event["event"] for event in events] == ["started", *["progress"] * 12, "finished"]
+    assert contents(tmp_path / "out") == whole
+    assert run("merge", shards[0], "-o", tmp_path / "other", "--json") == 2
+    event = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert (event["event"], event["status"], event["error"]) == ("failed", 2, "InputError")
+    assert event["message"].startswith("each of the 2 shards must be given once")
+
+
+@pytest.fixture(scope="module")
+def ray():
+    """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
+    os.environ["PYTHONPATH"] = str(Path(__file__).parents[2])
+    ray.init("local", num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
+    yield ray
+    ray.shutdown()
+    del os.environ["PYTHONPATH"]
+
+
+@pytest.mark.usefixtures("ray")
+class TestRay:
+    def test_same_bytes(self, scene, tmp_path, whole):
+        """Begun here, gone on with on Ray, where a worker is killed: no layout is settled twice, no frame is lost."""
+        told = []
+        write(scene, tmp_path / "out", frames=3)
+        options = {"render": KilledOnce(tmp_path, 6), "settle": partial(only_later, 1), "workers": None}
+        progress = lambda *event: told.append(event)  # noqa: E731
+        assert write(scene, tmp_path / "out", cluster=Cluster(), progress=progress, **options).rendered == 9
+        assert any(text.startswith("the process making frame 6 was lost") for *_, text in told)
+        assert told[-1][:2] == (12, 12)
+        assert contents(tmp_path / "out") == whole
+
+    def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
+        with pytest.raises(InputError, match=r"^no frame 5$"):
+            write(scene, tmp_path / "out", cluster=Cluster(), workers=1, render=refuse_5)
+
+    def test_workers_take_resources(self, scene, tmp_path):
+        summary = write(scene, tmp_path / "out", frames=2, cluster=Cluster(resources={"camera": 1, "CPU": 1}))
+        assert summary.rendered == 2
+        with pytest.raises(MissingResourceError, match=r"no node of the Ray cluster has CPU=1, camera=2 for a worker"):
+            write(scene, tmp_path / "other", cluster=Cluster(resources={"CPU": 1, "camera": 2}))
+
+
+class FakeRay:
+    """As much of Ray as tells of machines."""
+
+    def __init__(self, **nodes):
+        self.alive = nodes
+
+    def nodes(self):
+        return [{"NodeID": name, "Alive": cpus > 0, "Resources": {"CPU": cpus}} for name, cpus in self.alive.items()]
+
+    def is_initialized(self):
+        return True
+
+    def put(self, value):
+        return value
+
+    def remote(self, kind):
+        return SimpleNamespace(options=lambda **options: SimpleNamespace(remote=lambda *arguments: object()))
+
+
+def test_machines_that_join_are_told_of_once(monkeypatch):
+    ray, now = FakeRay(head=2.0, first=5.0), [0.0]
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(cluster.time, "monotonic", lambda: now[0])
+
+    def openings(**nodes):
+        ray.alive |= nodes
+        now[0] += 10.0
+        return pool.openings()
+
+    pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), None)
+    assert (pool.room, openings()) == (3, 0)
+    assert (openings(second=4.0), openings()) == (2, 0)
+    assert openings(second=0.0, first=0.0) == 0  # lost: theirs is what is made again
+    assert openings(again=4.0) == 2
+    few = pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), 2)
+    workers = [few.hire(), few.hire()]
+    assert (few.room, openings(third=8.0)) == (2, 0)
+    del few._actors[workers[0]]
+    assert openings(fourth=8.0) == 1
+    assert openings(**dict.fromkeys(ray.alive, 0.0)) == 0
+    now[0] += cluster._PATIENCE
+    with pytest.raises(LostWorkersError, match=r"^no node .* CPU=2 for a worker any more; finished frames are kept"):
+        openings()
+
+
+def test_images_of_lights_travel_with_the_job(scene_data, write_scene, tmp_path):
+    """Where frames are made no path of the caller's is opened: its folder is gone."""
+    cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 90, dtype=np.uint8))
+    scene_data["lights"] = [{"kind": "environment", "image": "sky.png"}]
+    home = load_scene(write_scene(scene_data))
+    image = home.images["sky.png"].read_bytes()
+    job = RemoteFrames(FrameMaker(home, Catalogue.of(home), tmp_path / "out", render, settle))
+    sent = pickle.dumps(job)
+    for path in (*home.path.parent.glob("*.yaml"), tmp_path / "sky.png"):
+        path.unlink()
+    there = pickle.loads(sent)
+    parcel = there.make(0, there.settle(0))
+    assert parcel.record["lights"][0]["image"] == "sky.png"
+    (copy,) = there.maker.scene.images.values()
+    assert copy.read_bytes() == image and tmp_path not in copy.parents
+    renderer = Renderer(there.maker.scene, quality="fast")
+    assert renderer._emitter(plan_frame(there.maker.scene, 0).lights[0])["filename"] == str(copy)
+    scene = there.maker.scene
+    there.make(1, there.settle(0))
+    assert there.maker.scene is scene  # by which the renderer knows its uploads
+    del there, renderer
+    assert not copy.exists()
+
+
+def only_later(first, scene, index, *, progress):
+    """Settles, but no layout that was settled before."""
+    assert index >= first
+    return settle(scene, index, progress=progress)
+
+
+def refuse_5(scene, index, *, layout):
+    if index == 5:
+        raise InputError("no frame 5")
+    return render(scene, index, layout=layout)
+
+
+@pytest.mark.parametrize("text", ["CPU", "CPU=0", "=3", "CPU=x", "CPU=nan", "CPU=2,,"])
+def test_resources_that_are_none(text):
+    with pytest.raises(InputError, match=r"resources must be NAME=AMOUNT"):
+        Cluster.parse_resources(text)
+
+
+def test_without_ray(scene, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(MissingResourceError, match=r"needs Ray: pip install 'mitsplat\[cluster\]'"):
+        write(scene, tmp_path / "out", cluster=Cluster())

@@ -1,0 +1,93 @@
+"""Arrays that worker processes share: as they were sent, in one memory, for nobody to change, gone in the end."""
+
+import os
+import signal
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.asset import Asset
+from mitsplat.cache import cache_folder
+from mitsplat.engine import shared_arrays
+from mitsplat.engine.pool import run_frames
+from mitsplat.splats import Splats
+from tests.conftest import box_asset
+
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class Describe:
+    """Tells of its arrays from within a worker."""
+
+    splats: Splats
+    asset: Asset
+    empty: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    text: str = "as it was"
+
+    def __call__(self, index, note, /):
+        total = total_of(self.splats)
+        try:
+            self.splats.means.flags.writeable = True
+        except ValueError as error:
+            refusal = str(error)
+        self.asset.mesh.copy().apply_scale(2.0)
+        rows = Path("/proc/self/smaps").read_text().split("\n")
+        starts = [i for i, row in enumerate(rows) if str(cache_folder()) in row]
+        mapped = [rows[i].split()[1] for i in starts]
+        resident = sum(int(row.split()[1]) for i in starts for row in rows[i : i + 5] if row.startswith("Rss:")) / 1024
+        return os.getpid(), total, refusal, mapped, resident, (self.empty.shape, self.text)
+
+
+def splats_of(count: int) -> Splats:
+    rng = np.random.default_rng(0)
+    return Splats(
+        means=rng.normal(size=(count, 3)),
+        quats=rng.normal(size=(count, 4)),
+        scales=rng.uniform(0.1, 1, (count, 3)),
+        opacities=rng.uniform(0, 1, count),
+        sh=rng.normal(size=(count, 16, 3)),
+    )
+
+
+def total_of(splats: Splats) -> float:
+    return float(sum(array.sum(dtype=np.float64) for array in vars(splats).values()))
+
+
+def test_workers_map_one_copy_of_what_was_sent(tmp_path, monkeypatch):
+    """And nothing of it is left behind, not even by one that is killed."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    splats = splats_of(50_000)
+    size = sum(array.nbytes for array in vars(splats).values()) / MIB
+    make = Describe(splats, box_asset("nut"))
+    with closing(run_frames(make, {i: [i] for i in range(4)}, workers=2, note=print)) as results:
+        found = list(islice(results, 2))
+        os.kill(found[0][0], signal.SIGKILL)
+        found += list(results)
+    assert len({process for process, *_ in found}) == 2
+    for _, total, refusal, mapped, resident, rest in found:
+        assert total == total_of(splats)
+        assert refusal == "cannot set WRITEABLE flag to True of this array"
+        assert mapped == ["r--s"]
+        assert size <= resident <= size + 1
+        assert rest == ((0, 3), "as it was")
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.parametrize("reason", ["read-only", "full"])
+def test_without_a_file_each_has_a_copy(tmp_path, monkeypatch, reason):
+    if reason == "full":
+        monkeypatch.setattr(shared_arrays.tempfile, "TemporaryFile", lambda dir: Path("/dev/full").open("wb"))  # noqa: SIM115
+    else:
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    splats = splats_of(10)
+    packed = shared_arrays.SharedArrays(Describe(splats, box_asset("nut")))
+    opened, arguments = packed.__reduce__()
+    copy = opened(*arguments)
+    assert packed.size == 0 and arguments[1] is None
+    assert total_of(copy.splats) == total_of(splats)

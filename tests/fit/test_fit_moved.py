@@ -1,0 +1,92 @@
+"""A capture that is moved, turned and made larger gives the splats that are.
+
+What can be exact is: lengths by a power of two change no digit. Other lengths and a translation round the means anew,
+and where a gradient vanishes rounding decides its sign, by which Adam moves a parameter by its rate whatever the
+gradient's size. A rotation is no symmetry of a fit: Adam scales every coordinate by its own gradients, and Gaussians
+begin along the axes of the world and become long along these. There the splats only look the same, as those of another
+seed do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mitsplat.capture.capture import Capture
+from mitsplat.fit import trainer as fit
+from mitsplat.fit.folder import FitResult
+from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.image_metrics import psnr
+from mitsplat.render.layers import render_splats
+from mitsplat.splats import Splats
+from tests.fit.test_fit import SMALL, photograph, seeing
+
+BOTH = pytest.mark.parametrize("densification", ["mcmc", "classic"])
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Pictures of the ball whose points they see, so that depths take part."""
+    return seeing(photograph(tmp_path_factory.mktemp("photos")))
+
+
+def similarity(scale: float, translation: tuple[float, float, float], rotation: Rotation | None = None) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * (rotation or Rotation.identity()).as_matrix()
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def fitted(capture: Capture, folder: Path, matrix: np.ndarray, settings: FitSettings) -> tuple[FitResult, FitResult]:
+    """The fit of the capture, and that of the moved capture."""
+    moved = fit_capture(capture.transformed(matrix), folder / "moved", settings)
+    return fit_capture(capture, folder / "still", settings), moved
+
+
+@BOTH
+def test_larger_by_a_power_of_two_is_the_same_to_the_bit(
+    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
+) -> None:
+    settings = replace(SMALL, densification=densification)
+    still, moved = fitted(capture, tmp_path, similarity(4, (0, 0, 0)), settings)
+    assert len(still.splats) > 600 and moved.psnr == still.psnr
+    for name, factor in (("means", 4), ("scales", 4), ("quats", 1), ("opacities", 1), ("sh", 1)):
+        expected = np.float32(factor) * getattr(still.splats, name)
+        np.testing.assert_array_equal(getattr(moved.splats, name), expected, err_msg=name)
+
+
+def test_moved_and_larger_is_the_same_within_a_step_of_the_optimiser(capture: Capture, tmp_path: Path) -> None:
+    matrix = similarity(1.7, (1, -2, 0.5))
+    still, moved = fitted(capture, tmp_path, matrix, replace(SMALL, iterations=20, refine_every=5))
+    splats, expected = moved.splats, still.splats.transformed(matrix)
+    assert len(splats) == len(expected) > 600 and moved.psnr == pytest.approx(still.psnr, abs=0.01)
+    centres = np.array([photo.camera.centre for photo in capture.training])
+    extent = 1.7 * 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    np.testing.assert_allclose(splats.means, expected.means, atol=SMALL.rate_means * extent)
+    np.testing.assert_allclose(np.log(splats.scales), np.log(expected.scales), atol=SMALL.rate_scales)
+    logits = [np.log(s.opacities / (1 - s.opacities)) for s in (splats, expected)]
+    np.testing.assert_allclose(*logits, atol=SMALL.rate_opacities)
+    np.testing.assert_allclose(splats.sh, expected.sh, atol=SMALL.rate_sh)
+
+
+@BOTH
+def test_turned_is_as_like_as_another_seed(
+    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
+) -> None:
+    settings = replace(SMALL, densification=densification, iterations=40, rate_sh=0.01)
+    matrix = similarity(1.7, (1, -2, 0.5), Rotation.from_rotvec([0.7, -0.4, 1.1]))
+    still, moved = fitted(capture, tmp_path, matrix, settings)
+    other = fit_capture(capture, tmp_path / "other", replace(settings, seed=1))
+
+    def pictures(splats: Splats) -> np.ndarray:
+        return np.stack([render_splats(splats, p.camera, quality=fit.QUALITY).rgb for p in capture.held_out])
+
+    still_seen = pictures(still.splats)
+    back = moved.splats.transformed(np.linalg.inv(matrix))
+    assert psnr(pictures(back), still_seen) > psnr(pictures(other.splats), still_seen)
+    assert moved.psnr == pytest.approx(still.psnr, abs=0.3)

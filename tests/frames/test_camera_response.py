@@ -1,0 +1,156 @@
+"""Development of linear pictures: identities and the published shadow chain."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from mitsplat.colour import black_body_colour
+from mitsplat.frames.camera_response import (
+    colour_matrix,
+    develop,
+    light_image,
+    motion_kernel,
+    shadow_from_image,
+    tone_curve,
+)
+from mitsplat.render.layers import Layers
+from mitsplat.scene.spec import Composite, ImageShadow, Sensor
+
+
+def encode(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def test_neutral_development_shows_captured_colours_unchanged() -> None:
+    encoded = np.arange(256, dtype=np.float64) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    image = develop(np.repeat(linear[None, :, None], 3, axis=2).astype(np.float32), {})
+    np.testing.assert_array_equal(image[0, :, 0], np.arange(256))
+
+
+def test_one_stop_doubles_linear_light() -> None:
+    linear = np.full((2, 2, 3), 0.1, np.float32)
+    np.testing.assert_allclose(develop(linear, {"exposure": 1.0}) / 255, encode(np.full((2, 2, 3), 0.2)), atol=0.003)
+
+
+def test_hue_turns_and_keeps_grey() -> None:
+    matrix = colour_matrix(hue=120.0)
+    np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
+
+
+def test_saturation_zero_is_grey_of_equal_luminance() -> None:
+    grey = colour_matrix(saturation=0.0) @ [0.2, 0.6, 0.1]
+    np.testing.assert_allclose(grey, 0.2126 * 0.2 + 0.7152 * 0.6 + 0.0722 * 0.1, rtol=1e-6)
+
+
+def test_white_balance_for_a_warm_light_makes_white_cooler() -> None:
+    red, _, blue = colour_matrix(white_balance=4500.0) @ [1, 1, 1]
+    assert blue > 1 > red
+    np.testing.assert_allclose(colour_matrix(white_balance=6504.0), np.eye(3))
+
+
+@pytest.mark.parametrize("tone", ["neutral", "filmic"])
+def test_tone_curves_rise_from_black_to_white(tone: str) -> None:
+    curve = tone_curve(tone)
+    assert curve[0] == pytest.approx(0, abs=2e-3)
+    assert (np.diff(curve) >= 0).all()
+    assert curve[-1] <= 1
+
+
+def test_filmic_keeps_mid_grey() -> None:
+    image = develop(np.full((1, 1, 3), 0.18, np.float32), {}, tone="filmic")
+    assert abs(int(image[0, 0, 0]) - 118) <= 1
+
+
+@pytest.mark.parametrize("iso", [100.0, 1600.0])
+@pytest.mark.parametrize("level", [0.02, 0.18, 0.6])
+def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float) -> None:
+    """N = level * full well * 100 / ISO electrons: variance N + read noise squared, seen through the tone curve."""
+    sensor = Sensor(full_well=10000, read_noise=5)
+    linear = np.full((128, 128, 3), level, np.float32)
+    a, b, c = (develop(linear, {"iso": iso}, sensor=sensor, seed=s) for s in (1, 1, 2))
+    assert a.tobytes() == b.tobytes() != c.tobytes()
+    white = 10000 * 100 / iso
+    deviation = np.sqrt(level * white + 25) / white
+    encoded = encode(np.maximum(level + np.linspace(-4, 4, 4001) * deviation, 0))
+    weight = np.exp(-0.5 * np.linspace(-4, 4, 4001) ** 2)
+    middle = np.average(encoded, weights=weight)
+    expected = np.sqrt(np.average((encoded - middle) ** 2, weights=weight) + 1 / (12 * 255**2))
+    assert np.std(a / 255.0) == pytest.approx(expected, rel=0.03)
+    assert np.mean(a / 255.0) == pytest.approx(middle, abs=1e-3)
+
+
+def test_vignetting_takes_its_stops_in_the_corner_and_none_in_the_middle() -> None:
+    linear = np.full((101, 201, 3), 0.4, np.float32)
+    encoded = develop(linear, {"vignetting": 2.0}) / 255
+    assert encoded[50, 100, 0] == pytest.approx(encode(np.array(0.4)), abs=0.004)
+    assert encoded[0, 0, 0] == pytest.approx(encode(np.array(0.1)), abs=0.01)
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0, 90.0, 215.0])
+@pytest.mark.parametrize("length", [0.5, 3.0, 12.0])
+def test_motion_kernel_is_a_line_of_its_length_and_angle(length: float, angle: float) -> None:
+    """A uniform line of length L has variance L^2 / 12 along itself; bilinear weights add at most 1/4 px^2 each way."""
+    kernel = motion_kernel(length, angle)
+    reach = kernel.shape[0] // 2
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    along = x * np.cos(np.radians(angle)) - y * np.sin(np.radians(angle))
+    across = x * np.sin(np.radians(angle)) + y * np.cos(np.radians(angle))
+    assert kernel.sum() == pytest.approx(1, abs=1e-5)
+    assert (kernel * x).sum() == pytest.approx(0, abs=1e-4) and (kernel * y).sum() == pytest.approx(0, abs=1e-4)
+    assert 0 <= (kernel * along**2).sum() - length**2 / 12 < 0.26
+    assert (kernel * across**2).sum() < 0.26
+
+
+def test_motion_keeps_even_pictures_and_smears_points() -> None:
+    even = np.full((20, 30, 3), 0.3, np.float32)
+    draws = {"motion_blur": 6.0, "motion_angle": 40.0}
+    assert np.array_equal(develop(even, draws), develop(even, {}))
+    point = np.zeros((21, 21, 3), np.float32)
+    point[10, 10] = 1
+    smeared = develop(point, {"motion_blur": 6.0, "motion_angle": 0.0})[..., 0]
+    assert np.flatnonzero(smeared.any(axis=0)).tolist() == list(range(7, 14))
+    assert np.flatnonzero(smeared.any(axis=1)).tolist() == [10]
+
+
+def test_jpeg_of_low_quality_loses_detail_and_keeps_the_channels() -> None:
+    rng = np.random.default_rng(0)
+    linear = np.clip(0.3 + 0.1 * rng.normal(size=(64, 64, 1)) * (1, 1, 1) + (0.2, 0, 0), 0, 1).astype(np.float32)
+    plain, fine, coarse = (develop(linear, draws).astype(float) for draws in ({}, {"jpeg": 98.0}, {"jpeg": 10.0}))
+    assert np.abs(fine - plain).mean() < 3 < 0.4 * np.abs(coarse - plain).mean()
+
+
+def test_black_bodies_are_warm_below_daylight_and_of_luminance_one() -> None:
+    warm, cool = np.array(black_body_colour(2700.0)), np.array(black_body_colour(9000.0))
+    for colour in (warm, cool):
+        assert colour @ [0.2126, 0.7152, 0.0722] == pytest.approx(1, rel=1e-6)
+    assert warm[0] > warm[1] > warm[2] and cool[2] > cool[1] > cool[0]
+    np.testing.assert_allclose(black_body_colour(6504.0), 1, atol=0.06)
+
+
+def test_published_shadow_is_darkest_in_shadow_and_one_in_light() -> None:
+    shadow_map = np.ones((64, 128), np.float32)
+    shadow_map[:, :40] = 0.0
+    parameters = ImageShadow(blur=20.0, darkest=0.4)
+    factor, shine = shadow_from_image(shadow_map, parameters)
+    assert factor[32, 2] == pytest.approx(0.4, abs=0.01)
+    assert factor[32, 120] == pytest.approx(1.0, abs=0.01)
+    assert (np.diff(factor[32]) >= -1e-6).all()
+    assert shine[32, 2] == 0 and shine[32, 120] == pytest.approx(parameters.highlight_gain, rel=0.01)
+
+
+def test_parameters_of_the_published_shadow_reach_the_picture() -> None:
+    light = np.ones((64, 128, 3), np.float32)
+    light[:, :40] = 0.0
+    layers = dict.fromkeys((f.name for f in fields(Layers)), np.zeros((64, 128), np.float32))
+    layers |= {"captured": np.full((64, 128, 3), 0.5, np.float32), "alpha": np.ones((64, 128), np.float32)}
+    layers = Layers(**{**layers, "light": light})
+    for darkest in (0.2, 0.6):
+        shadow = ImageShadow(darkest=darkest, highlight_gain=0.1)
+        picture = light_image(layers, Composite(shadow="image", image_shadow=shadow))
+        np.testing.assert_allclose(picture[32, 2], 0.5 * darkest, atol=0.005)
+        np.testing.assert_allclose(picture[32, 120], 0.5 + 0.1, atol=0.005)

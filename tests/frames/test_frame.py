@@ -1,0 +1,252 @@
+"""Whole frames of a small scene: from the plan to picture and labels, and through XML."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from pydantic import TypeAdapter
+
+import mitsplat as ms
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.frames.mitsuba_xml import export_xml, render_xml
+from mitsplat.quality import PRESETS
+from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.scene.scene import FramePlan, LightSpec
+from tests.conftest import WriteScene
+from tests.render.test_render import make_splats
+
+
+@pytest.fixture(scope="module")
+def settled() -> dict[str, Any]:
+    """The layout of the small scene, settled once for all tests of this module."""
+    return {}
+
+
+@pytest.fixture
+def scene(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
+    scene_data["output"] |= {"width": 192, "height": 144}
+    scene_data["camera"] |= {"radius": 0.25, "height": 0.25}
+    return ms.load_scene(write_scene(scene_data))
+
+
+def layout_of_small_scene(scene: ms.Scene, settled: dict[str, Any]) -> ms.Layout:
+    if "layout" not in settled:
+        settled["layout"] = ms.settle_layout(scene, 0)
+    return settled["layout"]
+
+
+def test_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    frame = ms.render_frame(scene, 1, layout=layout)
+    assert frame.image.shape == (144, 192, 3) and frame.image.dtype == np.uint8
+    known = {instance.id for instance in layout.instances}
+    assert set(np.unique(frame.instance)) <= known | {0}
+    assert frame.labels.instances
+    for label in frame.labels.instances:
+        assert label.class_name in scene.class_names
+        instance = next(i for i in layout.instances if i.id == label.id)
+        centre, _ = frame.camera.project(instance.world_from_object[:3, 3])
+        x0, y0, x1, y1 = label.box
+        assert x0 - 8 <= centre[0, 0] <= x1 + 8 and y0 - 8 <= centre[0, 1] <= y1 + 8
+    assert set(frame.seconds) >= {"render", "composite", "label"}
+    assert frame._repr_png_().startswith(b"\x89PNG")
+
+
+def test_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    first = ms.render_frame(scene, 2, layout=layout)
+    ms.render_frame(scene, 3, layout=layout)
+    again = ms.render_frame(ms.load_scene(scene.path), 2, layout=layout)
+    assert first.image.tobytes() == again.image.tobytes()
+    assert first.instance.tobytes() == again.instance.tobytes()
+
+
+@pytest.mark.parametrize("source", ["splats", "proxies"])
+def test_silhouettes_are_labels_of_the_instances_alone(
+    write_scene: WriteScene, scene_data: dict[str, Any], settled: dict[str, Any], scene: ms.Scene, source: str
+) -> None:
+    """Each instance placed alone in the scene is labelled with exactly what it covers among the others."""
+    layout = layout_of_small_scene(scene, settled)
+    table = {**scene_data["shapes"][0], "visible": False}  # surroundings may hide an instance; alone it has none
+    data = {**scene_data, "shapes": [table], "labels": {"source": source}}
+    chosen = ms.load_scene(write_scene(data, f"{source}.yaml"))
+    frame = ms.render_frame(chosen, 1, layout=layout)
+    ids = frame.instance if source == "splats" else frame.proxy_instance
+    assert len(frame.labels.instances) >= 2
+    for label in frame.labels.instances:
+        x0, y0, x1, y1 = label.box
+        assert not (label.mask & (ids[y0:y1, x0:x1] != label.id)).any()
+        assert 0 < label.agreement <= 1 and 0 < label.boundary_f1 <= 1
+        alone = replace(layout, instances=tuple(i for i in layout.instances if i.id == label.id))
+        (only,) = ms.render_frame(chosen, 1, layout=alone).labels.instances
+        np.testing.assert_array_equal(only.mask, label.amodal.mask)
+        assert (only.box, only.visible_fraction) == (label.amodal.box, 1)
+        assert label.visible_fraction == label.area / only.area
+
+
+def test_frame_is_remade_from_its_record(
+    scene_data: dict[str, Any],
+    write_scene: WriteScene,
+    scene: ms.Scene,
+    settled: dict[str, Any],
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A scene of another seed, given only what the manifest says of a frame, shows the same picture."""
+    layout = layout_of_small_scene(scene, settled)
+    path = [{"position": [0.1, 0, 0.4], "temperature": 3000}, {"position": [-0.1, 0, 0.5], "temperature": 8000}]
+    scene_data["lights"] = [
+        {"kind": "point", "position": [0, 0, 0.5], "intensity": 0.3, "temperature": 5000, "path": path},
+        {"kind": "environment", "radiance": 0.5},
+    ]
+    scene_data["randomise"] = {
+        "exposure": [-1, 1], "hue": [-5, 5], "saturation": [0.8, 1.2], "white_balance": [5000, 7000], "iso": [100, 800],
+        "vignetting": [0, 1], "motion_blur": [0, 3], "jpeg": [40, 95], "light_intensity": [0.5, 2],
+    }  # fmt: skip
+    first = ms.load_scene(write_scene(scene_data))
+    frame = ms.render_frame(first, 2, layout=layout)
+    (tmp_path / "images" / frame.plan.split).mkdir(parents=True)
+    (tmp_path / "labels" / frame.plan.split).mkdir(parents=True)
+    record = json.loads(json.dumps(write_frame(frame, tmp_path, first.spec, Catalogue.of(first))))
+
+    taken = record["camera"]
+    (fx, _, cx), (_, fy, cy), _ = taken["intrinsics"]
+    camera = Camera(
+        taken["width"],
+        taken["height"],
+        *(fx, fy, cx, cy),
+        np.array(taken["world_from_camera"]),
+        tuple(taken["distortion"]),
+        taken["near"],
+    )
+    plan = FramePlan(
+        **{name: record[name] for name in ("index", "layout", "view", "split", "draws", "seed")},
+        camera=camera,
+        next_camera=None,
+        lights=tuple(TypeAdapter(LightSpec).validate_python(light) for light in record["lights"]),
+    )
+    scene_data["seed"] = 999
+    other = ms.load_scene(write_scene(scene_data))
+    assert ms.render_frame(other, 2, layout=layout).image.tobytes() != frame.image.tobytes()
+    monkeypatch.setattr("mitsplat.frames.frame.plan_frame", lambda *_: plan)
+    assert ms.render_frame(other, 2, layout=layout).image.tobytes() == frame.image.tobytes()
+
+
+@pytest.mark.parametrize("shadow", ["none", "image"])
+def test_shadow_modes_differ_from_traced(
+    write_scene: WriteScene, scene_data: dict[str, Any], settled: dict[str, Any], scene: ms.Scene, shadow: str
+) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    other = ms.load_scene(write_scene({**scene_data, "composite": {"shadow": shadow}}, f"{shadow}.yaml"))
+    traced, changed = ms.render_frame(scene, 0, layout=layout), ms.render_frame(other, 0, layout=layout)
+    assert not np.array_equal(traced.image, changed.image)
+    np.testing.assert_array_equal(traced.instance, changed.instance)
+
+
+@pytest.fixture
+def refined(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
+    return ms.load_scene(write_scene({**scene_data, "rendering": {"kernel": "mip", "samples": 2}}, "refined.yaml"))
+
+
+def test_rendering_refines_the_preset(scene: ms.Scene, refined: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    whole = replace(PRESETS["balanced"], kernel="mip", samples=2)
+    images = [
+        ms.render_frame(refined, 0, layout=layout, quality=quality).image for quality in (None, "balanced", whole)
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[0], images[2])
+    assert not np.array_equal(images[0], ms.render_frame(scene, 0, layout=layout).image)
+
+
+@pytest.mark.parametrize("name", ["scene", "refined"])
+def test_exported_xml_renders_the_same_picture(
+    name: str,
+    request: pytest.FixtureRequest,
+    settled: dict[str, Any],
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = request.getfixturevalue(name)
+    layout = layout_of_small_scene(scene, settled)
+    monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", lambda *_: layout)
+    export_xml(scene, 1, tmp_path / "one.xml")
+    picture = render_xml(tmp_path / "one.xml", tmp_path / "out")
+    frame = ms.render_frame(scene, 1, layout=layout)
+    ours = np.asarray(Image.open(picture), dtype=np.float64)
+    covered = frame.layers["alpha"] > 0.99
+    assert covered.any()
+    assert np.abs(ours - frame.image)[covered].mean() < 1.0
+
+
+def test_bad_xml_is_one_sentence(tmp_path: Any) -> None:
+    (tmp_path / "bad.xml").write_text('<scene version="3.0.0"><shape type="splats"/></scene>')
+    with pytest.raises(InputError, match="filename"):
+        render_xml(tmp_path / "bad.xml", tmp_path)
+    with pytest.raises(InputError, match="no such file"):
+        render_xml(tmp_path / "absent.xml", tmp_path)
+
+
+def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:
+    with pytest.raises(InputError):
+        ms.render_frame(scene, 12)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("quality", ["fast", "balanced"])
+@pytest.mark.parametrize("close", [False, True])
+def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: int, close: bool) -> None:
+    """From the third picture on only tiles with objects are made anew, also where something static is before them."""
+    ms.render_splats(make_splats(1), Camera.look_at((0, 0, -2), (0, 0, 0), width=8, height=8, fov_x=50))
+    static = make_splats_shape(make_splats(300, 1, scales=(0.02, 0.1)))
+    things = [make_splats(40, seed, spread=0.15, scales=(0.01, 0.05)) for seed in (2, 3, 4)]
+    camera = Camera.look_at((0, 0, -0.3 if close else -2), (0, 0, 0), up=(0, -1, 0), width=50, height=37, fov_x=50)
+
+    def scene(number: int) -> Any:
+        pose = np.eye(4)
+        pose[0, 3] = 0.2 * number - 0.3
+        thing = make_splats_shape(things[number], pose, instance=number + 1)
+        return mi.load_dict({"type": "scene", "static": static, "thing": thing})
+
+    def layers(integrator: Any, number: int) -> ms.Layers:
+        return render_layers(integrator, scene(number), camera)
+
+    chosen = replace(PRESETS[quality], samples=samples)
+    still = make_integrator(quality=chosen, shadow="none")
+    for number in (0, 1, 2, 0):
+        got, fresh = layers(still, number), layers(make_integrator(quality=chosen, shadow="none"), number)
+        for field in fields(got):
+            assert np.array_equal(getattr(got, field.name), getattr(fresh, field.name)), (number, field.name)
+    assert still._still is not None and still._still[1] is not None
+    elsewhere = replace(camera, cx=camera.cx + 1)
+    render_layers(still, scene(0), elsewhere)
+    assert still._still[1] is None
+
+
+def test_views_of_a_layout_share_what_was_uploaded(
+    write_scene: WriteScene,
+    scene_data: dict[str, Any],
+    settled: dict[str, Any],
+    scene: ms.Scene,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Area lights are shapes that are made anew for every frame; they must not count as a change of what is there."""
+    from mitsplat.plugins import splat_proxy
+
+    uploads = []
+    merge = splat_proxy.merge_clouds
+    monkeypatch.setattr(splat_proxy, "merge_clouds", lambda clouds: uploads.append(1) or merge(clouds))
+    layout = layout_of_small_scene(scene, settled)
+    lit = scene_data | {"lights": [{"kind": "area", "position": [0, 0, 1], "target": [0, 0, 0]}]}
+    chosen = ms.load_scene(write_scene(lit, "lit.yaml"))
+    for index in (0, 1):
+        ms.render_frame(chosen, index, layout=layout)
+    assert len(uploads) == 1

@@ -1,0 +1,179 @@
+"""Scenes that are written in XML by hand: what they may name, what is refused and how, and the README's own."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mitsplat.asset import Asset
+from mitsplat.cli import app
+from mitsplat.errors import InputError
+from mitsplat.frames.mitsuba_xml import one_sentence, render_xml
+from mitsplat.render.layers import ensure_variant
+from mitsplat.scene.untrusted_xml import check_xml
+from tests.conftest import box_asset
+
+ROOT = Path(__file__).parents[2]
+
+SCENE = """<scene version="3.9.0">
+    <integrator type="splat_proxy"/>
+    <sensor type="perspective">
+        <film type="hdrfilm"> <integer name="width" value="24"/> <integer name="height" value="16"/> </film>
+        <transform name="to_world"> <lookat origin="0, 0, 0.1" target="0, 0, 0" up="0, 1, 0"/> </transform>
+    </sensor>
+{}
+</scene>
+"""
+
+NUT = '<shape type="splats"> <string name="asset" value="nut"/> {} </shape>'
+
+SPLAT_FILE = '<shape type="splats"> <string name="filename" value="{}"/> </shape>'
+
+FILM = '<film type="hdrfilm"> <integer name="width" value="8"/> </film>'
+
+
+def tuned(properties: str, text: str = SCENE.format("")) -> str:
+    """A scene whose integrator has these properties."""
+    return text.replace('"splat_proxy"/>', f'"splat_proxy"> {properties} </integrator>')
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """A folder with an asset in metres, one in millimetres, and room for a scene."""
+    box_asset("nut").save(tmp_path / "nut")
+    box_asset("nut").save(tmp_path / "milli", splats="splats.spz")
+    return tmp_path
+
+
+def write(folder: Path, text: str) -> Path:
+    (folder / "scene.xml").write_text(text)
+    return folder / "scene.xml"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            SCENE.format(NUT.format('<float name="size" value="1"/>')),
+            r":7: shape 'splats' takes no 'size'; it takes asset, filename, proxy, units, to_world, instance, dynamic, "
+            "capture_light, roughness, specular$",
+        ),
+        (
+            SCENE.format('<shape type="sphere"> <string name="proxy" value="a"/> <float name="b" value="1"/> </shape>'),
+            ":7: shape 'sphere' takes no 'proxy', 'b'$",
+        ),
+        (
+            tuned('<float name="noise" value="1"/>'),
+            ":2: integrator 'splat_proxy' takes no 'noise'; it takes quality, .*, max_depth, hide_emitters$",
+        ),
+        (
+            f'<scene version="3.0.0">\n<sensor type="opencv_camera">{FILM} <float name="fov" value="1"/>'
+            '<float name="fx" value="8"/> <float name="fy" value="8"/> </sensor> </scene>',
+            ":2: sensor 'opencv_camera' takes no 'fov'; it takes fx, fy, cx, cy, distortion, lens, to_world, ",
+        ),
+        (
+            SCENE.format("").replace('"perspective"', '"orthographic"'),
+            r"scene.xml: integrator 'splat_proxy': the sensor must be 'opencv_camera', 'perspective' or 'thinlens' "
+            r"\(got OrthographicCamera\)$",
+        ),
+        (
+            tuned('<integer name="max_depth" value="1"/>'),
+            r":2: integrator 'splat_proxy': 'max_depth' must be from 2 to 64 \(got 1\)$",
+        ),
+        (
+            SCENE.format('<shape type="splats"/>').replace("splat_proxy", "path"),
+            ":7: shape 'splats': 'asset' or 'filename' is missing$",
+        ),
+        (
+            SCENE.format(NUT.format("")).replace("splat_proxy", "path"),
+            "scene.xml: shape 'splats' is only seen by the integrator 'splat_proxy'$",
+        ),
+        (
+            SCENE.format('<shape type="splats"> <string name="asset" value="bolt"/> </shape>'),
+            ":7: shape 'splats': no such file: .*/bolt/asset.yaml$",
+        ),
+        (
+            SCENE.format(SPLAT_FILE.format("milli/splats.spz")),
+            ":7: shape 'splats': .*/milli/splats.spz is in the units and axes that .*/asset.yaml states: name the "
+            "folder as 'asset', or give 'units'$",
+        ),
+        (
+            SCENE.format(NUT.format('<float name="units" value="1"/>')),
+            ":7: shape 'splats': 'asset' takes the place of 'filename', 'proxy' and 'units'$",
+        ),
+        (SCENE.format('<shape type="splatz"/>'), ':7: .*Plugin "splatz" not found'),
+        (SCENE.format('<shape type="ply"> <string name="filename" value="no.ply"/> </shape>'), ":7: .*file not found"),
+        (SCENE.format('<shape type="sphere"> <float name="radius"/> </shape>'), ":7: missing required attribute"),
+    ],
+)  # fmt: skip
+def test_what_a_scene_has_wrong_is_one_sentence(small: Path, text: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        render_xml(write(small, text), small / "out.png")
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(f"{small}/scene.xml")
+
+
+def test_a_sentence_without_a_place_is_kept() -> None:
+    assert one_sentence(Path("a.xml"), "[scene.cpp:12] nothing works") == "a.xml: nothing works"
+    assert one_sentence(Path("a.xml"), "") == "a.xml: Mitsuba refuses it without a reason"
+
+
+def test_a_camera_that_shears_is_refused(small: Path) -> None:
+    sensor = (
+        f'<sensor type="opencv_camera">{FILM} <float name="fx" value="8"/> <float name="fy" value="8"/> '
+        '<transform name="to_world"> <scale value="2"/> </transform> </sensor>'
+    )
+    with pytest.raises(InputError, match="'to_world' must be a rotation and a translation"):
+        render_xml(write(small, f'<scene version="3.0.0">{sensor}</scene>'), small / "out.png")
+
+
+def test_an_asset_is_read_in_metres_with_its_mesh_and_material(small: Path) -> None:
+    ensure_variant()
+    named = '<shape type="splats"> <string name="asset" value="{}"/> <integer name="instance" value="{}"/> </shape>'
+    by_unit = (
+        '<shape type="splats"> <string name="filename" value="milli/splats.spz"/> <float name="units" value="0.001"/>'
+        '<string name="proxy" value="milli/mesh.ply"/> <integer name="instance" value="3"/>'
+        '<string name="capture_light" value="scene"/> </shape>'
+    )
+    lines = named.format("nut", 1), named.format("milli", 2), named.format("nut", 0), by_unit
+    path = write(small, SCENE.format("\n".join(lines)))
+    shapes = sorted(mi.load_file(str(path)).shapes(), key=lambda shape: shape.instance)
+    nut = Asset.load(small / "nut")
+    for shape in shapes:
+        at = shape.world_from_splats
+        np.testing.assert_allclose(shape.splats.means @ at[:3, :3].T, nut.splats.means, atol=1e-5)
+        np.testing.assert_allclose(shape.proxy.bounds @ at[:3, :3].T, nut.mesh.bounds, atol=1e-5)
+    assert [s.capture_light for s in shapes] == ["uniform", "uniform", "uniform", "scene"]
+    assert [s.specular for s in shapes] == pytest.approx([0, 0.04, 0.04, 0])
+
+
+def test_an_asset_outside_of_the_scenes_folder_is_refused(small: Path) -> None:
+    (small / "in").mkdir()
+    text = SCENE.format('<shape type="splats"> <string name="asset" value="../nut"/> </shape>')
+    with pytest.raises(InputError, match=r"scene\.xml:7: must not name a file outside of the scene's folder"):
+        render_xml(write(small / "in", text), small / "out.png")
+    check_xml(small / "in/scene.xml", allow_outside=True)
+
+
+def test_the_readmes_scene_renders_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its size alone is less, so that the test is fast."""
+    (text,) = re.findall(r"```xml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    for name in set(re.findall(r'name="asset" value="([^"]+)"', text)):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    text = re.sub(r'name="(width|height)" value="(\d+)"', lambda m: f'name="{m[1]}" value="{int(m[2]) // 8}"', text)
+    write(tmp_path, tuned('<integer name="lens_rings" value="1"/>', text))
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["render", str(tmp_path / "scene.xml"), "-o", str(tmp_path / "scene.png")])
+    assert result.exit_code == 0, result.output
+    picture = np.array(mi.Bitmap(str(tmp_path / "scene.png")), dtype=float)
+    assert picture.shape == (45, 80, 3)
+    parts = (slice(14, 24), slice(45, 54)), (slice(22, 28), slice(27, 34)), (slice(35, 45), slice(10, 70))
+    gold, gear, mat = (picture[part].mean((0, 1)) for part in parts)
+    assert gold[0] > 1.3 * gold[2] > 50
+    assert mat[2] > 1.1 * mat[0] > 20
+    assert np.ptp(gear) < 15

@@ -1,0 +1,77 @@
+"""The chart of speed against accuracy."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from mitsplat.cli import app
+from mitsplat.errors import InputError
+from mitsplat.frames.speed_accuracy import Row, Step, cheapest, draw_chart, measure_steps
+from mitsplat.quality import PRESETS
+from tests.render.test_render import make_splats
+
+
+@pytest.fixture(scope="module")
+def splat_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("chart") / "cloud.ply"
+    make_splats(400, 3, scales=(0.02, 0.1)).save(file)
+    return file
+
+
+def row(name: str, seconds: float, rmse: float) -> Row:
+    psnr = -20 * math.log10(rmse) if rmse else math.inf
+    return Row(name, seconds, rmse, psnr, largest=rmse, ssim=1.0, mask_iou=1.0, memory=0.5)
+
+
+ROWS = [row("fast", 1.0, 0.01), row("balanced", 2.0, 0.001), row("exact", 9.0, 0.0), row("fast, no shadow", 0.5, 0.0)]
+
+
+@pytest.mark.parametrize(("tolerance", "name"), [(0.02, "fast"), (0.002, "balanced"), (0.0, "exact")])
+def test_cheapest_preset_within_a_tolerance(tolerance: float, name: str) -> None:
+    assert cheapest(ROWS, tolerance).name == name
+
+
+def test_negative_tolerance_is_refused() -> None:
+    with pytest.raises(InputError, match="tolerance must be at least 0"):
+        cheapest(ROWS, -1.0)
+
+
+def test_coarser_steps_are_measured_to_be_less_exact(splat_file: Path) -> None:
+    coarse = Step("coarse", replace(PRESETS["fast"], alpha_min=0.2))
+    steps = (coarse, Step("fast", PRESETS["fast"]), Step("exact", PRESETS["exact"]))
+    rows = measure_steps(splat_file, steps, frames=2, overrides={"output.width": 64, "output.height": 48})
+    assert [r.name for r in rows] == ["coarse", "fast", "exact"]
+    assert rows[0].rmse > 2 * rows[1].rmse > 0 and rows[0].ssim < rows[1].ssim < 1
+    assert (rows[2].rmse, rows[2].largest, rows[2].ssim, rows[2].mask_iou) == (0, 0, 1, 1)
+    assert all(r.seconds > 0 and 0.05 < r.memory < 8 for r in rows)
+
+
+def test_chart_command_writes_table_csv_and_picture(splat_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "chart.png"
+    result = CliRunner().invoke(
+        app, ["chart", str(splat_file), "--size", "48x32", "-n", "1", "--tolerance", "0", "-o", str(out)]
+    )
+    assert result.exit_code == 0, result.output
+    assert "exact *" in result.output
+    with out.with_suffix(".csv").open() as stream:
+        lines = list(csv.DictReader(stream))
+    assert {"fast", "balanced", "exact"} < {line["name"] for line in lines}
+    theirs = next(line for line in lines if "volprim" in line["name"])
+    assert 0 < float(theirs["rmse"]) < 0.5 and theirs["mask_iou"] == "nan"
+    assert float(next(line for line in lines if line["name"] == "exact")["rmse"]) == 0
+
+
+def test_chart_shows_every_step(tmp_path: Path) -> None:
+    draw_chart(ROWS, tmp_path / "a.png", title="", tolerance=0.002)
+    draw_chart(ROWS[1:], tmp_path / "b.png", title="", tolerance=0.002)
+    a, b = (np.asarray(Image.open(tmp_path / name)) for name in ("a.png", "b.png"))
+    assert a.shape[0] > 300 and (a != 255).mean() > 0.01
+    assert a.shape != b.shape or (a != b).any()

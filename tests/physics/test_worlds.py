@@ -1,0 +1,479 @@
+"""Rigid bodies against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mitsplat.mesh import convex_pieces, mass_properties
+from tests.bodies import STEPPERS, lowest, pose_at
+
+GRAVITY = 9.81
+pytestmark = pytest.mark.usefixtures("physics")
+EVERYWHERE = np.full(3, -1e3), np.full(3, 1e3)
+
+
+def body_of(*pieces, friction=0.5, density=3000.0):
+    from mitsplat.physics.worlds import Body
+
+    return Body(pieces, mass_properties(trimesh.util.concatenate(list(pieces)), pieces, density=density), friction)
+
+
+def table(pose=None, friction=0.5):
+    """A box whose top is the plane z = 0 of its pose."""
+    from mitsplat.physics.worlds import Collider
+
+    top_from_box = trimesh.transformations.translation_matrix((0, 0, -0.05))
+    return Collider(friction, box=((1.0, 1.0, 0.1), (np.eye(4) if pose is None else pose) @ top_from_box))
+
+
+def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0):
+    from mitsplat.physics.worlds import MujocoWorld, WarpWorld
+
+    if stepper == "mujoco":
+        world = MujocoWorld(bodies, colliders, timestep=timestep)
+    else:
+        world = WarpWorld(bodies, colliders, timestep=timestep, capacity=capacity)
+    world.reset(np.stack(poses))
+    return world
+
+
+def run_until(world, time):
+    while world.time < time - 1e-9:
+        world.advance()
+
+
+def centres(world):
+    """Centres of mass [m], shape (N, 3)."""
+    return np.array([(pose @ [*body.mass.centre, 1])[:3] for body, pose in zip(world.bodies, world.poses, strict=True)])
+
+
+def energy(world):
+    """Kinetic and potential energy of the bodies [J]."""
+    total = 0.0
+    for body, pose, centre, (speed, spin) in zip(
+        world.bodies, world.poses, centres(world), world.velocities, strict=True
+    ):
+        inertia = pose[:3, :3] @ body.mass.inertia @ pose[:3, :3].T
+        total += body.mass.mass * (GRAVITY * centre[2] + speed @ speed / 2) + spin @ inertia @ spin / 2
+    return total
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_free_fall(stepper):
+    """z = z0 - g t^2 / 2 and v = -g t; semi-implicit steps of h add g h t / 2."""
+    box = trimesh.creation.box((0.02, 0.02, 0.02))
+    world = world_of(stepper, [body_of(box)], [table()], [pose_at((0, 0, 2.0))])
+    run_until(world, 0.4)
+    assert world.velocities[0, 0, 2] == pytest.approx(-GRAVITY * world.time, rel=1e-3)
+    fallen = GRAVITY * world.time**2 / 2 + GRAVITY * 0.002 * world.time / 2
+    assert 2.0 - world.poses[0, 2, 3] == pytest.approx(fallen, rel=1e-3)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_the_frame_is_the_meshs_and_not_the_centre_of_mass(stepper):
+    """A body spinning in free fall turns about its centre of mass, which follows the parabola; its origin does not."""
+    box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.3, -0.2, 0.1))
+    start = pose_at((0, 0, 2), Rotation.from_rotvec((0.4, -1.0, 0.3)))
+    world = world_of(stepper, [body_of(box)], [table()], [start])
+    np.testing.assert_allclose(world.poses[0], start, atol=1e-6)
+    run_until(world, 0.2)
+    centre = (world.poses[0] @ [0.3, -0.2, 0.1, 1])[:3] - (start @ [0.3, -0.2, 0.1, 1])[:3]
+    np.testing.assert_allclose(centre, (0, 0, -GRAVITY * 0.2 * 0.202 / 2), atol=2e-5)
+    np.testing.assert_allclose(world.poses[0, :3, :3], start[:3, :3], atol=1e-4)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_small_parts_come_to_rest_on_the_table(stepper):
+    """A box of 10 mm flat, one on edge, a washer-thin disc on its rim, and one with its origin elsewhere."""
+    from mitsplat.physics.worlds import run_to_rest
+
+    box = trimesh.creation.box((0.010, 0.010, 0.010))
+    disc = trimesh.creation.cylinder(radius=0.006, height=0.0015, sections=32)
+    slab = trimesh.creation.box((0.15, 0.06, 0.012)).apply_translation((0.5, 0.5, 0.5))
+    meshes = [box, box, disc, slab]
+    poses = [
+        pose_at((0, 0, 0.02)),
+        pose_at((0.1, 0, 0.02), Rotation.from_euler("x", 40, degrees=True)),
+        pose_at((0.2, 0, 0.45), Rotation.from_euler("xy", (75, 10), degrees=True)),
+        pose_at((-0.7, -0.7, -0.4), Rotation.from_euler("z", 5, degrees=True)),
+    ]
+    world = world_of(stepper, [body_of(mesh) for mesh in meshes], [table()], poses)
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    for mesh, pose, thickness in zip(meshes, outcome.poses, (0.01, 0.01, 0.0015, 0.012), strict=True):
+        assert lowest(mesh, pose) == pytest.approx(0.0, abs=3e-4)
+        heights = (mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2]
+        assert np.ptp(heights) == pytest.approx(thickness, abs=3e-4)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+    first = outcome.poses
+    run_until(world, world.time + 1.0)
+    np.testing.assert_allclose(world.poses[:, :3, 3], first[:, :3, 3], atol=1e-4)
+
+
+FRICTIONS = [(0.2, 0.6), (0.6, 0.2), (0.05, 0.8), (0.8, 0.05), (0.35, 0.5), (0.9, 0.0), (0.0, 0.9), (0.4, 0.4)]
+"""Of a block and of what it lies on."""
+
+
+def inclines(angle, frictions):
+    """Tables side by side that fall towards +x by an angle [rad], and the frame of each one's surface."""
+    frames = [
+        pose_at((0, 1.1 * i, 0)) @ pose_at((0, 0, 0), Rotation.from_euler("y", angle)) for i in range(len(frictions))
+    ]
+    return [table(frame, friction) for frame, friction in zip(frames, frictions, strict=True)], frames
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_friction_on_an_incline(stepper):
+    """On 25 degrees a block slides by g (sin a - mu cos a) t (t + h) / 2, mu the geometric mean, h the step."""
+    angle = np.radians(25.0)
+    tables, frames = inclines(angle, [friction for _, friction in FRICTIONS])
+    starts = np.stack([frame @ pose_at((-0.45, 0, 0.005)) for frame in frames])
+    block = trimesh.creation.box((0.04, 0.04, 0.01))
+    world = world_of(stepper, [body_of(block, friction=friction) for friction, _ in FRICTIONS], tables, starts)
+    run_until(world, 0.5)
+    way = (world.poses[:, :3, 3] - starts[:, :3, 3]) @ frames[0][:3, 0]
+    acceleration = 2 * way / (world.time * (world.time + 0.002))
+    mu = np.tan(angle) - acceleration / (GRAVITY * np.cos(angle))
+    np.testing.assert_allclose(mu, np.sqrt(np.prod(FRICTIONS, axis=1)), rtol=0.003, atol=1e-4)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_what_slides_on_an_incline(stepper):
+    """A block slides iff tan a > sqrt(mu mu'), whichever of the two is the smoother, on a table or on a slab."""
+    angle = np.radians(20.0)
+    pairs = [(low, (share * np.tan(angle)) ** 2 / low) for share in (0.9, 1.1) for low in (0.1, 0.3, 1.0)]
+    block, slab = trimesh.creation.box((0.02, 0.02, 0.01)), trimesh.creation.box((0.3, 0.1, 0.02))
+    rough = 9.0  # of the tables on which slabs lie, which must not slide themselves
+    tables, frames = inclines(angle, [mu for _, mu in pairs] + [rough] * len(pairs))
+    bodies = [body_of(block, friction=mu) for mu, _ in pairs * 2]
+    bodies += [body_of(slab, friction=mu) for _, mu in pairs]
+    height = [0.005] * len(pairs) + [0.0251] * len(pairs)
+    starts = [frame @ pose_at((-0.1, 0, z)) for frame, z in zip(frames, height, strict=True)]
+    starts += [frame @ pose_at((0, 0, 0.01)) for frame in frames[len(pairs) :]]
+    world = world_of(stepper, bodies, tables, starts)
+    run_until(world, 0.1)  # let them sink in
+    before = world.poses[:, :3, 3]
+    run_until(world, 0.4)
+    way = np.linalg.norm(world.poses[:, :3, 3] - before, axis=1)
+    np.testing.assert_array_equal(way > 0.005, [True] * 3 + [False] * 3 + [True] * 3 + [False] * 9)
+    assert way[way < 0.005].max() < 1e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_friction_of_spin(stepper):
+    """A top on a square foot slows by g m mu sqrt(p^2 + r^2) / I: sliding at the corners, p from the axis, and spin.
+
+    Spin friction of each corner is mu r, r = 10 mm the radius of contact; the cone of both is an ellipsoid.
+    """
+    foot = trimesh.creation.box((0.004, 0.004, 0.004)).apply_translation((0, 0, 0.002))
+    disc = trimesh.creation.box((0.05, 0.05, 0.006)).apply_translation((0, 0, 0.007))
+    tables, frames = inclines(0.0, [mu for _, mu in FRICTIONS])
+    bodies = [body_of(foot, disc, friction=mu) for mu, _ in FRICTIONS]
+    world = world_of(stepper, bodies, tables, frames)
+    run_until(world, 0.1)
+    velocities = np.zeros((len(bodies), 2, 3))
+    velocities[:, 1, 2] = 40.0
+    world.reset(world.poses, velocities)
+    run_until(world, 0.3)
+    mass, mu = bodies[0].mass, np.sqrt(np.prod(FRICTIONS, axis=1))
+    slowing = GRAVITY * mass.mass * mu * np.hypot(0.002 * np.sqrt(2), 0.01) / mass.inertia[2, 2]
+    slowed = (40.0 - world.velocities[:, 1, 2]) / world.time
+    np.testing.assert_allclose(slowed, slowing, rtol=0.01, atol=0.6)
+
+
+def test_mujoco_in_c_is_stepped_as_by_itself(monkeypatch):
+    """With the friction that MuJoCo takes, the stages called one by one leave what mj_step does, to the bit."""
+    import mujoco
+
+    from mitsplat.physics import worlds as physics
+
+    box = trimesh.creation.box((0.02, 0.03, 0.01))
+    poses = [pose_at((0.004 * i, 0, 0.02 + 0.03 * i), Rotation.from_rotvec((i, 1, 0.3))) for i in range(5)]
+    ours, own = (world_of("mujoco", [body_of(box)] * 5, [table(friction=0.4)], poses) for _ in range(2))
+
+    def larger(first, second):
+        slide, spin, roll = np.maximum(first, second).T
+        return np.maximum(np.stack([slide, slide, spin, roll, roll], axis=1), 1e-5)
+
+    monkeypatch.setattr(physics, "pair_friction", larger)
+    run_until(ours, 0.6)
+    mujoco.mj_step(own._model, own._data, nstep=300)
+    assert own._data.ncon > 8
+    np.testing.assert_array_equal(ours._data.qpos, own._data.qpos)
+    np.testing.assert_array_equal(ours._data.qvel, own._data.qvel)
+
+
+def test_a_contact_buffer_that_is_too_small_is_noticed():
+    from mitsplat.physics.worlds import OVERFLOW, run_to_rest
+
+    boxes = [body_of(trimesh.creation.box((0.03, 0.03, 0.03)))] * 4
+    poses = [pose_at((0.1 * i, 0, 0.016)) for i in range(4)]
+    world = world_of("warp", boxes, [table()], poses, capacity=0.001)
+    assert run_to_rest(world, max_time=1.0, bounds=EVERYWHERE).refused == OVERFLOW
+
+
+def test_worlds_that_share_kernels_do_not_meet():
+    """A world falls as it does alone while another of more pieces, made after it by the same kernels, runs too."""
+    from mitsplat.physics.contacts import ContactFinder
+    from mitsplat.physics.worlds import WarpWorld, all_pieces
+
+    few = [body_of(trimesh.creation.box((0.02, 0.03, 0.01)))] * 2
+    many = [body_of(trimesh.creation.icosphere(subdivisions=1, radius=0.01))] * 6
+    poses = np.stack([pose_at((0.05 * i, 0, 0.03), Rotation.from_euler("xy", (20 * i, 35))) for i in range(6)])
+
+    def made(bodies, finder):
+        world = WarpWorld(bodies, [table()], timestep=0.002, capacity=1.0, contact_finder=finder)
+        world.reset(poses[: len(bodies)])
+        return world
+
+    alone = made(few, None)
+    run_until(alone, 0.3)
+    finder = ContactFinder(all_pieces([*few, *many], [table()]))
+    first, second = made(few, finder), made(many, finder)
+    while first.time < 0.3 - 1e-9:
+        first.advance()
+        second.advance()
+    np.testing.assert_array_equal(first.poses, alone.poses)
+    assert (second.poses[:, 2, 3] > 0.009).all()
+
+
+def test_mean_speeds():
+    """A turn of t about an axis through the centre of mass, and a way of w, in s seconds: t / s and w / s."""
+    from mitsplat.physics.worlds import _mean_speeds
+
+    body = body_of(trimesh.creation.box((0.02, 0.03, 0.01)))
+    before = pose_at((0.1, 0, 0), Rotation.from_rotvec((0.3, -1, 2)))[None]
+    for turn in (1e-4, 0.5, np.pi):
+        after = pose_at((0.1, 0, 3e-4), Rotation.from_rotvec((0, turn, 0)) * Rotation.from_rotvec((0.3, -1, 2)))[None]
+        assert _mean_speeds([body], before, after, 0.05) == pytest.approx((6e-3, turn / 0.05), rel=1e-6)
+
+
+def test_a_light_part_carries_a_heavy_one():
+    """A plate a hundred times as heavy rests on two nuts: none of them sinks by more than 0.1 mm."""
+    from mitsplat.physics.worlds import run_to_rest
+
+    nut, plate = trimesh.creation.box((0.01, 0.01, 0.005)), trimesh.creation.box((0.15, 0.05, 0.0135))
+    bodies = [body_of(nut), body_of(nut), body_of(plate)]
+    assert bodies[2].mass.mass > 100 * bodies[0].mass.mass
+    poses = [pose_at((-0.05, 0, 0.003)), pose_at((0.05, 0, 0.003)), pose_at((0, 0, 0.014))]
+    world = world_of("warp", bodies, [table()], poses)
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    assert [lowest(mesh, pose) for mesh, pose in zip((nut, nut, plate), outcome.poses, strict=True)] == pytest.approx(
+        [0.0, 0.0, 0.005], abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_an_incline_is_crept_down_by_less_than_a_tenth_of_a_millimetre(stepper):
+    """tan 20 = 0.36 < mu = 0.5: a block at rest stays; 3 s."""
+    block = trimesh.creation.box((0.04, 0.04, 0.01))
+    tilt = pose_at((0, 0, 0), Rotation.from_euler("y", 20, degrees=True))
+    world = world_of(stepper, [body_of(block)], [table(tilt)], [tilt @ pose_at((0, 0, 0.005))])
+    run_until(world, 0.2)  # let it sink in
+    before = world.poses
+    run_until(world, 3.2)
+    assert np.linalg.norm(world.poses[0, :3, 3] - before[0, :3, 3]) < 1e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_box_ends_on_a_face_however_it_is_dropped(stepper):
+    """Flat on each face, on edges, and on a corner below the centre of mass: the energy is least on a face."""
+    from mitsplat.physics.worlds import run_to_rest
+
+    box = trimesh.creation.box((0.02, 0.03, 0.01))
+    on_corner = Rotation.align_vectors([[0, 0, -1]], [[2, 3, 1]])[0]
+    turns = [
+        Rotation.identity(),
+        Rotation.from_euler("x", 90, degrees=True),
+        Rotation.from_euler("y", 90, degrees=True),
+        Rotation.from_euler("x", 45, degrees=True),
+        Rotation.from_euler("y", 30, degrees=True),
+        # Exactly balanced it would stay: three degrees off.
+        on_corner * Rotation.from_euler("x", 3, degrees=True),
+    ]
+    poses = [pose_at((0.1 * i - 0.25, 0, 0.05), turn) for i, turn in enumerate(turns)]
+    world = world_of(stepper, [body_of(box)] * len(turns), [table()], poses)
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    steepest = np.abs(outcome.poses[:, 2, :3]).max(axis=1)
+    assert np.degrees(np.arccos(np.minimum(steepest, 1.0))).max() < 0.1
+    np.testing.assert_array_equal(np.abs(outcome.poses[:3, 2, :3]).argmax(axis=1), [2, 1, 0])
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_box_does_not_balance_on_its_edge(stepper):
+    """The centre of mass stands above the edge at a tilt of atan(d / b), where only roll friction could hold it."""
+    from mitsplat.physics.worlds import run_to_rest
+
+    breadth, depth = 0.03, 0.009
+    slab = trimesh.creation.box((breadth, breadth, depth))
+    upright = Rotation.from_euler("y", 90, degrees=True)
+    poses = []
+    for i, degrees in enumerate((-0.3, 0.3)):
+        tilt = np.arctan(depth / breadth) + np.radians(degrees)
+        height = (breadth * np.cos(tilt) + depth * np.sin(tilt)) / 2
+        poses.append(pose_at((0, 0.1 * i, height), Rotation.from_euler("y", tilt) * upright))
+    world = world_of(stepper, [body_of(slab)] * 2, [table()], poses)
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    # Back onto the narrow face, and over onto the large one.
+    np.testing.assert_allclose(np.abs(outcome.poses[:, 2, 2]), [0, 1], atol=1e-3)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_stack_of_five_stands(stepper):
+    """Drift below 0.1 mm in 5 s."""
+    box = trimesh.creation.box((0.04, 0.04, 0.02))
+    poses = [pose_at((0, 0, 0.01 + 0.0201 * i)) for i in range(5)]
+    world = world_of(stepper, [body_of(box)] * 5, [table()], poses)
+    run_until(world, 0.5)
+    before = world.poses[:, :3, 3]
+    run_until(world, 5.5)
+    assert np.linalg.norm(world.poses[:, :3, 3] - before, axis=1).max() < 1e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_drop_neither_rebounds_nor_gains_energy(stepper):
+    """Contact only takes from E = sum m (g z + v v / 2) + w I w / 2; after impact nothing rises by 1 mm."""
+    shapes = [
+        trimesh.creation.box((0.03, 0.03, 0.03)),
+        trimesh.creation.icosphere(3, 0.015),
+        trimesh.creation.cylinder(radius=0.015, height=0.02, sections=48),
+    ]
+    poses = [pose_at((0.1 * i, 0, 0.3)) for i in range(3)]
+    world = world_of(stepper, [body_of(shape) for shape in shapes], [table()], poses)
+    start = least = energy(world)
+    heights = []
+    while world.time < 1.5:
+        world.advance()
+        heights.append([lowest(mesh, pose) for mesh, pose in zip(shapes, world.poses, strict=True)])
+        assert energy(world) - least < 0.01 * start
+        least = min(least, energy(world))
+    for height in np.transpose(heights):
+        impact = int(np.argmax(height < 0))
+        assert height[impact] < 0
+        assert height[impact:].max() < 1e-3
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+@pytest.mark.parametrize("speed", [3.0, 6.0])
+def test_a_thin_plate_does_not_tunnel(stepper, speed):
+    """A plate of 2 mm, 12 mm a step at 6 m/s, thrown flat, on edge and on a corner at table and wall."""
+    from mitsplat.physics.worlds import Collider
+
+    plate = trimesh.creation.box((0.05, 0.04, 0.002))
+    wall = Collider(0.5, box=((0.05, 1.0, 1.0), pose_at((0.425, 0, 0.5))))
+    turns = [Rotation.identity(), Rotation.from_euler("x", 90, degrees=True), Rotation.from_euler("xy", (40, 35), True)]
+    to_wall = Rotation.from_euler("y", 90, degrees=True)
+    poses = [pose_at((-0.3, 0.2 * i, 0.1), turn) for i, turn in enumerate(turns)]
+    poses += [pose_at((0.2, 0.2 * i - 0.2, 0.2), to_wall * turn) for i, turn in enumerate(turns)]
+    velocities = np.zeros((6, 2, 3))
+    velocities[:3, 0, 2], velocities[3:, 0, 0] = -speed, speed
+    world = world_of(stepper, [body_of(plate)] * 6, [table(), wall], poses)
+    world.reset(np.stack(poses), velocities)
+    least = start = energy(world)
+    while world.time < 1.0:
+        world.advance()
+        assert centres(world)[:, 2].min() > -0.02
+        assert centres(world)[:, 0].max() < 0.42
+        assert energy(world) - least < 0.01 * start
+        least = min(least, energy(world))
+    assert min(lowest(plate, pose) for pose in world.poses) > -3e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_an_overlap_of_ten_millimetres_ejects_nothing(stepper):
+    """Boxes 10 mm in one another, and one 10 mm in the table, part at less than 1 m/s."""
+    box = trimesh.creation.box((0.04, 0.04, 0.04))
+    poses = [pose_at((0, 0, 0.02)), pose_at((0.03, 0, 0.021)), pose_at((0.2, 0, 0.01))]
+    world = world_of(stepper, [body_of(box)] * 3, [table()], poses)
+    fastest = 0.0
+    while world.time < 1.0:
+        world.advance()
+        fastest = max(fastest, float(np.linalg.norm(world.velocities[:, 0], axis=1).max()))
+    assert fastest < 1.0
+    assert [lowest(box, pose) for pose in world.poses] == pytest.approx([0, 0, 0], abs=3e-4)
+    assert world.poses[1, 0, 3] - world.poses[0, 0, 3] > 0.04 - 5e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_a_ball_rests_inside_a_cup_and_not_on_its_hull(stepper):
+    """The floor of the cup is 6 mm thick: the ball's centre comes to rest a radius above it, not above the rim."""
+    from mitsplat.physics.worlds import Collider, run_to_rest
+
+    profile = [[0, 0], [0.03, 0], [0.03, 0.03], [0.025, 0.03], [0.025, 0.006], [0, 0.006]]
+    cup = trimesh.creation.revolve(profile, sections=8)
+    ball = trimesh.creation.icosphere(3, 0.012)
+    world = world_of(
+        stepper, [body_of(ball)], [Collider(0.5, pieces=convex_pieces(cup)), table()], [pose_at((0.005, 0, 0.06))]
+    )
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    assert lowest(ball, outcome.poses[0]) == pytest.approx(0.006, abs=5e-4)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_bodies_are_thrown_as_said(stepper):
+    """After t at r + v t - g t (t + h) / 2, for semi-implicit steps of h; spin w about a principal axis stays.
+
+    MuJoCo integrates the frame's origin: the centre of mass, a apart, is off by the centripetal h w^2 a t / 2.
+    """
+    box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.1, 0, 0))
+    start = pose_at((0, 0, 1.0), Rotation.from_euler("z", 30, degrees=True))
+    velocities = np.array([[[0.5, -0.3, 1.0], [0, 0, 4.0]]])
+    world = world_of(stepper, [body_of(box)], [table()], [start])
+    centre = centres(world)[0]
+    world.reset(start[None], velocities)
+    np.testing.assert_allclose(world.velocities, velocities, atol=1e-5)
+    run_until(world, 0.2)
+    fallen = np.array([0, 0, GRAVITY * 0.2 * 0.202 / 2])
+    np.testing.assert_allclose(
+        centres(world)[0], centre + velocities[0, 0] * 0.2 - fallen, atol=0.002 * 4**2 * 0.1 * 0.2 / 2
+    )
+    turned = Rotation.from_euler("z", np.radians(30) + 4.0 * 0.2).as_matrix()
+    np.testing.assert_allclose(world.poses[0, :3, :3], turned, atol=1e-3)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
+    """A block at 0.3 mm/s moves by less than 0.1 mm in a quarter of a second and 0.5 mm in one; not if it speeds up."""
+    from mitsplat.physics import worlds as physics
+
+    block = trimesh.creation.box((0.04, 0.04, 0.01))
+    world = world_of(stepper, [body_of(block, friction=0.0)], [table(friction=0.0)], [pose_at((0, 0, 0.005))])
+    start, velocities = world.poses, np.zeros((1, 2, 3))
+    velocities[0, 0, 0] = 3e-4
+    world.reset(start, velocities)
+
+    def push(time, poses):
+        world.set_velocities(velocities * (3 if time > 0.3 else 1))
+
+    refused = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE, observe=push).refused
+    assert refused == "not at rest within 1 s"
+    world.reset(start, velocities)
+    outcome = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE)
+    assert outcome.refused == ""
+    assert 2e-4 < outcome.surface_motion < 4.5e-4
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_what_is_poured_falls_no_faster_than_it_may(stepper):
+    """A ball falls 0.5 m in h / v + v / 2 g = 0.55 s at v = 1 m/s, and no faster."""
+    from mitsplat.physics import worlds as physics
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    world = world_of(stepper, [body_of(ball)], [table()], [pose_at((0, 0, 0.52))])
+    speeds, heights = [], []
+
+    def observe(time, poses):
+        speeds.append(np.linalg.norm(world.velocities[0, 0]))
+        heights.append((time, poses[0, 2, 3]))
+
+    physics.run_to_rest(world, max_time=3.0, bounds=EVERYWHERE, fastest=1.0, observe=observe)
+    assert max(speeds) == pytest.approx(1.0, rel=1e-3)
+    landed = next(time for time, height in heights if height < 0.025)
+    assert landed == pytest.approx(0.5 / 1.0 + 1.0 / (2 * GRAVITY), abs=0.04)

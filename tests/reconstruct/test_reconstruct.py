@@ -1,0 +1,234 @@
+"""Captures and splats to asset folders with a verdict and a page, and what is kept of earlier runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.asset import Asset
+from mitsplat.capture.pipeline import CaptureResult, CaptureSettings
+from mitsplat.errors import InputError
+from mitsplat.fit.trainer import FitSettings
+from mitsplat.mesh_distance import Surface
+from mitsplat.reconstruct.evaluation import Verdict
+from mitsplat.reconstruct.pipeline import AssetJob, Finished, make_asset, make_photo_asset, read_fit
+from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
+from mitsplat.reconstruct.surface import SurfaceSettings
+from mitsplat.scene.scene import load_scene
+from tests.conftest import KnownObject
+
+SETTINGS = ReconstructSettings(surface=SurfaceSettings(voxels=96, faces=4000), view_size=160, verdict_size=160)
+GOOD = Verdict(
+    photos=32, rejected=0, psnr=30.0, psnr_object=29.0, splat_iou=0.98, mesh_iou=0.97, offset=1e-3, spread=1e-3,
+    lost=0.01, scale_error=1e-3, units="metre", gaussians=9, faces=9, watertight=True, solid=True,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_pieces() -> Iterator[None]:
+    """The convex decomposition takes longer than all else, and has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mitsplat.reconstruct.reconstruct.convex_pieces", lambda mesh: (mesh.convex_hull,))
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished]:
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "fit").mkdir()
+    known_object.splats.save(folder / "fit" / "splats.ply")
+    (folder / "fit" / "fit.json").write_text('{"psnr": 31.5}')
+    capture = replace(known_object.capture, units="unknown", rejected={"blurred.jpg": "it is <blurred>"})
+    capture.save(folder / "capture")
+    job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
+    return folder, make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+
+
+def test_mesh_and_splats_share_the_frame_of_the_truth(known_object: KnownObject, made: tuple[Path, Finished]) -> None:
+    folder, done = made
+    asset = Asset.load(folder / "asset")
+    assert asset.class_name == "bracket"
+    assert asset.mesh is not None
+    assert asset.mesh.is_volume
+    assert len(asset.pieces) == 1
+    distance = np.abs(Surface(known_object.mesh).signed_distances(np.asarray(asset.mesh.sample(3000, seed=0))))
+    assert distance.mean() < 0.004 * known_object.mesh.scale
+    assert asset.check() == ()
+    found = done.verdict
+    assert found.splat_iou is not None
+    assert found.splat_iou > 0.98
+    assert found.mesh_iou is not None
+    assert found.mesh_iou > 0.97
+    assert found.offset is not None
+    assert found.offset < 0.002
+    assert (found.psnr, found.photos, found.rejected, found.watertight) == (31.5, 32, 1, True)
+    assert done.shortcoming is None
+
+
+def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, Finished]) -> None:
+    folder, _ = made
+    scene = folder / "scene.yaml"
+    camera = "camera: {kind: orbit, radius: 1, height: 1, target: [0, 0, 0]}"
+    common = f"name: s\nregion: {{min: [-1, -1, 0], max: [1, 1, 1]}}\n{camera}\n"
+    scene.write_text(common + "objects: [{asset: asset}]\n")
+    with pytest.raises(InputError, match=r"objects\[0\].asset: asset 'part' is of unknown units"):
+        load_scene(scene)
+    scene.write_text(common + "objects: [{asset: asset, size: 0.3}]\n")
+    loaded = load_scene(scene).assets[0]
+    assert loaded.units == "metre"
+    assert loaded.mesh is not None
+    assert loaded.mesh.extents.max() == pytest.approx(0.3)
+
+
+def test_the_page_is_one_file_with_every_part(made: tuple[Path, Finished]) -> None:
+    page = (made[0] / "asset" / "report.html").read_text()
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    for heading in ("Verdict", "Held-out views", "Cameras", "Photos", "Rejected"):
+        assert f">{heading}<" in page
+    assert "it is &lt;blurred&gt;" in page
+    assert page.count('class="camera"') == 2 * 32
+    assert page.count("mesh over photo") == 2 * 4
+    assert "Every threshold is met" in page
+
+
+def test_the_same_inputs_are_kept_and_others_are_not(
+    made: tuple[Path, Finished], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder, first = made
+    job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
+
+    def never(*args: object, **kwargs: object) -> None:
+        raise InputError("made anew")
+
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.reconstruct_asset", never)
+    again = make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+    assert again.kept
+    assert again.verdict == first.verdict
+    others = (replace(job, name="other"), replace(job, settings=replace(SETTINGS, size=0.2)))
+    record = (folder / "asset" / "verdict.json").read_bytes()
+    for other in others:
+        with pytest.raises(InputError, match="made anew"):
+            make_asset(folder / "capture", folder / "fit", folder / "asset", other)
+        (folder / "asset" / "verdict.json").write_bytes(record)
+    mask = next((folder / "capture" / "masks").glob("*.png"))
+    content = mask.read_bytes()
+    mask.write_bytes(content + b"\0")
+    with pytest.raises(InputError, match="made anew"):
+        make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+    mask.write_bytes(content)
+    (folder / "asset" / "verdict.json").write_bytes(record[:50])
+    with pytest.raises(InputError, match="made anew"):
+        make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+
+
+def test_a_drawing_gives_a_capture_its_scale(known_object: KnownObject) -> None:
+    """The capture is in no unit, the drawing in millimetres: the asset has the size of the drawing."""
+    tenth = np.diag([0.1, 0.1, 0.1, 1.0])
+    capture = replace(known_object.capture.transformed(tenth), units="unknown")
+    drawing = known_object.mesh.copy()
+    drawing.apply_transform(trimesh.transformations.rotation_matrix(2.0, (1, 2, 3)))
+    drawing.apply_scale(1000.0)
+    found = reconstruct_asset(
+        capture,
+        known_object.splats.transformed(tenth),
+        name="part",
+        settings=SETTINGS,
+        imported=ImportedMesh(drawing, metres_per_unit=1e-3),
+    )
+    assert found.alignment is not None
+    assert found.asset.units == found.verdict.units == "metre"
+    assert found.asset.mesh is not None
+    assert found.asset.mesh.scale == pytest.approx(known_object.mesh.scale, rel=5e-3)
+    assert found.verdict.offset is not None
+    assert found.verdict.offset < 0.003
+
+
+@pytest.mark.parametrize(("height", "lowest"), [(0.049, 0.0), (0.0, -0.05)])
+def test_an_object_ends_on_the_table_that_it_stands_on(known_object: KnownObject, height: float, lowest: float) -> None:
+    """What is 1 mm below the table is cut off; a plane through the middle of an object is none that it stands on."""
+    lifted = np.eye(4)
+    lifted[2, 3] = height
+    capture = replace(known_object.capture.transformed(lifted), table=True)
+    found = reconstruct_asset(capture, known_object.splats.transformed(lifted), name="part", settings=SETTINGS)
+    assert found.asset.mesh is not None
+    assert found.asset.mesh.bounds[0, 2] == pytest.approx(lowest, abs=4e-4)
+    assert found.asset.mesh.is_volume
+
+
+def test_surroundings_need_no_masks_and_get_an_open_mesh(known_object: KnownObject) -> None:
+    photos = tuple(replace(photo, mask=None) for photo in known_object.capture.photos)
+    capture = replace(known_object.capture, photos=photos)
+    found = reconstruct_asset(capture, known_object.splats, name="cell", kind="environment", settings=SETTINGS)
+    assert found.isolation is None
+    assert found.asset.pieces == ()
+    assert len(found.asset.splats) == len(known_object.splats)
+    assert (found.verdict.mesh_iou, found.verdict.lost) == (None, None)
+    with pytest.raises(InputError, match="masks from at least 3 sides"):
+        reconstruct_asset(capture, known_object.splats, name="part", settings=SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"rejected": 30}, "only 32 of 62 photos found their camera"),
+        ({"psnr": 12.0}, "12.0 dB"),
+        ({"splat_iou": 0.5}, "the splats meet held-out masks"),
+        ({"mesh_iou": 0.5}, "the mesh meets held-out masks"),
+        ({"offset": 0.02}, "2.00% of the diagonal apart"),
+        ({"scale_error": 0.05}, "known to 5.0% only"),
+        ({"watertight": False}, "the mesh is open"),
+        ({"lost": 0.5}, "removed 50.0% of the object"),
+    ],
+)
+def test_each_missed_threshold_is_one_sentence_with_advice(change: dict[str, float], sentence: str) -> None:
+    assert GOOD.misses() == ()
+    (miss,) = replace(GOOD, **change).misses()
+    assert sentence in miss
+    assert " is wanted): " in miss
+
+
+def test_a_capture_in_metres_takes_no_size(known_object: KnownObject) -> None:
+    with pytest.raises(InputError, match="in metres already: it takes no size"):
+        reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=replace(SETTINGS, size=0.2))
+
+
+def test_photos_go_through_all_stages(
+    known_object: KnownObject, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A fit of other inputs is replaced, see test_fit_interrupted.py, so that there is nothing to be asked for."""
+    overwritten = []
+
+    def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:
+        overwritten.append(overwrite)
+
+    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, *, progress: object) -> Finished:
+        assert (capture, fit) == (out / "capture", out / "fit")
+        return Finished(out, GOOD, kept=False)
+
+    capture = known_object.capture.save(tmp_path / "asset" / "capture")
+    captured = CaptureResult(capture, 32, "a board", 0.5, doubtful={"05.png": 0.6})
+    monkeypatch.setattr("mitsplat.capture.pipeline.capture_photos", lambda photos, out, settings, progress: captured)
+    monkeypatch.setattr("mitsplat.fit.trainer.fit_capture", fit_capture)
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.make_asset", made_of)
+    job = AssetJob(name="part")
+    for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):
+        made = make_photo_asset(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)
+    assert made.folder == tmp_path / "asset"
+    assert made.warnings == captured.warnings
+    assert "05.png (60%)" in made.warnings[0]
+    assert overwritten == [True, True, True]
+
+
+def test_fits_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has the fit finished"):
+        read_fit(tmp_path)
+    (tmp_path / "fit.json").write_text("[]")
+    with pytest.raises(InputError, match="not the record of a fit"):
+        read_fit(tmp_path)
+    assert read_fit(tmp_path / "one.ply") == (tmp_path / "one.ply", None)

@@ -1,0 +1,97 @@
+"""Isolation: weights against the twin, and what is removed of planted rubbish."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.reconstruct.evaluation import sized_photo
+from mitsplat.reconstruct.segment_splats import MaskedView, isolate_object, visible_weights
+from mitsplat.splats import Splats
+from tests.conftest import KnownObject
+from tests.plugins.test_backward import separated
+from tests.reference import responses
+from tests.render.test_render import CAMERA
+
+
+def test_weights_are_those_of_the_twin() -> None:
+    """Blended weight T a of every Gaussian, ray by ray in float64."""
+    splats = separated(12, 1)
+    mask = np.random.default_rng(0).random((CAMERA.height, CAMERA.width)).astype(np.float32)
+    expected = np.zeros((12, 2))
+    x, y = np.meshgrid(np.arange(CAMERA.width) + 0.5, np.arange(CAMERA.height) + 0.5)
+    for (u, v), share in zip(CAMERA.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1)), mask.ravel(), strict=True):
+        opacity, z = responses(splats, CAMERA, u, v)
+        order = np.argsort(z, kind="stable")
+        behind = np.concatenate([[1.0], np.cumprod(1 - opacity[order])[:-1]])
+        expected[order] += (behind * opacity[order])[:, None] * (share, 1 - share)
+    found = visible_weights(splats, MaskedView(CAMERA, mask))
+    assert expected.max() > 3
+    # What is cut where the opacity falls below 0.002 is missing.
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.05)
+
+
+def test_a_mask_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="24 x 32 px"):
+        visible_weights(separated(2, 1), MaskedView(CAMERA, np.ones((32, 24), dtype=np.float32)))
+
+
+def rubbish(means: np.ndarray, scale: object, opacity: float = 0.9) -> Splats:
+    count = len(means)
+    return Splats(
+        means=means,
+        quats=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        scales=np.broadcast_to(scale, (count, 3)),
+        opacities=np.full(count, opacity),
+        sh=np.zeros((count, 1, 3)),
+    )
+
+
+def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject) -> None:
+    x, y = np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.2, 0.2, 40))
+    table = rubbish(np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.06)], axis=1), (0.006, 0.006, 0.001))
+    speck = rubbish(np.array([[-0.01, 0.0, 0.035], [-0.009, 0.0, 0.035]]), 5e-4)  # hovers inside the pocket
+    needle = rubbish(np.array([[0.045, 0.01, 0.02]]), (0.0005, 0.02, 0.0005))
+    buried = rubbish(np.array([[0.0, 0.0, -0.01]]), 0.001)
+    parts = [known_object.splats, table, speck, needle, buried]
+    views = [
+        MaskedView(camera, mask)
+        for camera, _, mask in (sized_photo(photo, 160) for photo in known_object.capture.photos)
+        if mask is not None and camera.centre[2] > 0  # nobody looks through the table
+    ]
+    found = isolate_object(Splats.concatenate(parts), views)
+    ends = np.cumsum([len(part) for part in parts])
+    own, table_kept, speck_kept, needle_kept, buried_kept = np.split(found.kept, ends[:-1])
+    seen_from_above = known_object.splats.means[:, 2] > 0
+    assert own[seen_from_above].mean() > 0.97
+    assert not table_kept.any()
+    assert not speck_kept.any()
+    assert not needle_kept.any()
+    assert not buried_kept.any()
+    assert found.needles >= 1
+    assert found.floaters >= 2
+    assert found.unseen + found.outside + found.needles + found.floaters == (~found.kept).sum()
+    assert found.lost < 0.02
+    assert len(found.splats) == found.kept.sum()
+
+
+def test_lost_tells_what_masks_leave_out(known_object: KnownObject) -> None:
+    """Where splats are missing in the middle of the masks, as much alpha is lost as pixels are bare."""
+    views = [
+        MaskedView(camera, mask if number % 2 else np.zeros_like(mask))
+        for number, (camera, _, mask) in enumerate(sized_photo(photo, 160) for photo in known_object.capture.photos)
+        if mask is not None
+    ]
+    assert isolate_object(known_object.splats, views).lost > 0.05
+
+
+def test_masks_of_something_else_are_refused(known_object: KnownObject) -> None:
+    views = [
+        MaskedView(photo.camera, np.zeros((photo.camera.height, photo.camera.width), dtype=np.float32))
+        for photo in known_object.capture.photos[:4]
+    ]
+    with pytest.raises(InputError, match="are these masks of this capture"):
+        isolate_object(known_object.splats, views)
+    with pytest.raises(InputError, match="got no view with one"):
+        isolate_object(known_object.splats, [])

@@ -1,0 +1,112 @@
+"""The house: every import between wings points down, nothing goes in circles, and no wing is too large to know."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+FLOORS = (
+    ("cli",),
+    ("audit", "checks"),
+    ("dataset",),
+    ("bake", "formats", "reconstruct"),
+    ("fit", "frames"),
+    ("labels", "physics", "render"),
+    ("capture", "engine", "plugins", "scene"),
+    ("ground",),
+)
+"""Wings from the roof down: each imports from floors below its own. Ground is what lies in ``mitsplat`` itself."""
+
+LARGEST = 3000
+"""Lines of a wing; the plugins, one stage of the renderer a module, and the ground are no such rooms."""
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the package by its name; ``plugins`` is installed as ``mitsplat.plugins``."""
+    found = {}
+    for path in [*(ROOT / "mitsplat").rglob("*.py"), *(ROOT / "plugins").glob("*.py")]:
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        parts = parts[:-1] if parts[-1] == "__init__" else parts
+        found[".".join(parts if parts[0] == "mitsplat" else ("mitsplat", *parts))] = path
+    return found
+
+
+MODULES = modules()
+
+
+def wing_of(module: str) -> str:
+    names = module.split(".")
+    return names[1] if len(names) > 1 and any(names[1] in floor for floor in FLOORS) else "ground"
+
+
+def imports(module: str) -> Iterator[tuple[str, int]]:
+    """Modules of the package that a module imports anywhere in it, but for type checkers, and the lines."""
+    tree = ast.parse(MODULES[module].read_text())
+    unread = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "mitsplat":
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            targets = {name if name in MODULES else str(node.module) for name in names}
+        elif isinstance(node, ast.Import):
+            targets = {alias.name for alias in node.names if alias.name in MODULES}
+        else:
+            continue
+        if node not in unread:
+            yield from ((target, node.lineno) for target in targets)
+
+
+FLOOR = {wing: height for height, wings in enumerate(reversed(FLOORS)) for wing in wings}
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_imports_point_down(module: str) -> None:
+    if module in ("mitsplat", "mitsplat.variant"):
+        return  # the front door, which hands out names of every wing, and what registers the plugins
+    own = wing_of(module)
+    for target, line in imports(module):
+        other = wing_of(target)
+        place = f"{MODULES[module].relative_to(ROOT)}:{line}: {own} imports {target}"
+        assert own == other or FLOOR[other] < FLOOR[own], place
+
+
+def test_nothing_goes_in_circles() -> None:
+    graph = {module: {target for target, _ in imports(module)} - {module} for module in MODULES}
+    doors = {module for module, path in MODULES.items() if path.name == "__init__.py"}
+    for module in graph:  # a door imports its own rooms, which are entered through it
+        graph[module] -= doors
+    list(TopologicalSorter(graph).static_order())
+
+
+def test_every_wing_has_a_floor_and_a_door_that_tells_of_it() -> None:
+    wings = {path.parent.name for path in (ROOT / "mitsplat").glob("*/*.py")}
+    assert wings | {"plugins", "ground"} == set(FLOOR)
+    for wing in wings:
+        door = ast.parse((ROOT / "mitsplat" / wing / "__init__.py").read_text())
+        assert len(ast.get_docstring(door) or "") > 100, wing
+
+
+def test_no_wing_is_too_large_to_know() -> None:
+    lines = Counter[str]()
+    for module, path in MODULES.items():
+        lines[wing_of(module)] += len(path.read_text().splitlines())
+    del lines["plugins"], lines["ground"]
+    assert {wing: count for wing, count in lines.items() if count > LARGEST} == {}
+
+
+def test_the_design_names_every_module() -> None:
+    design = (ROOT / "docs/design.md").read_text()
+    for module, path in MODULES.items():
+        if path.name != "__init__.py":
+            assert f"`{module.split('.')[-1]}`" in design, module

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -138,6 +138,15 @@ class AnnotationFile:
             if not self.broken:
                 yield from cursor.finish()
 
+    def entries_of(self, frame: TrueFrame) -> Generator[tuple[str, str], None, list[Any]]:
+        """What is said of a frame, whose image is checked on the way; nothing once the file is broken."""
+        yield from self.check_image(frame)
+        if self.broken:
+            return []
+        found = list(self.entries.take(frame.index))
+        yield from self.entries.errors()
+        return found
+
     def check_image(self, frame: TrueFrame) -> Violations:
         """What is wrong with the frame's image."""
         if self.broken:
@@ -166,11 +175,7 @@ class InstancesReader:
         """Compare with the masks."""
         if frame.split != self._split:
             return
-        yield from self._of.check_image(frame)
-        if self._of.broken:
-            return
-        found = list(self._of.entries.take(frame.index))
-        yield from self._of.entries.errors()
+        found = yield from self._of.entries_of(frame)
         if self._of.broken:
             return
         if len(found) != len(frame.instances):
@@ -245,11 +250,7 @@ class PanopticReader:
         """Compare with the frame's picture of segments."""
         if frame.split != self._split:
             return
-        yield from self._of.check_image(frame)
-        if self._of.broken:
-            return
-        found = list(self._of.entries.take(frame.index))
-        yield from self._of.entries.errors()
+        found = yield from self._of.entries_of(frame)
         if self._of.broken:
             return
         if len(found) != 1:

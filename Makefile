@@ -4,6 +4,7 @@ VENV := .venv
 STAMPS := .make
 PIP_INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 INPUTS := pyproject.toml constraints.txt
+SPHINX := --builder html --fresh-env --fail-on-warning --keep-going --nitpicky --quiet
 
 .PHONY: render test lint docs clean
 
@@ -21,7 +22,7 @@ lint: $(STAMPS)/tools
 
 # docs/_build/html/index.html; NOTEBOOKS=1 also runs the notebooks, so that the pages show what they print.
 docs: $(STAMPS)/docs
-	$(VENV)/bin/python -m sphinx --builder html --fail-on-warning --keep-going --nitpicky --quiet docs docs/_build/html
+	$(VENV)/bin/python -m sphinx $(SPHINX) docs docs/_build/html
 	$(VENV)/bin/python docs/links.py docs/_build/html
 
 clean:

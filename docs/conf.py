@@ -52,7 +52,7 @@ python_use_unqualified_type_names = True
 napoleon_use_ivar = True
 napoleon_use_rtype = False
 # Names of other projects, of type aliases, and of what has no page of its own.
-nitpick_ignore_regex = [(r"py:.*", r"(?!mitsplat\.).*"), (r"py:.*", r"mitsplat\..*")]
+nitpick_ignore_regex = [(r"py:.*", r"(?!mitsplat\.).*")]
 
 # Appearance
 html_theme = "furo"

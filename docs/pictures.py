@@ -1,4 +1,4 @@
-"""Makes the pictures of the scene reference and of the gallery: ``python docs/pictures.py [KEY or SCENE ...]``."""
+"""Makes the pictures of the scene reference and of the gallery: ``python docs/pictures.py [--missing] [KEY or SCENE ...]``."""
 
 from __future__ import annotations
 
@@ -112,7 +112,9 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="keys of the scene file, and files of the gallery; all if absent")
-    wanted = set(parser.parse_args().names)
+    parser.add_argument("--missing", action="store_true", help="keep what is there")
+    options = parser.parse_args()
+    wanted = set(options.names)
     FOLDER.mkdir(exist_ok=True)
     work = {
         picture.file: (picture.key, lambda folder, it=picture: _render_key(it, folder)) for picture in read_pictures()
@@ -130,7 +132,7 @@ def main() -> None:
         (folder / "assets").symlink_to(SCENES / "assets")
         trimesh.creation.torus(0.05, 0.015).apply_translation((0, 0, 0.015)).export(folder / "ring.ply")
         for file, (key, make) in work.items():
-            if not wanted or key in wanted:
+            if (not wanted or key in wanted) and not (options.missing and file.exists()):
                 start = time.perf_counter()
                 image = make(folder)
                 cv2.imwrite(str(file), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85, cv2.IMWRITE_JPEG_OPTIMIZE, 1])

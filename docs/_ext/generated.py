@@ -56,9 +56,8 @@ def _scripts() -> str:
     sections = []
     for path in sorted((ROOT / "examples").glob("*.py")):
         told = inspect.cleandoc(ast.get_docstring(ast.parse(path.read_text())) or "")
-        sections.append(
-            f"### `{path.name}`\n\n{_plain(told)}\n\n```{{literalinclude}} ../examples/{path.name}\n:language: python\n```"
-        )
+        code = f"```{{literalinclude}} ../examples/{path.name}\n:language: python\n```"
+        sections.append(f"### `{path.name}`\n\n{told.replace('``', '`')}\n\n{code}")
     return "\n\n".join(sections)
 
 
@@ -76,7 +75,9 @@ def _wings() -> str:
     sections = []
     for wing in WINGS:
         module = importlib.import_module(f"mitsplat.{wing}")
-        sections.append(f"## `mitsplat.{wing}`\n\n```{{eval-rst}}\n.. automodule:: mitsplat.{wing}\n   :no-members:\n```")
+        sections.append(
+            f"## `mitsplat.{wing}`\n\n```{{eval-rst}}\n.. automodule:: mitsplat.{wing}\n   :no-members:\n```"
+        )
         public = [name for name in module.__all__ if name in mitsplat.__all__]
         if public:
             sections.append("Also hands out " + ", ".join(f"{{py:obj}}`mitsplat.{name}`" for name in public) + ".")
@@ -98,17 +99,9 @@ def _plugins() -> str:
     for path in (ROOT / "plugins" / f"{name}.py" for name in ("splats", "splat_proxy", "opencv_camera")):
         classes = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef))
         manual = next(text for node in classes if ":monosp:" in (text := ast.get_docstring(node) or ""))
-        sections.append(f"## `{path.stem}`\n\n```{{eval-rst}}\n{_SUBSTITUTIONS}\n{manual}\n```")
+        manual = re.sub(r"\|(\w+)\|", r"\1", manual)  # |string| and the like, which Mitsuba's documentation replaces
+        sections.append(f"## `{path.stem}`\n\n```{{eval-rst}}\n{manual}\n```")
     return "\n\n".join(sections)
-
-
-_SUBSTITUTIONS = "".join(
-    f".. |{name}| replace:: {name}\n" for name in ("string", "float", "int", "bool", "point", "transform")
-)
-
-
-def _plain(text: str) -> str:
-    return text.replace("``", "`")
 
 
 GENERATED: dict[str, Callable[[], str]] = {

@@ -62,11 +62,13 @@ def _section(root: Schema, path: str, model: Schema, pictures: dict[str, list[Pi
         required = name in model.get("required", ())
         shown.append("**required**" if required else _default_of(key))
         text = _markdown(key.get("description") or _resolved(root, _item(key)).get("description", ""))
-        entry = f"`{name}`{{#{anchor} .key}} {' · '.join(filter(None, shown))}\n: {_indented(text)}"
+        # What is a mapping has a section, whose anchor it is.
+        place = ".key" if f"](#{anchor})" in shown[0] else f"#{anchor} .key"
+        entry = f"`{name}`{{{place}}} {' · '.join(filter(None, shown))}\n: {_indented(text)}"
         # The keys that several kinds share are shown once.
         keys.append(entry + _gallery(pictures.pop(full, [])))
     label = f"({_anchor(path)})=\n" if path else ""
-    level = "##" if not kind and path.count(".") == 0 or kind else "###"
+    level = "##" if kind or "." not in path else "###"
     return f"{label}{level} {title}\n\n{_markdown(model.get('description', ''))}\n\n" + "\n\n".join(keys)
 
 
@@ -123,7 +125,9 @@ def _default_of(key: Schema) -> str:
     default = key.get("default")
     if isinstance(default, dict) or default in (None, []):
         return ""
-    return f"default `{json.dumps(default)}`".replace('"', "").replace(".0]", "]").replace(".0,", ",").replace(".0`", "`")
+    return (
+        f"default `{json.dumps(default)}`".replace('"', "").replace(".0]", "]").replace(".0,", ",").replace(".0`", "`")
+    )
 
 
 def _listed(names: Any) -> str:
@@ -136,7 +140,7 @@ def _joined(path: str, name: str) -> str:
 
 
 def _anchor(path: str) -> str:
-    return re.sub(r"[^a-z0-9_]+", "-", path.lower().replace(" of kind ", " ")).strip("-")
+    return re.sub(r"[^a-z0-9]+", "-", path.lower().replace(" of kind ", " ")).strip("-")
 
 
 def _markdown(text: str) -> str:

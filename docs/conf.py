@@ -51,8 +51,8 @@ maximum_signature_line_length = 90
 python_use_unqualified_type_names = True
 napoleon_use_ivar = True
 napoleon_use_rtype = False
-# Names of other projects, of type aliases, and of what has no page of its own.
-nitpick_ignore_regex = [(r"py:.*", r"(?!mitsplat\.).*")]
+# Names of other projects and of type aliases; those of mitsplat are looked up in the code, by ``generated``.
+nitpick_ignore_regex = [(r"py:.*", r"(?!mitsplat\.|\.).*")]
 
 # Appearance
 html_theme = "furo"

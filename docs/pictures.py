@@ -1,4 +1,7 @@
-"""Makes the pictures of the scene reference and of the gallery: ``python docs/pictures.py [--missing] [KEY or SCENE ...]``."""
+"""Makes the pictures of the scene reference and of the gallery.
+
+Run as ``python docs/pictures.py [--missing] [KEY or SCENE ...]``.
+"""
 
 from __future__ import annotations
 

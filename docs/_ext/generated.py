@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import inspect
+import pkgutil
 import re
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from docutils import nodes
 from pictures import GALLERY, SCENES
 from scene_reference import scene_reference
 from sphinx.application import Sphinx
@@ -121,7 +124,29 @@ def _fill_in(app: Sphinx, docname: str, source: list[str]) -> None:
     source[0] = re.sub(r"<!-- generated: (\w+) -->", lambda match: GENERATED[match[1]](), source[0])
 
 
+def _undocumented(
+    _app: Sphinx, _env: object, node: nodes.Element, shown: nodes.TextElement
+) -> nodes.TextElement | None:
+    """What the code has but no page tells of is shown without a link; what it has not is left to be complained of."""
+    target: str = node.get("reftarget", "")
+    if target.startswith("."):
+        target = f"{node.get('py:module')}{target}"
+    if not target.startswith("mitsplat."):
+        return None
+    try:
+        if importlib.util.find_spec(target):
+            return shown
+    except ModuleNotFoundError:
+        pass
+    try:
+        pkgutil.resolve_name(target)
+    except (ImportError, AttributeError):
+        return None
+    return shown
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Sphinx's entry."""
     app.connect("source-read", _fill_in)
+    app.connect("missing-reference", _undocumented)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

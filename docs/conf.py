@@ -45,7 +45,10 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
-autodoc_type_aliases = {name: name for name in ("BoolArray", "ByteImage", "Float32Array", "Float64Array", "IntArray")}
+autodoc_type_aliases = {
+    **{name: name for name in ("BoolArray", "ByteImage", "Float32Array", "Float64Array", "Int32Array", "Int64Array")},
+    **{"npt.ArrayLike": "ArrayLike", "LightSpec": "LightSpec", "CameraSpec": "CameraSpec"},
+}
 autodoc_class_signature = "mixed"
 maximum_signature_line_length = 90
 python_use_unqualified_type_names = True

@@ -20,6 +20,7 @@ from docutils import nodes
 from pictures import GALLERY, SCENES
 from scene_reference import scene_reference
 from sphinx.application import Sphinx
+from sphinx.domains.python import PyObject
 
 ROOT = Path(__file__).parents[2]
 WINGS = (
@@ -145,8 +146,33 @@ def _undocumented(
     return shown
 
 
+def _tidy_signature(_app: Sphinx, *told: object) -> tuple[str | None, str | None]:
+    """Defaults that only a factory knows, as dots, since what is no Python is not laid out; aliases by their names."""
+    signature, returns = (part and re.sub(r"TypeAliasForwardRef\('([\w.]+)'\)", r"\1", str(part)) for part in told[-2:])
+    return signature and signature.replace("<factory>", "..."), returns
+
+
+def _part_attributes(_app: Sphinx, *told: object) -> None:
+    """``a, b: text`` among the attributes as one entry each, after Napoleon."""
+    lines = told[-1]
+    for position in reversed(range(len(lines))):
+        if match := re.match(r":ivar (\w+(?:, \w+)+):(.*)", lines[position]):
+            end = position + 1
+            while end < len(lines) and lines[end].startswith(" "):
+                end += 1
+            text = lines[position + 1 : end]
+            lines[position:end] = [
+                line for name in match[1].split(", ") for line in (f":ivar {name}:{match[2]}", *text)
+            ]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Sphinx's entry."""
     app.connect("source-read", _fill_in)
     app.connect("missing-reference", _undocumented)
+    app.connect("autodoc-process-signature", _tidy_signature)
+    app.connect("autodoc-process-docstring", _part_attributes, priority=900)
+    for field in PyObject.doc_field_types:
+        if field.name == "variable":
+            field.label = "Attributes"
     return {"parallel_read_safe": True, "parallel_write_safe": True}

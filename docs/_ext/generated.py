@@ -36,9 +36,13 @@ def _scene() -> str:
 
 
 def _cli() -> str:
-    """Typer's own reference, without its first heading."""
+    """Typer's own reference without its first heading; the list of commands, which it cuts short, whole and linked."""
     command = [sys.executable, "-m", "typer", "mitsplat.cli", "utils", "docs", "--name", "mitsplat"]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    told = dict(re.findall(r"^## `mitsplat (\w+)`\n\n(.+)", text, re.MULTILINE))
+    text = re.sub(
+        r"^\* `(\w+)`: .*", lambda m: f"* [`{m[1]}`](#mitsplat-{m[1]}): {told[m[1]]}", text, flags=re.MULTILINE
+    )
     return text.split("\n", 1)[1]
 
 

@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 
 DOCS = Path(__file__).parent
 SCENES = DOCS.parent / "scenes"
-FOLDER = DOCS / "pictures"
+FOLDER = DOCS / "pictures" / "scene"
 SIZE = (320, 200)
 """Of the reference's pictures [px]; those of the gallery are twice as large."""
 
@@ -44,7 +44,7 @@ class Picture:
     scene: dict[str, Any]
     file: Path
     frames: tuple[int, ...]
-    zoom: int
+    zoom: float
     labels: bool
 
 
@@ -82,7 +82,7 @@ def _render_key(picture: Picture, folder: Path) -> Any:
     from mitsplat.labels import draw_labels
 
     yaml = YAML(typ="safe")
-    width, height = (edge // picture.zoom for edge in SIZE)
+    width, height = (round(edge / picture.zoom) for edge in SIZE)
     several = len(picture.frames) > 1
     size = {"width": width // 2, "height": height // 2} if several else {"width": width, "height": height}
     yaml.dump(picture.scene | {"output": picture.scene["output"] | size}, folder / "scene.yaml")
@@ -90,7 +90,7 @@ def _render_key(picture: Picture, folder: Path) -> Any:
         frames = [renderer.render(index) for index in picture.frames]
     images = [draw_labels(frame.image, frame.labels) if picture.labels else frame.image for frame in frames]
     image = np.vstack([np.hstack(images[:2]), np.hstack(images[2:])]) if several else images[0]
-    return cv2.resize(image, SIZE, interpolation=cv2.INTER_NEAREST) if picture.zoom > 1 else image
+    return cv2.resize(image, SIZE, interpolation=cv2.INTER_NEAREST if picture.zoom > 1 else cv2.INTER_AREA)
 
 
 def _render_scene(name: str) -> Any:
@@ -113,12 +113,14 @@ def main() -> None:
     import cv2
     import trimesh
 
+    from mitsplat.errors import InputError
+
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="keys of the scene file, and files of the gallery; all if absent")
     parser.add_argument("--missing", action="store_true", help="keep what is there")
     options = parser.parse_args()
     wanted = set(options.names)
-    FOLDER.mkdir(exist_ok=True)
+    FOLDER.mkdir(parents=True, exist_ok=True)
     work = {
         picture.file: (picture.key, lambda folder, it=picture: _render_key(it, folder)) for picture in read_pictures()
     }
@@ -134,17 +136,21 @@ def main() -> None:
         folder = Path(name)
         (folder / "assets").symlink_to(SCENES / "assets")
         trimesh.creation.torus(0.05, 0.015).apply_translation((0, 0, 0.015)).export(folder / "ring.ply")
+        failed = []
         for file, (key, make) in work.items():
-            if (not wanted or key in wanted) and not (options.missing and file.exists()):
-                start = time.perf_counter()
+            if (wanted and key not in wanted) or (options.missing and file.exists()):
+                continue
+            start = time.perf_counter()
+            try:
                 image = make(folder)
-                cv2.imwrite(str(file), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
-                print(
-                    f"{key}: {file.name}, {file.stat().st_size / 1000:.0f} kB, {time.perf_counter() - start:.0f} s",
-                    flush=True,
-                )
-    for extra in set(FOLDER.glob("*.jpg")) - set(work):
-        print(f"{extra.name} is no longer asked for")
+            except InputError as error:
+                failed.append(f"{file.name}: {error}")
+                continue
+            cv2.imwrite(str(file), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+            size, seconds = file.stat().st_size / 1000, time.perf_counter() - start
+            print(f"{key}: {file.name}, {size:.0f} kB, {seconds:.0f} s", flush=True)
+    extra = [f"{file.name} is no longer asked for" for file in sorted(set(FOLDER.glob("*.jpg")) - set(work))]
+    sys.exit("\n".join(failed + extra) or None)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def _gallery() -> str:
         told, language = re.sub(r"^# |^<!-- | -->$", "", first), "xml" if path.suffix == ".xml" else "yaml"
         title = path.stem.replace("_", " ").capitalize()
         sections.append(
-            f"## {title}\n\n{told}\n\n![A frame of {name}](pictures/gallery-{path.stem}.jpg)\n\n"
+            f"## {title}\n\n{told}\n\n![A frame of {name}](pictures/scene/gallery-{path.stem}.jpg)\n\n"
             f"```{{literalinclude}} ../scenes/{name}\n:language: {language}\n:caption: scenes/{name}\n```"
         )
     return "\n\n".join(sections)

@@ -79,7 +79,7 @@ def _gallery(pictures: list[Picture]) -> str:
     for picture in pictures:
         fragment = picture.fragment if picture.scene and picture.fragment != "{}" else "# without"
         lines += ["::::{container} picture", f"![A frame rendered with {picture.key} as in the lines below it]"]
-        lines[-1] += f"(pictures/{picture.file.name})"
+        lines[-1] += f"(pictures/scene/{picture.file.name})"
         lines += ["", "```yaml", *fragment.splitlines(), "```", "::::"]
     return _indented("\n".join([*lines, ":::::"]))
 

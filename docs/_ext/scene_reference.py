@@ -53,13 +53,13 @@ def _section(root: Schema, path: str, model: Schema, pictures: dict[str, list[Pi
     where, _, kind = path.partition(" of kind ")
     title = f"`{where}` of kind `{kind}`" if kind else f"`{where}`" if where else "The file"
     keys = []
-    for name, key in model["properties"].items():
+    for name, key in sorted(model["properties"].items(), key=lambda item: item[0] != "kind"):
         full = _joined(where, name)
         anchor = _anchor(_joined(f"{where}.{kind}" if kind else where, name))
         shown = [_type_of(root, _item(key), full + ("[]" if _item(key) is not key else ""))]
         if _item(key) is not key:
-            shown[0] = f"list of {shown[0]}"
-        required = name in model.get("required", ())
+            shown[0] = f"list of {_plural(shown[0])}"
+        required = name in model.get("required", ()) or "const" in key  # a kind is what decides which mapping it is
         shown.append("**required**" if required else _default_of(key))
         text = _markdown(key.get("description") or _resolved(root, _item(key)).get("description", ""))
         # What is a mapping has a section, whose anchor it is.
@@ -111,14 +111,23 @@ def _type_of(root: Schema, key: Schema, path: str) -> str:
         return _listed(f"`{choice}`" for choice in key.get("enum", [key.get("const")]))
     if "prefixItems" in key:
         each = {_type_of(root, item, path) for item in key["prefixItems"]}
-        return f"{len(key['prefixItems'])} × {each.pop()}" if len(each) == 1 else f"[{', '.join(sorted(each))}]"
+        return f"{len(key['prefixItems'])} {_plural(each.pop())}" if len(each) == 1 else f"[{', '.join(sorted(each))}]"
     if key.get("type") == "array":
-        return f"list of {_type_of(root, key['items'], path)}"
+        return f"list of {_plural(_type_of(root, key['items'], path))}"
     names = {"string": "text", "boolean": "`true` or `false`", "integer": "whole number"}
     low, high = key.get("minimum", key.get("exclusiveMinimum")), key.get("maximum", key.get("exclusiveMaximum"))
-    signs = (">" if "exclusiveMinimum" in key else "≥", "<" if "exclusiveMaximum" in key else "≤")
-    bounds = [f"{sign} {value:g}" for sign, value in zip(signs, (low, high), strict=True) if value is not None]
-    return " ".join([names.get(key.get("type", ""), key.get("type", "anything")), ", ".join(bounds)]).strip()
+    if "minimum" in key and "maximum" in key:
+        bounds = f"from {low:g} to {high:g}"
+    else:
+        signs = (">" if "exclusiveMinimum" in key else "≥", "<" if "exclusiveMaximum" in key else "≤")
+        bounds = ", ".join(
+            f"{sign} {value:g}" for sign, value in zip(signs, (low, high), strict=True) if value is not None
+        )
+    return f"{names.get(key.get('type', ''), key.get('type', 'anything'))} {bounds}".strip()
+
+
+def _plural(text: str) -> str:
+    return re.sub(r"(number|mapping)(?!s)", r"\1s", text, count=1)
 
 
 def _default_of(key: Schema) -> str:

@@ -6,6 +6,7 @@ import ast
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -108,8 +109,6 @@ class Swapped(Rotation):
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Any:
-        from types import SimpleNamespace
-
         x, y, z, w = Rotation.from_matrix(matrix).as_quat()
         return SimpleNamespace(as_quat=lambda: (w, x, y, z))
 
@@ -119,8 +118,8 @@ def with_camera(change: Callable[[camera.Camera], Any]) -> Patch:
 
     def patch(monkeypatch: pytest.MonkeyPatch) -> None:
         for owner in (coco, bop, colmap):
-            real = owner.camera_of
-            monkeypatch.setattr(owner, "camera_of", lambda record, real=real: change(real(record)))
+            read = SimpleNamespace(from_json=lambda stored: change(camera.Camera.from_json(stored)))
+            monkeypatch.setattr(owner, "Camera", read)
 
     return patch
 
@@ -229,6 +228,16 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "poses: world for camera": ("poses", with_camera(world_for_camera), POSES, "camera_from_object is not"),
     "poses: millimetres": ("poses", with_camera(millimetres_for_metres), POSES, "camera_from_object is not"),
+    "poses: objects from one": (
+        "poses",
+        entry(
+            coco,
+            "pose_entry",
+            lambda e: [instance.update(object=instance["object"] + 1) for instance in e["instances"]],
+        ),
+        POSES,
+        "object is",
+    ),
     "voc: pixels from zero": (
         "voc",
         changing(voc, "annotation", lambda made, *args: made.replace("<xmin>", "<xmin>1")),

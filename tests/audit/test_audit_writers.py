@@ -468,3 +468,13 @@ def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
     words[8], words[9] = words[9], words[8]
     path.write_text(" ".join(words) + "\n")
     assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}
+
+
+def test_a_lens_focused_nearer_than_cameras_see_by_default(tmp_path: Path) -> None:
+    """What formats and audit make of a record is its camera, ``near`` included, without which it could not be focused."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
+    lens = Intrinsics(fov_x=60.0, aperture=0.002, focus=0.008, near=0.004)
+    seen = scene.spec.camera.model_copy(update={"intrinsics": lens})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))
+    out = write(scene, tmp_path / "out", ["bop", "colmap", "poses"])
+    assert audit_dataset(out).violations == ()

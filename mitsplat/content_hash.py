@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from mitsplat.errors import InputError
 
 
-def file_hash(file: Path | IO[bytes]) -> str:
+def file_hash(file: Path | BufferedReader) -> str:
     """SHA-256 of a file's content, or of the rest of an open one, as hexadecimal text.
 
     Raises:

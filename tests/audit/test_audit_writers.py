@@ -471,7 +471,7 @@ def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
 
 
 def test_a_lens_focused_nearer_than_cameras_see_by_default(tmp_path: Path) -> None:
-    """What formats and audit make of a record is its camera, ``near`` included, without which it could not be focused."""
+    """Formats and audit make the camera of a record anew, ``near`` included, without which it could not be focused."""
     scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
     lens = Intrinsics(fov_x=60.0, aperture=0.002, focus=0.008, near=0.004)
     seen = scene.spec.camera.model_copy(update={"intrinsics": lens})

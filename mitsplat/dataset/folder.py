@@ -21,7 +21,7 @@ from mitsplat.dataset.manifest import Manifest, cut_torn_line
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, storage_errors, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
-from mitsplat.formats.registry import Catalogue, CollectionWriter
+from mitsplat.formats.registry import TABLE, Catalogue, CollectionWriter
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
@@ -36,10 +36,8 @@ LOCK = ".lock"
 _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
 """Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
-    *("images", "labels", "layers", "annotations", "layouts", "scene"),
-    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "voc", "label-studio", "bop", "colmap"),
-    *("depth", "normals", "instances", "semantic", "flow", "report.html"),
-    *("data.yaml", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
+    *(entry for format in TABLE.values() for entry in format.entries),
+    *("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
 )
 
 

@@ -46,21 +46,21 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "encode_image", "write_collection", "write_frame"]
 
 TABLE = {
-    **{task: Format(partial(yolo.write, task=task), partial(yolo.DataYaml, task=task)) for task in yolo.TASKS},
-    "voc": Format(voc.write, voc.SetsWriter),
-    "label-studio": Format(label_studio.write, label_studio.ConfigWriter),
-    "instances": Format(maps.write_instances),
-    "coco": Format(describe=coco.describe_instances),
-    "amodal": Format(describe=partial(coco.describe_instances, amodal=True)),
-    "panoptic": Format(coco.write_panoptic, coco.describe_panoptic),
-    "poses": Format(describe=coco.describe_poses),
-    "semantic": Format(maps.write_semantic),
-    "depth": Format(maps.write_depth),
-    "bop": Format(bop.write, bop.ScenesWriter),
-    "colmap": Format(describe=ModelWriter),
-    "normals": Format(maps.write_normals),
-    "flow": Format(maps.write_flow),
-    "exr": Format(maps.write_exr),
+    **{task: yolo.format_of(task) for task in yolo.TASKS},
+    "voc": Format(("voc",), voc.write, voc.SetsWriter),
+    "label-studio": Format(("label-studio",), label_studio.write, label_studio.ConfigWriter),
+    "instances": Format(("instances",), maps.write_instances),
+    "coco": Format(("annotations",), describe=coco.describe_instances),
+    "amodal": Format(("annotations",), describe=partial(coco.describe_instances, amodal=True)),
+    "panoptic": Format(("panoptic", "annotations"), coco.write_panoptic, coco.describe_panoptic),
+    "poses": Format(("annotations",), describe=coco.describe_poses),
+    "semantic": Format(("semantic",), maps.write_semantic),
+    "depth": Format(("depth",), maps.write_depth),
+    "bop": Format(("bop",), bop.write, bop.ScenesWriter),
+    "colmap": Format(("colmap",), describe=ModelWriter),
+    "normals": Format(("normals",), maps.write_normals),
+    "flow": Format(("flow",), maps.write_flow),
+    "exr": Format(("layers",), maps.write_exr),
 }
 """Formats in the order in which they are written."""
 

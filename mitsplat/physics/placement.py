@@ -204,11 +204,16 @@ class _Draw:
 
         Conservative advancement: nothing is met on a way that is shorter than the distance of what is nearest.
         """
-        floor = min(obstacle.bounds[0][2] for obstacle in self._obstacles)
+        top = _bounds(self._items[i].outline, pose)[1][2]
+        # The lid of an enclosure, which a pose at the region's top touches, is not met on the way down.
+        obstacles = [obstacle for obstacle in self._obstacles if obstacle.bounds[0][2] < top - _HOVER]
+        if not obstacles:
+            return False
+        floor = min(obstacle.bounds[0][2] for obstacle in obstacles)
         reach = float(pose[2, 3] - floor) + 1.0
         while True:
             placed = PlacedSurface("", self._items[i].surface, pose)
-            distance = min(clearance(placed, obstacle, reach=reach).distance for obstacle in self._obstacles)
+            distance = min(clearance(placed, obstacle, reach=reach).distance for obstacle in obstacles)
             if distance < _HOVER:
                 return distance > 0
             if placed.bounds[1][2] < floor:

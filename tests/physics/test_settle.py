@@ -391,6 +391,16 @@ def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
     assert layout.certificate.surface_motion < 1e-4
 
 
+@pytest.mark.parametrize("arrangement", ["stack", "upright"])
+def test_things_are_put_down_below_the_lid_of_an_enclosure(scene_data, write_scene, arrangement):
+    """They start at the region's top, where the lid is, but stand on the ground from the first moment on."""
+    scene_data["objects"] = [{"asset": "assets/nut", "count": 2}]
+    scene_data["enclosure"] = {"margin": 0.05}
+    settle = {"arrangement": arrangement, "stepper": "mujoco", "attempts": 1}
+    _, layout = drop_layout(scene_data, write_scene, settle=settle)
+    assert layout.certificate.time_to_rest < 0.1
+
+
 def test_what_is_upright_stands_as_the_asset_does(scene_data, write_scene):
     """Bolts of 10 x 10 x 50 mm, which lie down when dropped, stand: the vertical stays, its turn is random."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 5}]

@@ -65,7 +65,7 @@ def _mean_radiance(
         sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(directions))
     spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
-    # A path that meets a sliver may end in no number, a few of ten million on a CAD mesh: the mean is that of the others.
+    # A path that meets a sliver may end in no number, a few of ten million in drawings: the mean is of the others.
     finite = dr.all(dr.isfinite(spectrum))
     radiance = mi.Color3f(dr.select(valid & finite, spectrum, 0.0))
     hit, number = (dr.select(which, mi.Float(1), 0) for which in (valid, finite))

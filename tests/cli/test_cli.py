@@ -330,6 +330,7 @@ def test_bad_option_of_bake_is_one_sentence(
             "bake plant.splat -o a",
             "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got splats, which an asset.yaml",
         ),
+        ("bake nut.step -o a", "nut.step: must be a mesh (.glb, .obj, .stl, .ply) (got solids of a CAD program: export"),
         ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
         ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
         ("check plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
@@ -354,6 +355,7 @@ def test_another_kind_of_file_is_named(
     box_asset("nut").mesh.export("part.stl")
     Path("folder").mkdir()
     Path("scene.xml").write_text('<scene version="3.9.0"/>')
+    Path("nut.step").touch()
     assert run(*words.split()) == 2
     told = capsys.readouterr().err
     assert told.startswith(f"mitsplat: {sentence}") and told.count("\n") == 1

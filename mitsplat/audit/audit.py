@@ -25,6 +25,7 @@ import numpy as np
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.bop import BopReader
 from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
+from mitsplat.audit.label_studio import ConfigReader, check_task
 from mitsplat.audit.layers import LayersReader, SightReader
 from mitsplat.audit.listed import ColmapReader, LayoutReader, VocReader, YoloReader
 from mitsplat.audit.owned import Owned, check_listed
@@ -37,6 +38,8 @@ from mitsplat.files import SPLITS, Record
 _SHARE = 1e-5
 """Difference of shares that are stored with six decimals."""
 
+
+_CHECKS = {**CHECKS, "label-studio/": check_task}
 
 __all__ = ["POLYGON_AREA", "POLYGON_IOU", "Audit", "audit_dataset"]
 
@@ -88,7 +91,7 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
         violations += check_listed(record, content)
         violations += ((f"manifest.jsonl, frame {frame.index}", text) for text in _check_labels(frame))
         for file in record["files"]:
-            check = next((check for prefix, check in CHECKS.items() if file.startswith(prefix)), None)
+            check = next((check for prefix, check in _CHECKS.items() if file.startswith(prefix)), None)
             if check is not None and file not in damaged:
                 violations += ((file, text) for text in check(frame, root / file))
         violations += check_bop(frame, damaged)
@@ -119,6 +122,7 @@ def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
         "panoptic": lambda: [PanopticReader(root, content, split) for split in SPLITS],
         "poses": lambda: [PosesReader(root, content, split) for split in SPLITS],
         "voc": lambda: [VocReader(root, content)],
+        "label-studio": lambda: [ConfigReader(root, content)],
         "bop": lambda: [BopReader(root, content)],
         "colmap": lambda: [ColmapReader(root)],
     }

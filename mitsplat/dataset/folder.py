@@ -36,7 +36,7 @@ _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part
 """Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
     *("images", "labels", "layers", "annotations", "layouts", "scene"),
-    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "voc", "bop", "colmap"),
+    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "voc", "label-studio", "bop", "colmap"),
     *("depth", "normals", "instances", "semantic", "flow", "report.html"),
     *("data.yaml", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
 )

@@ -13,15 +13,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
-from mitsplat.files import Record
+from mitsplat.files import SPLITS, Record
+from mitsplat.formats.format import Catalogue, Describer, FrameFiles
 from mitsplat.json_stream import ListsFile
 from mitsplat.labels.labels import UNLABELLED, Labels
 
@@ -141,6 +142,54 @@ class PosesWriter:
     def add(self, record: Record) -> None:
         """Describe a frame."""
         self.file.append("frames", pose_entry(record, self._assets))
+
+
+class _OfSplit(Protocol):
+    file: ListsFile
+
+    def add(self, record: Record) -> None: ...
+
+
+class _OfSplits:
+    """A file of annotations for each split."""
+
+    def __init__(self, root: Path, name: str, make: Callable[[Path], _OfSplit]) -> None:
+        self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in SPLITS}
+
+    def add(self, record: Record) -> None:
+        self._writers[record["split"]].add(record)
+
+    def keep(self) -> None:
+        for writer in self._writers.values():
+            writer.file.keep()
+
+    def discard(self) -> None:
+        for writer in self._writers.values():
+            writer.file.discard()
+
+
+def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> Describer:
+    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``."""
+    names = catalogue.class_names, catalogue.keypoint_names
+    return _OfSplits(
+        root, "amodal" if amodal else "instances", lambda path: InstancesWriter(path, *names, amodal=amodal)
+    )
+
+
+def describe_panoptic(root: Path, catalogue: Catalogue) -> Describer:
+    """Writes ``panoptic_<split>.json``."""
+    return _OfSplits(root, "panoptic", lambda path: PanopticWriter(path, catalogue.class_names))
+
+
+def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
+    """Writes ``poses_<split>.json``."""
+    return _OfSplits(root, "poses", lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets))
+
+
+def write_panoptic(files: FrameFiles) -> None:
+    """Write a frame's picture of segments."""
+    picture = panoptic_image(files.labelled, files.ids, files.record.get("environment"))
+    files.add_png(f"panoptic/{files.name}.png", picture)
 
 
 def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> dict[str, Any] | None:

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from mitsplat.camera import Camera
 from mitsplat.files import GrowingFile, Record
 from mitsplat.formats.coco import camera_of, image_file
+from mitsplat.formats.format import Catalogue
 
 
 class ModelWriter:
     """Writes the three files."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, catalogue: Catalogue) -> None:
         self._cameras, self._images, self._points = (
             GrowingFile(root / f"colmap/{name}.txt") for name in ("cameras", "images", "points3D")
         )

@@ -442,6 +442,7 @@ FormatName = Literal[
     "panoptic",
     "poses",
     "voc",
+    "label-studio",
     "bop",
     "colmap",
     "depth",

@@ -19,7 +19,7 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
-from mitsplat.formats import bop, coco, colmap, maps, voc, yolo
+from mitsplat.formats import bop, coco, colmap, label_studio, maps, voc, yolo
 from mitsplat.formats import registry as writers
 from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
@@ -167,6 +167,8 @@ PANOPTIC, POSES = "annotations/panoptic_train.json", "annotations/poses_train.js
 GT, INFO, BOP_CAMERA = (f"bop/train/000000/scene_{part}.json" for part in ("gt", "gt_info", "camera"))
 OTHER = {1: 2, 2: 1, 3: 3}
 
+REAL_STROKE = label_studio.encode_brush
+
 FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     "coco: box one too far": ("coco", each_annotation(lambda e: add_to(e["bbox"], 0, 1)), COCO, "bbox is"),
     "coco: box to its last pixel": ("coco", each_annotation(lambda e: add_to(e["bbox"], 2, -1)), COCO, "bbox is"),
@@ -311,7 +313,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "yolo: class names swapped": (
         "yolo",
-        changing(writers, "data_yaml", lambda made, *args: made.replace("0:", "2:").replace("1:", "0:")),
+        changing(yolo, "data_yaml", lambda made, *args: made.replace("0:", "2:").replace("1:", "0:")),
         "data.yaml",
         "names are",
     ),
@@ -332,6 +334,18 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         task("yolo-obb", lambda made: made.mean(axis=0) + 1.4 * (made - made.mean(axis=0))),
         "yolo-obb/labels/train/000000.txt",
         "fits",
+    ),
+    "label-studio: along columns": (
+        "label-studio",
+        changing(label_studio, "encode_brush", lambda made, mask: REAL_STROKE(mask.T.copy())),
+        "label-studio/train/000000.json",
+        "differ from its mask",
+    ),
+    "label-studio: neighbours' classes": (
+        "label-studio",
+        changing(label_studio, "region", lambda made, *args: made | {"value": made["value"] | {"brushlabels": ["?"]}}),
+        "label-studio/train/000000.json",
+        "class is",
     ),
     "instances: classes for ids": (
         "instances",

@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 import mitsplat
+from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.mesh_distance import Surface, standoff
 from scenes.build.parts import PARTS, build_part
@@ -30,6 +31,11 @@ def main() -> None:
     parser.add_argument("meshes", nargs="+", metavar="MESH")
     parser.add_argument("--gaussians", type=int, default=20000)
     arguments = parser.parse_args()
+    with recording("assets.bake", parser, arguments):
+        measure(arguments)
+
+
+def measure(arguments: argparse.Namespace) -> None:
     for name in arguments.meshes:
         mesh = build_part(name, 0)[0] if name in PARTS else Path(name)
         stages: dict[str, float] = {}
@@ -55,8 +61,19 @@ def main() -> None:
             f"{result.psnr_object:.2f} dB), {len(result.asset.pieces)} pieces within {gap:.2f} mm, "
             f"mitsplat {mitsplat.__version__}"
         )
+        for value, unit, key in (
+            (len(truth.faces), "", "faces"),
+            (len(result.asset.splats), "", "gaussians"),
+            (seconds, "s", "cpu"),
+            (result.psnr, "dB", "psnr"),
+            (result.psnr_object, "dB", "psnr object"),
+            (len(result.asset.pieces), "", "pieces"),
+            (gap, "mm", "pieces outside"),
+        ):
+            figure(value, unit, Path(name).stem, key)
         times = list(stages.values())
         for stage, begin, end in zip(stages, times, times[1:], strict=False):
+            figure(end - begin, "s", Path(name).stem, "stages", stage)
             print(f"    {stage}: {end - begin:.1f} s")
 
 

@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
+from benchmarks.record import figure, recording
 from mitsplat.camera import Camera
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.quality import PRESETS, Quality
@@ -87,6 +88,8 @@ def print_growth() -> None:
 
     def show(label: str, splats: Splats, camera: Camera, quality: Quality) -> None:
         binning, marching, pairs = stages(splats, camera, quality)
+        for part, value, unit in (("bin", binning, "s"), ("march", marching, "s"), ("pairs", pairs / 1e6, "M")):
+            figure(value, unit, label, part)
         print(f"{label:44s}{binning:8.3f}{marching:8.3f}{pairs / 1e6:7.1f}M")
 
     fast, balanced = PRESETS["fast"], PRESETS["balanced"]
@@ -113,6 +116,9 @@ def print_peak() -> None:
         replace(splats, opacities=splats.opacities * 0.02), CAMERA, replace(endless, alpha_min=1e-5)
     )
     rate, peak = pairs * TILE * TILE / seconds, fma_peak()
+    figure(rate / 1e9, "G/s", "evaluations")
+    figure(peak / 1e9, "G/s", "multiply adds")
+    figure(rate * FMA_PER_EVALUATION / peak, "", "share of peak")
     print(
         f"march: {rate / 1e9:.2f} G evaluations per processor second; at {FMA_PER_EVALUATION} multiply-adds each "
         f"{rate * FMA_PER_EVALUATION / peak:.0%} of the peak of {peak / 1e9:.0f} G"
@@ -124,9 +130,13 @@ def print_volprim() -> None:
     splats, name = crowd()
     scene = volprim_scene(splats, CAMERA)
     theirs = fastest(lambda: render_volprim(scene), repeats=1)
+    figure(len(splats), "", "gaussians")
+    figure(theirs, "s", "volprim")
     print(f"{name}, {CAMERA.width}x{CAMERA.height}: ellipsoids + volprim_rf_basic {theirs:.1f} s")
     for preset in PRESETS:
         ours = fastest(lambda preset=preset: render_splats(splats, CAMERA, quality=preset))  # type: ignore[misc]
+        figure(ours, "s", preset)
+        figure(theirs / ours, "", preset, "ratio")
         print(f"  render_splats {preset:10s}{ours:7.2f} s, ratio {theirs / ours:.0f}")
 
 
@@ -137,11 +147,12 @@ def main() -> None:
     options = parser.parse_args()
     ensure_variant()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
-    if options.volprim:
-        print_volprim()
-        return
-    print_growth()
-    print_peak()
+    with recording("render.splats", parser, options):
+        if options.volprim:
+            print_volprim()
+            return
+        print_growth()
+        print_peak()
 
 
 if __name__ == "__main__":

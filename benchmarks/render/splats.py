@@ -1,6 +1,6 @@
 """How the time of the splat renderer grows, how far its march is from the machine's peak, and Mitsuba's own path.
 
-    python -m benchmarks.render.splats [--volprim]
+    python -m benchmarks.render.splats [--volprim] [--captures FOLDER]
 
 Seconds are processor seconds of all threads, which other load on the machine changes little; the fastest of two.
 The peak is that of fused multiply-adds in a loop without memory, which the same compiler made.
@@ -13,10 +13,16 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 # isort: off
-from benchmarks.render.captures import CAMERA, crowd, synthetic  # imports mitsplat, which must come before Dr.Jit
+from benchmarks.render.captures import (
+    CAMERA,
+    CAPTURES,
+    crowd,
+    synthetic,
+)  # imports mitsplat, which must come before Dr.Jit
 
 import drjit as dr
 import mitsuba as mi
@@ -125,9 +131,9 @@ def print_peak() -> None:
     )
 
 
-def print_volprim() -> None:
+def print_volprim(captures: Path) -> None:
     """Whole images of the captures, beside Mitsuba's ellipsoids + volprim_rf_basic."""
-    splats, name = crowd()
+    splats, name = crowd(captures)
     scene = volprim_scene(splats, CAMERA)
     theirs = fastest(lambda: render_volprim(scene), repeats=1)
     figure(len(splats), "", "gaussians")
@@ -144,12 +150,13 @@ def main() -> None:
     """Parse the command line and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--volprim", action="store_true", help="only the comparison with Mitsuba's own path")
+    parser.add_argument("--captures", type=Path, default=CAPTURES)
     options = parser.parse_args()
     ensure_variant()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
-    with recording("render.splats", parser, options):
+    with recording("render.splats", parser, options, ignore=("captures",)):
         if options.volprim:
-            print_volprim()
+            print_volprim(options.captures)
             return
         print_growth()
         print_peak()

@@ -17,12 +17,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from benchmarks.render.captures import (
-    CAMERA,
-    CAPTURES,
-    crowd,
-    synthetic,
-)  # imports mitsplat, which must come before Dr.Jit
+from benchmarks.render.captures import CAMERA, CAPTURES, crowd, synthetic  # imports mitsplat before Dr.Jit
 
 import drjit as dr
 import mitsuba as mi

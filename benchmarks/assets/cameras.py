@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("poses", type=Path)
     options = parser.parse_args()
-    with recording("assets.cameras", parser, options):
+    with recording("assets.cameras", parser, options, ignore=("poses",)):
         compare(options.capture, options.poses)
 
 

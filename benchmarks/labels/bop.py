@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--delta", type=float, default=15.0)
     options = parser.parse_args()
-    with recording("labels.bop", parser, options):
+    with recording("labels.bop", parser, options, ignore=("dataset",)):
         compare(options)
 
 

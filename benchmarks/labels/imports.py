@@ -104,18 +104,21 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     options = parser.parse_args()
     command = "python", "benchmarks/labels/imports.py"
-    with recording("labels.imports", parser, options, command=command):
+    with recording("labels.imports", parser, options, ignore=("dataset",), command=command):
         compare(options)
 
 
 def compare(options: argparse.Namespace) -> None:
     """Import everything."""
     truth = Truth(options.dataset)
+    held = [instances for split in truth.splits.values() for instances in split.values()]
+    figure(len(held), "", "images")
+    figure(sum(map(len, held)), "", "instances")
     {"datumaro": by_datumaro, "fiftyone": by_fiftyone}[options.tool](options.dataset, truth)
     if missing := [name for instances in truth.splits.values() for name in instances]:
         raise SystemExit(f"images that were not imported: {missing}")
     for count, what in ((truth.images, "images"), (truth.boxes, "boxes"), (truth.masks, "masks")):
-        figure(count, "", what)
+        figure(count, "", "compared", what)
     print(f"{options.tool}: {truth.images} images, {truth.boxes} boxes, {truth.masks} masks as in the manifest")
 
 

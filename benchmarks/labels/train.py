@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=6)
     parser.add_argument("--model", default="yolo11n-seg.yaml")
     options = parser.parse_args()
-    with recording("labels.train", parser, options):
+    with recording("labels.train", parser, options, ignore=("dataset",)):
         measure(options)
 
 
@@ -81,9 +81,10 @@ def measure(options: argparse.Namespace) -> None:
     root = options.dataset.resolve()
     data = YAML(typ="safe").load(root / "data.yaml")
     data |= {"nc": len(data["names"]), "channels": 3}
+    total = 0
     for split in ("train", "val"):
         images, whole, parted, worst = compare(root, data, split)
-        figure(images, "", split, "images")
+        total += images
         figure(worst, "px", split, "boxes worst")
         for values, kind in ((whole, "whole"), (parted, "parted")):
             figure(len(values), "", split, kind, "instances")
@@ -91,6 +92,7 @@ def measure(options: argparse.Namespace) -> None:
         ious = [f"{np.min(values):.4f} ({len(values)} instances)" if values else "none" for values in (whole, parted)]
         print(f"{split}: {images} images; least IoU with the manifest's masks, over 200 px in one part {ious[0]}, ")
         print(f"  smaller or in parts {ious[1]}; boxes within {worst:.3f} px; classes as in the manifest")
+    figure(total, "", "images")
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         model = ultralytics.YOLO(options.model)

@@ -75,14 +75,13 @@ def time_ours(splats: Splats) -> None:
               f"{lists.visible} visible, {lists.pairs} pairs")  # fmt: skip
         for part, milliseconds in {"whole": whole, "bin": binning, "march": marching}.items():
             figure(milliseconds, "ms", name, part)
-    kernels = []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        run_all()
-        kernels = dr.kernel_history()
-    inside = sum(k["execution_time"] for k in kernels)
-    figure(inside, "ms", name, "kernels")
-    print(f"  of which inside kernels: {inside:.2f} ms in {len(kernels)} launches")
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            run_all()
+            kernels = dr.kernel_history()
+        inside = sum(k["execution_time"] for k in kernels)
+        figure(inside, "ms", name, "kernels")
+        print(f"  of which inside kernels: {inside:.2f} ms in {len(kernels)} launches")
 
 
 def time_gsplat(splats: Splats) -> np.ndarray:

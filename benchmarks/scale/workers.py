@@ -83,6 +83,7 @@ def measure_workers(counts: list[int], **options: float | str) -> None:
     print(f"{options}: workers, PSS of all of them [MiB], of the driver [MiB]")
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(write_room(Path(folder), **options), allow_outside=True)  # type: ignore[arg-type]
+        largest = 0
         for count in counts:
             sizes: list[tuple[int, int]] = []
 
@@ -93,7 +94,8 @@ def measure_workers(counts: list[int], **options: float | str) -> None:
                     sizes.append((sum(found), of_process("self", "smaps_rollup", "Pss")))  # noqa: B023
 
             write_dataset(scene, Path(folder) / f"out{count}", workers=count, progress=hear)
-            largest, driver = max(sizes)
+            before, (largest, driver) = largest, max(sizes)
+            figure((largest - before) / MIB, "MiB", f"{count} workers", "added")
             figure(largest / MIB, "MiB", f"{count} workers", "pss")
             figure(driver / MIB, "MiB", f"{count} workers", "driver")
             print(f"{count:3d} {largest / MIB:8.0f} {driver / MIB:8.0f}", flush=True)

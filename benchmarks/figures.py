@@ -1,0 +1,226 @@
+"""Writes the documentation's figures from what benchmarks recorded, so that none is typed by hand.
+
+    python -m benchmarks.figures            # writes docs/figures.md and docs/reliability.md
+    python -m benchmarks.figures --check    # says what is not as the results are, with status 1
+    python -m benchmarks.figures --age      # how much has changed since each result
+
+Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` stands for
+
+* ``RESULT FIGURE FORMAT``: one figure, as Python formats it; ``*1000:.1f`` multiplies it before;
+* ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
+* ``caption RESULT ...``: command, machine, load and revision of results;
+* ``index``: all results.
+
+What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.record import MEASURED, RESULTS, ROOT
+from benchmarks.scale.projection import project
+
+TEMPLATES = ROOT / "benchmarks" / "templates"
+PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md"}
+SAID = "said.md"
+VIEWS, BYTES = 12, 2.5e5
+"""Frames of a layout, and bytes of a frame, in the projection: those of the default scene."""
+
+Results = Mapping[str, Mapping[str, Any]]
+
+
+class FigureError(Exception):
+    """A template names what no result has."""
+
+
+def read_results(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
+    """Everything recorded, by name, and what follows from it."""
+    results = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+    results["projection"] = {"figures": projected(results)}
+    return results
+
+
+def projected(results: Results) -> dict[str, list[Any]]:
+    """What a million images cost, from the recorded times of a frame, its files and a layout."""
+    frame = value_of(results, "render.frame", "whole_frame")
+    rendering = max(frame) if isinstance(frame, list) else frame
+    writing = value_of(results, "labels.cost", "yolo_coco.write")
+    settle = value_of(results, "physics.settle-share", "warp.cpu")
+    found = project(rendering + writing, BYTES, settle, VIEWS)
+    figures: dict[str, list[Any]] = {
+        "rendering": [rendering, "s"],
+        "writing": [writing, "s"],
+        "settle": [settle, "s"],
+        "views": [VIEWS, ""],
+        "megabytes": [BYTES / 1e6, "MB"],
+        "each": [found.each, "s"],
+        "limit": [found.limit, "1/s"],
+        "most": [found.most, ""],
+    }
+    for row in found.rows:
+        name = f"workers_{row.workers}"
+        speed = f"{row.speed:.2f}" + (" (saturated)" if row.saturated else "")
+        figures |= {f"{name}.speed": [speed, "1/s"], f"{name}.days": [row.days, ""], f"{name}.hours": [row.hours, ""]}
+        figures[f"{name}.terabytes"] = [row.terabytes, "TB"]
+    return figures
+
+
+def value_of(results: Results, result: str, name: str) -> Any:
+    """A figure without its unit."""
+    if result not in results:
+        raise FigureError(f"no result {result}")
+    figures = results[result]["figures"]
+    if name not in figures:
+        raise FigureError(f"{result} has no figure {name}; it has {', '.join(figures)}")
+    return figures[name][0]
+
+
+def formatted(value: Any, spec: str) -> str:
+    """A number, a pair of the least and the most, or text; what is unknown is a dash."""
+    factor, _, form = spec.rpartition(":")
+    if value is None:
+        return "–"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list):
+        ends = list(dict.fromkeys(formatted(one, spec) for one in value))
+        return " to ".join(ends)
+    try:
+        number = value * float(factor.removeprefix("*")) if factor else value
+        return format(number, form).replace("%", " %").replace("-", "−")
+    except ValueError as error:
+        raise FigureError(f"{value} cannot be written as {spec}: {error}") from error
+
+
+def caption(result: Mapping[str, Any]) -> str:
+    """Where figures are from: command, machine, load and revision."""
+    machine, load = result["machine"], result["load"]
+    where = f"{machine['cores']} cores of {machine['processor']}" if machine["processor"] else "an unrecorded machine"
+    where += f" with {machine['memory_gib']} GiB" if machine["memory_gib"] else ""
+    where += f" and an {machine['gpu']}" if machine["gpu"] else ""
+    loaded = f"load {load['start']} to {load['end']}" if load.get("start") is not None else load.get("said")
+    text = f"`{result['command']}` on {where}" + (f", {loaded}" if loaded else "")
+    day = f"{result['revision']} of {result['date']}"
+    if result["recorded"] == "transcribed":
+        text += f"; taken over from the notes of revision {day}, not recorded anew since"
+    else:
+        text += f"; recorded at revision {day}{' with changes' if result['changed'] else ''}"
+        text += f" in {result['seconds']:.0f} s"
+    return text + (f". {result['note']}" if result.get("note") else ".")
+
+
+def index(results: Results) -> str:
+    """A table of all results."""
+    lines = ["| command | revision | date | recorded | s | GPU |", "| --- | --- | --- | --- | ---: | --- |"]
+    for result in results.values():
+        if "command" in result:
+            kind = "by the benchmark" if result["recorded"] == "run" else "taken over"
+            seconds = f"{result['seconds']:.0f}" if result["seconds"] is not None else "–"
+            gpu = result["machine"]["gpu"] or ""
+            row = f"`{result['command']}`", result["revision"], result["date"], kind, seconds, gpu
+            lines.append(f"| {' | '.join(row)} |")
+    return "\n".join(lines)
+
+
+def filled(text: str, results: Results) -> str:
+    """A template with its figures."""
+
+    def fill(match: re.Match[str]) -> str:
+        words = match[1].split()
+        try:
+            match words:
+                case ["index"]:
+                    return index(results)
+                case ["caption", *names] if names:
+                    for name in names:
+                        value_of(results, name, next(iter(results.get(name, {"figures": [""]})["figures"])))
+                    return "  \n".join(f"*{caption(results[name])}*" for name in names)
+                case ["cells", result, prefix, *cells] if cells:
+                    pairs = [cell.partition(":") for cell in cells]
+                    return " | ".join(
+                        formatted(value_of(results, result, f"{prefix}.{key}"), spec) for key, _, spec in pairs
+                    )
+                case [result, name, spec]:
+                    return formatted(value_of(results, result, name), spec)
+                case [result, name]:
+                    return formatted(value_of(results, result, name), "")
+        except FigureError as error:
+            raise FigureError(f"{{{{ {match[1].strip()} }}}}: {error}") from None
+        raise FigureError(f"{{{{ {match[1].strip()} }}}} is no figure")
+
+    return re.sub(r"\{\{(.*?)\}\}", fill, text)
+
+
+def pages(results: Results) -> dict[Path, str]:
+    """What every generated page must be."""
+    return {
+        ROOT / page: filled((TEMPLATES / name).read_text(encoding="utf-8"), results) for name, page in PAGES.items()
+    }
+
+
+def unsaid(results: Results) -> Iterable[str]:
+    """Sentences that pages written by hand do not have, or have with other figures; pages that are not there are none."""
+    file = ""
+    for line in filled((TEMPLATES / SAID).read_text(encoding="utf-8"), results).splitlines():
+        if line.startswith("# "):
+            file = line[2:].strip()
+        elif line.startswith("* "):
+            path = ROOT / file
+            words = path.read_text(encoding="utf-8").split() if path.exists() else line.split()
+            if " ".join(line[2:].split()) not in " ".join(words):
+                yield f"{file} should say: {line[2:]}"
+
+
+def differences(results: Results) -> list[str]:
+    """What of the documentation is not as the results are."""
+    found = [
+        f"{path.relative_to(ROOT)} is not what the results give; run python -m benchmarks.figures"
+        for path, text in pages(results).items()
+        if not path.exists() or path.read_text(encoding="utf-8") != text
+    ]
+    return [*found, *unsaid(results)]
+
+
+def print_ages(results: Results) -> None:
+    """Commits since each result that changed something figures depend on."""
+    for name, result in results.items():
+        if "command" in result:
+            command = ["git", "-C", str(ROOT), "rev-list", "--count", f"{result['revision']}..HEAD", "--", *MEASURED]
+            said = subprocess.run(command, capture_output=True, text=True, check=False)
+            count = said.stdout.strip() if said.returncode == 0 else "unknown"
+            print(f"{count:>8s} commits since {result['revision']} ({result['recorded']}): {name}")
+
+
+def main() -> None:
+    """Write, check, or tell ages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--age", action="store_true")
+    options = parser.parse_args()
+    try:
+        results = read_results()
+        if options.age:
+            print_ages(results)
+            return
+        if not options.check:
+            for path, text in pages(results).items():
+                path.write_text(text, encoding="utf-8")
+                print(f"written: {path.relative_to(ROOT)}")
+        found = differences(results)
+    except FigureError as error:
+        sys.exit(str(error))
+    for text in found:
+        print(text, file=sys.stderr)
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()

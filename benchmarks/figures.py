@@ -167,7 +167,7 @@ def pages(results: Results) -> dict[Path, str]:
 
 
 def unsaid(results: Results) -> Iterable[str]:
-    """Sentences that pages written by hand do not have, or have with other figures; pages that are not there are none."""
+    """Sentences that pages written by hand lack, or have with other figures; pages that are not there lack none."""
     file = ""
     for line in filled((TEMPLATES / SAID).read_text(encoding="utf-8"), results).splitlines():
         if line.startswith("# "):

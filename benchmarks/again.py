@@ -5,7 +5,7 @@
     python -m benchmarks.again --all        # all that run on this machine from a checkout alone
     python -m benchmarks.again ... --list   # says what would run, and how long it took
 
-A command that names CAPTURE, PHOTOS, DATASET or another thing that a checkout lacks, or a GPU, is run by hand, and so is
+What names CAPTURE, PHOTOS, DATASET or another thing that a checkout lacks, or a GPU, is run by hand, and so is
 ``python -m scenes.build --out FOLDER``, which without a folder replaces the shipped assets.
 """
 

@@ -9,7 +9,7 @@ Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` sta
 * ``RESULT FIGURE FORMAT``: one figure, as Python formats it; ``*1000:.1f`` multiplies it before;
 * ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
 * ``caption RESULT ...``: command, machine, load and revision of results;
-* ``index``: all results.
+* ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results.
 
 What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
 """
@@ -102,13 +102,8 @@ def formatted(value: Any, spec: str) -> str:
 
 def caption(result: Mapping[str, Any]) -> str:
     """Where figures are from: command, machine, load and revision."""
-    machine, load = result["machine"], result["load"]
-    where = f"{machine['cores']} cores of {machine['processor']}" if machine["processor"] else "an unrecorded machine"
-    where += f" with {machine['memory_gib']} GiB" if machine["memory_gib"] else ""
-    where += f" and an {machine['gpu']}" if machine["gpu"] else ""
-    loaded = f"load {load['start']} to {load['end']}" if load.get("start") is not None else load.get("said")
-    text = f"`{result['command']}` on {where}" + (f", {loaded}" if loaded else "")
-    day = f"{result['revision']} of {result['date']}"
+    load, day = load_of(result), f"{result['revision']} of {result['date']}"
+    text = f"`{result['command']}` on {machine_of(result)}" + (f", {load}" if load else "")
     if result["recorded"] == "transcribed":
         text += f"; taken over from the notes of revision {day}, not recorded anew since"
     else:
@@ -117,16 +112,32 @@ def caption(result: Mapping[str, Any]) -> str:
     return text + (f". {result['note']}" if result.get("note") else ".")
 
 
-def index(results: Results) -> str:
-    """A table of all results."""
-    lines = ["| command | revision | date | recorded | s | GPU |", "| --- | --- | --- | --- | ---: | --- |"]
-    for result in results.values():
-        if "command" in result:
-            kind = "by the benchmark" if result["recorded"] == "run" else "taken over"
-            seconds = f"{result['seconds']:.0f}" if result["seconds"] is not None else "–"
-            gpu = result["machine"]["gpu"] or ""
-            row = f"`{result['command']}`", result["revision"], result["date"], kind, seconds, gpu
-            lines.append(f"| {' | '.join(row)} |")
+def machine_of(result: Mapping[str, Any]) -> str:
+    """Processor, memory and GPU, as far as they are known."""
+    machine = result["machine"]
+    known = f"{machine['cores']} cores" if machine["cores"] else ""
+    known += (" of " if known else "") + machine["processor"] if machine["processor"] else ""
+    known += f" with {machine['memory_gib']} GiB" if machine["memory_gib"] else ""
+    return " and ".join(part for part in (known, machine["gpu"]) if part)
+
+
+def load_of(result: Mapping[str, Any]) -> str:
+    """Load average at the start and the end, or what notes say of it."""
+    load = result["load"]
+    return f"load {load['start']} to {load['end']}" if load["start"] is not None else load.get("said") or ""
+
+
+def runs(results: Iterable[Mapping[str, Any]]) -> str:
+    """A table of results."""
+    lines = ["| command | machine | load | revision | recorded |", "| --- | --- | --- | --- | --- |"]
+    for result in results:
+        if result["recorded"] == "transcribed":
+            how = "taken over from notes"
+        else:
+            how = f"in {result['seconds']:.0f} s" + (", with changes" if result["changed"] else "")
+        how += f". {result['note']}" if result.get("note") else ""
+        load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
+        lines.append(f"| `{result['command']}` | {machine_of(result)} | {load} | {day} | {how} |")
     return "\n".join(lines)
 
 
@@ -137,11 +148,13 @@ def filled(text: str, results: Results) -> str:
         words = match[1].split()
         try:
             match words:
-                case ["index"]:
-                    return index(results)
-                case ["caption", *names] if names:
-                    for name in names:
-                        value_of(results, name, next(iter(results.get(name, {"figures": [""]})["figures"])))
+                case ["runs"]:
+                    return runs(result for result in results.values() if "command" in result)
+                case ["caption" | "runs" as what, *names] if names:
+                    if missing := [name for name in names if "command" not in results.get(name, {})]:
+                        raise FigureError(f"no result {missing[0]}")
+                    if what == "runs":
+                        return runs(results[name] for name in names)
                     return "  \n".join(f"*{caption(results[name])}*" for name in names)
                 case ["cells", result, prefix, *cells] if cells:
                     pairs = [cell.partition(":") for cell in cells]

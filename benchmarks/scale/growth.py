@@ -3,10 +3,10 @@
     python -m benchmarks.scale.growth workers [--scene FILE] [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale.growth scene [--frames 6] [--size 320x180]
     python -m benchmarks.scale.growth memory [--frames 2000] [--views 50]
-    python -m benchmarks.scale.growth project --seconds 1.55 --bytes 2.5e5 [--settle 3] [--views 12]
+    python -m benchmarks.scale.growth project [--seconds 0.6] [--bytes 2.5e5] [--settle 3] [--views 12]
 
-``workers`` also compares the manifests' SHA-256. ``project`` prints a table from figures that the others measured; its
-model is in ``docs/reliability.md``.
+``workers`` also compares the manifests' SHA-256. ``project`` prints the table of ``docs/reliability.md``, where its model
+is, from recorded results or from the figures given.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.figures import read_results
 from benchmarks.record import figure, recording
 from benchmarks.scale import projection
 from benchmarks.scale.faults import SCENE
@@ -170,15 +171,21 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--scene", type=Path, default=WORKCELL)
     parser.add_argument("--size", default="320x180")
-    parser.add_argument("--seconds", type=float, default=1.55)
-    parser.add_argument("--bytes", type=float, default=2.5e5)
-    parser.add_argument("--settle", type=float, default=3.0)
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--bytes", type=float)
+    parser.add_argument("--settle", type=float)
     parser.add_argument("--views", type=int)
     options = parser.parse_args()
     if options.what == "project":
-        project(options.seconds, options.bytes, options.settle, options.views or 12)
+        known = {name: value for name, (value, _) in read_results()["projection"]["figures"].items()}
+        project(
+            options.seconds or known["rendering"] + known["writing"],
+            options.bytes or 1e6 * known["megabytes"],
+            options.settle or known["settle"],
+            options.views or known["views"],
+        )
         return
-    with recording("scale.growth", parser, options, ignore=("seconds", "bytes", "settle")):
+    with recording("scale.growth", parser, options):
         measure(options)
 
 

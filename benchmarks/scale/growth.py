@@ -5,8 +5,8 @@
     python -m benchmarks.scale.growth memory [--frames 2000] [--views 50]
     python -m benchmarks.scale.growth project [--seconds 0.6] [--bytes 2.5e5] [--settle 3] [--views 12]
 
-``workers`` also compares the manifests' SHA-256. ``project`` prints the table of ``docs/reliability.md``, where its model
-is, from recorded results or from the figures given.
+``workers`` also compares the manifests' SHA-256. ``project`` prints the table of ``docs/reliability.md``, which has its
+model, from recorded results or from the figures given.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ import json
 import re
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -172,11 +173,26 @@ def filled(text: str, results: Results) -> str:
     return re.sub(r"\{\{(.*?)\}\}", fill, text)
 
 
+def wrapped(text: str, width: int = 120) -> str:
+    """Paragraphs of plain text in lines of a width; a sign that begins a list stays behind what it follows."""
+    blocks = text.split("\n\n")
+    for place, block in enumerate(blocks):
+        if block[:1].isalnum() or (block.startswith(("`", "[", "(")) and not block.startswith("```")):
+            lines = textwrap.fill(" ".join(block.split()), width, break_long_words=False, break_on_hyphens=False)
+            end = "\n" * (len(block) - len(block.rstrip("\n")))
+            blocks[place] = re.sub(r"\n([-+*#>=]|\d+[.)]) ", r" \1\n", lines) + end
+    return "\n\n".join(blocks)
+
+
 def pages(results: Results) -> dict[Path, str]:
     """What every generated page must be."""
-    return {
-        ROOT / page: filled((TEMPLATES / name).read_text(encoding="utf-8"), results) for name, page in PAGES.items()
-    }
+    found = {}
+    for name, page in PAGES.items():
+        text = wrapped(filled((TEMPLATES / name).read_text(encoding="utf-8"), results))
+        found[ROOT / page] = (
+            f"{text}\n<!-- Written by python -m benchmarks.figures: edit benchmarks/templates/{name} -->\n"
+        )
+    return found
 
 
 def unsaid(results: Results) -> Iterable[str]:

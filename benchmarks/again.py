@@ -16,6 +16,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.figures import read_results
@@ -33,7 +34,7 @@ ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared")
 """What a checkout lacks."""
 
 
-def command_of(name: str, result: dict[str, Any]) -> list[str]:
+def command_of(result: Mapping[str, Any]) -> list[str]:
     """What records a result; the command line's own chart does not, its benchmark does."""
     words = shlex.split(result["command"])
     if words[:2] == ["mitsplat", "chart"]:
@@ -46,7 +47,7 @@ def command_of(name: str, result: dict[str, Any]) -> list[str]:
     return [sys.executable, *words[1:]] if words[0] == "python" else words
 
 
-def recordable(result: dict[str, Any]) -> bool:
+def recordable(result: Mapping[str, Any]) -> bool:
     """Whether a checkout on this machine is enough."""
     command = result["command"]
     own = command.startswith(("python -m benchmarks.", "mitsplat chart"))
@@ -73,7 +74,7 @@ def main() -> None:
         or (options.all and recordable(result))
     }
     failed = []
-    for command, seconds in {shlex.join(command_of(*one)): one[1]["seconds"] for one in chosen.items()}.items():
+    for command, seconds in {shlex.join(command_of(one)): one["seconds"] for one in chosen.values()}.items():
         print(f"{command}  ({f'{seconds:.0f} s the last time' if seconds else 'time unknown'})", flush=True)
         if not options.list and subprocess.run(shlex.split(command), cwd=ROOT, check=False).returncode:
             failed.append(command)

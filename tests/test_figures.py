@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import figures, record
+from benchmarks import again, figures, record
 from benchmarks.figures import FigureError, caption, differences, filled, formatted, read_results, unsaid
 from benchmarks.record import figure, name_of, recording, revision
 from mitsplat.checks import doctor
@@ -137,6 +137,22 @@ def test_a_result_that_cannot_be_kept_costs_no_run(tmp_path: Path, capsys: pytes
     with recording("render.frame", *options(), folder=tmp_path / "file"):
         figure(1, "s", "whole frame")
     assert "the result was not kept" in capsys.readouterr().err
+
+
+def test_which_commands_are_run_again() -> None:
+    chosen = {name for name, result in RESULTS.items() if "command" in result and again.recordable(result)}
+    assert {"render.frame", "labels.cost", "render.chart-workcell", "scale.fuzz-minutes_8-seed_1000"} <= chosen
+    assert not {name for name in chosen if "cuda" in name}
+    assert not chosen & {
+        "assets.statue",
+        "labels.train",
+        "render.chart-plant-size_640x480",
+        "scenes.build",
+        "engine.plan",
+    }
+    assert set(again.IDLE) <= RESULTS.keys()
+    words = again.command_of({"command": "mitsplat chart scenes/workcell.yaml -n 2"})
+    assert words[1:] == ["-m", "benchmarks.render.chart", "scenes/workcell.yaml", "--frames", "2"]
 
 
 def test_captions_say_what_is_old_or_changed() -> None:

@@ -144,13 +144,14 @@ def write_result(name: str, about: Mapping[str, Any], figures: Mapping[str, Sequ
 
 
 def revision(folder: Path = ROOT) -> dict[str, Any]:
-    """The commit, and whether files that decide figures differ from it; unknown outside of a checkout."""
+    """The commit, how many led to it, and whether files that decide figures differ; unknown outside of a checkout."""
     try:
         commit = _said("git", "-C", str(folder), "rev-parse", "--short=9", "HEAD")
+        number = int(_said("git", "-C", str(folder), "rev-list", "--count", "HEAD"))
         changed = bool(_said("git", "-C", str(folder), "status", "--porcelain", "--", *MEASURED))
     except (OSError, subprocess.CalledProcessError):
-        return {"revision": "unknown", "changed": None}
-    return {"revision": commit, "changed": changed}
+        return {"revision": "unknown", "commits": None, "changed": None}
+    return {"revision": commit, "commits": number, "changed": changed}
 
 
 def machine(gpu: bool) -> dict[str, Any]:

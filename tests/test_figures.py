@@ -127,9 +127,9 @@ def test_a_run_that_fails_is_not_kept(tmp_path: Path) -> None:
 
 
 def test_a_revision_outside_of_a_checkout_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert revision(tmp_path) == {"revision": "unknown", "changed": None}
+    assert revision(tmp_path) == {"revision": "unknown", "commits": None, "changed": None}
     monkeypatch.setenv("PATH", "")
-    assert revision() == {"revision": "unknown", "changed": None}
+    assert revision() == {"revision": "unknown", "commits": None, "changed": None}
 
 
 def test_a_result_that_cannot_be_kept_costs_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

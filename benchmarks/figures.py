@@ -34,6 +34,8 @@ PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md
 SAID = "said.md"
 VIEWS, BYTES = 12, 2.5e5
 """Frames of a layout, and bytes of a frame, in the projection: those of the default scene."""
+LATE = 50
+"""Commits by which a revision is older than the newest one when a caption says so."""
 
 Results = Mapping[str, Mapping[str, Any]]
 
@@ -101,9 +103,11 @@ def formatted(value: Any, spec: str) -> str:
         raise FigureError(f"{value} cannot be written as {spec}: {error}") from error
 
 
-def caption(result: Mapping[str, Any]) -> str:
-    """Where figures are from: command, machine, load and revision."""
+def caption(result: Mapping[str, Any], newest: int = 0) -> str:
+    """Where figures are from: command, machine, load and revision, and how much older it is than the newest one."""
     load, day = load_of(result), f"{result['revision']} of {result['date']}"
+    late = newest - (result["commits"] or newest)
+    day += f", {late} commits before the newest figure" if late >= LATE else ""
     text = f"`{result['command']}` on {machine_of(result)}" + (f", {load}" if load else "")
     if result["recorded"] == "transcribed":
         text += f"; taken over from the notes of revision {day}, not recorded anew since"
@@ -128,9 +132,12 @@ def load_of(result: Mapping[str, Any]) -> str:
     return f"load {load['start']} to {load['end']}" if load["start"] is not None else load.get("said") or ""
 
 
-def runs(results: Iterable[Mapping[str, Any]]) -> str:
-    """A table of results."""
-    lines = ["| command | machine | load | revision | recorded |", "| --- | --- | --- | --- | --- |"]
+def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
+    """A table of results, with the commits between their revision and the newest one."""
+    lines = [
+        "| command | machine | load | revision | commits since | recorded |",
+        "| --- | --- | --- | --- | ---: | --- |",
+    ]
     for result in results:
         if result["recorded"] == "transcribed":
             how = "taken over from notes"
@@ -138,25 +145,27 @@ def runs(results: Iterable[Mapping[str, Any]]) -> str:
             how = f"in {result['seconds']:.0f} s" + (", with changes" if result["changed"] else "")
         how += f". {result['note']}" if result.get("note") else ""
         load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
-        lines.append(f"| `{result['command']}` | {machine_of(result)} | {load} | {day} | {how} |")
+        late = "–" if result["commits"] is None else newest - result["commits"]
+        lines.append(f"| `{result['command']}` | {machine_of(result)} | {load} | {day} | {late} | {how} |")
     return "\n".join(lines)
 
 
 def filled(text: str, results: Results) -> str:
     """A template with its figures."""
+    newest = max((result.get("commits") or 0 for result in results.values()), default=0)
 
     def fill(match: re.Match[str]) -> str:
         words = match[1].split()
         try:
             match words:
                 case ["runs"]:
-                    return runs(result for result in results.values() if "command" in result)
+                    return runs((result for result in results.values() if "command" in result), newest)
                 case ["caption" | "runs" as what, *names] if names:
                     if missing := [name for name in names if "command" not in results.get(name, {})]:
                         raise FigureError(f"no result {missing[0]}")
                     if what == "runs":
-                        return runs(results[name] for name in names)
-                    return "  \n".join(f"*{caption(results[name])}*" for name in names)
+                        return runs((results[name] for name in names), newest)
+                    return "  \n".join(f"*{caption(results[name], newest)}*" for name in names)
                 case ["cells", result, prefix, *cells] if cells:
                     pairs = [cell.partition(":") for cell in cells]
                     return " | ".join(

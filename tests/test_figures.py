@@ -159,6 +159,8 @@ def test_captions_say_what_is_old_or_changed() -> None:
     result = {**RESULTS["labels.cost"], "changed": True, "note": "So."}
     assert " with changes in " in caption(result) and caption(result).endswith("So.")
     assert "not recorded anew since" in caption({**result, "recorded": "transcribed"})
+    assert "commits before" not in caption(result, result["commits"] + 49)
+    assert "50 commits before the newest figure" in caption(result, result["commits"] + 50)
 
 
 def test_every_benchmark_keeps_its_figures() -> None:

@@ -106,7 +106,7 @@ def formatted(value: Any, spec: str) -> str:
 def caption(result: Mapping[str, Any], newest: int = 0) -> str:
     """Where figures are from: command, machine, load and revision, and how much older it is than the newest one."""
     load, day = load_of(result), f"{result['revision']} of {result['date']}"
-    late = newest - (result["commits"] or newest)
+    late = newest - (result.get("commits") or newest)
     day += f", {late} commits before the newest figure" if late >= LATE else ""
     text = f"`{result['command']}` on {machine_of(result)}" + (f", {load}" if load else "")
     if result["recorded"] == "transcribed":
@@ -145,7 +145,7 @@ def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
             how = f"in {result['seconds']:.0f} s" + (", with changes" if result["changed"] else "")
         how += f". {result['note']}" if result.get("note") else ""
         load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
-        late = "–" if result["commits"] is None else newest - result["commits"]
+        late = "–" if result.get("commits") is None else newest - result["commits"]
         lines.append(f"| `{result['command']}` | {machine_of(result)} | {load} | {day} | {late} | {how} |")
     return "\n".join(lines)
 

@@ -21,12 +21,12 @@ from mitsplat.llvm import OLDEST_USABLE, VARIABLE
 from mitsplat.warp_start import quiet_warp
 
 NEEDED_MEMORY = 2.5
-"""What :func:`mitsplat.frames.budget.worker_memory` allows a worker of the default scene, rounded up [GiB]; less is used,
-see ``python -m benchmarks.scale.workers budget``."""
+"""What :func:`mitsplat.frames.budget.worker_memory` allows a worker of the default scene, rounded up [GiB];
+``python -m benchmarks.scale.workers budget`` has it beside what is used."""
 
 NEEDED_DISK = 0.5
-"""Twice a dataset of a thousand frames of 0.25 MB, beside which kernels, pieces and layouts of a first run are little, see
-``python -m benchmarks.scale.first_run`` [GiB]."""
+"""Twice a dataset of a thousand frames of 0.25 MB [GiB]. What a first run compiles and keeps is little beside it, see
+``python -m benchmarks.scale.first_run``."""
 
 
 TRIAL = """

@@ -19,7 +19,7 @@ from ruamel.yaml.scanner import RoundTripScanner
 
 from mitsplat.errors import InputError
 
-Model = TypeVar("Model", bound=BaseModel)
+Validated = TypeVar("Validated", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
@@ -84,7 +84,7 @@ class _Finding(NamedTuple):
     missing: bool
 
 
-def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, Any] | None = None) -> Model:
+def load_yaml(path: str | Path, model: type[Validated], *, overrides: Mapping[str, Any] | None = None) -> Validated:
     """Read a YAML 1.2 file into ``model``; types are checked strictly (no text for numbers) and no code is run.
 
     Args:

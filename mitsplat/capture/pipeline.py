@@ -20,7 +20,7 @@ from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, giv
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, Anchor, find_anchor
 from mitsplat.capture.overview import capture_sheet
 from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
-from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, Model, find_cameras
+from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.targets import Board
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
@@ -264,7 +264,7 @@ def _forget_other_photos(out: Path, inputs: dict[str, object], settings: Capture
 
 def _find_model(
     photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
-) -> tuple[Model, Anchor, dict[str, str]]:
+) -> tuple[SparseModel, Anchor, dict[str, str]]:
     """Cameras that neither each other nor a board contradicts, where they are put, and why other files have none."""
     faults: dict[str, str] = {}
     if settings.poses is not None:
@@ -289,7 +289,9 @@ def _find_model(
     return model, anchor, faults
 
 
-def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared], faults: Mapping[str, str]) -> None:
+def _demand_cameras(
+    photos: Path, model: SparseModel, by_file: Mapping[str, Prepared], faults: Mapping[str, str]
+) -> None:
     """Refuse too few cameras."""
     if len(model.cameras) < MIN_PHOTOS:
         reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
@@ -300,7 +302,7 @@ def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared],
         )
 
 
-def _without_faults(model: Model, least: int = MIN_POINTS) -> tuple[Model, dict[str, str]]:
+def _without_faults(model: SparseModel, least: int = MIN_POINTS) -> tuple[SparseModel, dict[str, str]]:
     """The model without cameras that contradict the others or observe fewer points, and why each is left out."""
     shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
     wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
@@ -313,7 +315,7 @@ def _without_faults(model: Model, least: int = MIN_POINTS) -> tuple[Model, dict[
     }
 
 
-def _anchored(model: Model, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
+def _anchored(model: SparseModel, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
     if settings.metric:
         return Anchor(np.eye(4), "metre", "z", table=True, source="the poses given")
     return find_anchor(

@@ -14,7 +14,7 @@ from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.capture.targets import Board
-    from mitsplat.reconstruct.pipeline import Finished
+    from mitsplat.reconstruct.pipeline import AssetResult
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -406,7 +406,7 @@ def _board(squares: str, square: float) -> Board:
     return Board(int(columns), int(rows), square)
 
 
-def _tell_asset(done: Finished) -> None:
+def _tell_asset(done: AssetResult) -> None:
     """What came of an asset, and status 4 where a threshold is missed."""
     found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
     closed = "watertight" if found.watertight else "open"

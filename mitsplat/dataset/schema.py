@@ -21,7 +21,7 @@ from mitsplat.camera import Camera, Lens
 from mitsplat.dataset.manifest import parse_line
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.scene.spec import CameraSpec, Labelling, Output
+from mitsplat.scene.spec import CameraSpec, LabelRules, Output
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]
@@ -42,7 +42,7 @@ class _Scene(_Stored):
     name: str
     seed: Count
     camera: CameraSpec
-    labels: Labelling
+    labels: LabelRules
     output: Output
 
 

@@ -90,7 +90,7 @@ class Adam:
         dr.eval(self.values, self.first, self.second)
 
 
-class Model(Adam):
+class GaussianModel(Adam):
     """Gaussians in terms of unconstrained parameters.
 
     Means and logarithms of scales are in ``unit``, opacities are logits; quaternions are xyzw and of any length. The SH

@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
-from mitsplat.fit.optimizer import Model
+from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.image_metrics import psnr_of
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant, make_sensor
@@ -90,7 +90,7 @@ def refine_splats(
     from mitsplat.plugins.backward import render_differentiable
     from mitsplat.plugins.splat_proxy import view_of
 
-    model = Model(splats, float(np.mean(splats.scales)))
+    model = GaussianModel(splats, float(np.mean(splats.scales)))
     views = [view_of(make_sensor(picture.camera)) for picture in pictures]
     targets = [
         ([mi.Float(np.ravel(p.rgb[..., c]).astype(np.float32)) for c in range(3)], mi.Float(np.ravel(p.alpha)))

@@ -25,7 +25,7 @@ from mitsplat.files import add_content
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps
 from mitsplat.fit.folder import FitFolder, FitResult
 from mitsplat.fit.initial_points import seed_points
-from mitsplat.fit.optimizer import Adam, Model
+from mitsplat.fit.optimizer import Adam, GaussianModel
 from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, Sight
@@ -247,7 +247,7 @@ class _Fit:
         seen = [photo.seen for photo in training]
         points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
         self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
-        self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
+        self.model = GaussianModel(seed_splats(points, colours, settings.sh_degree), self.extent)
         self.densification = _densification(settings, self.model.count)
         self.scale_weight = self.densification.scale_weight if settings.scale_weight is None else settings.scale_weight
         self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})

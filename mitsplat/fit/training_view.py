@@ -17,7 +17,7 @@ from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
 from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
-from mitsplat.fit.optimizer import Model
+from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.image_metrics import psnr, ssim
 from mitsplat.plugins.device import wrapped
 from mitsplat.quality import Quality
@@ -128,7 +128,7 @@ class Sight:
             self._depths = wrapped(mi.UInt32, number), wrapped(mi.Float, inverse)
         return self._depths
 
-    def render(self, model: Model, quality: Quality) -> tuple[Float32Array, Float32Array]:
+    def render(self, model: GaussianModel, quality: Quality) -> tuple[Float32Array, Float32Array]:
         """Display-encoded colour times alpha, (H, W, 3), and alpha, (H, W), as the splats look from here."""
         from mitsplat.plugins.backward import render_differentiable
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ from mitsplat.physics.worlds import (
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
@@ -112,7 +112,7 @@ class Drop:
             return Layout(index, (), NOTHING_TO_REST)
         frictions = self._draw_frictions(index)
         for attempt in range(spec.settle.attempts):
-            start = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt), given)
+            start = self.draw_poses(assets, random_stream(spec.seed, "object poses", index, attempt), given)
             world = self._world(assets, frictions, capacity)
             world.reset(start)
             outcome = self._run(world)
@@ -157,7 +157,7 @@ class Drop:
         if not assets:
             return
         certificate = layout.certificate
-        rng = _random(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
+        rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
         world = self._world(assets, self._draw_frictions(layout.index), capacity)
         world.reset(self.draw_poses(assets, rng, given))
@@ -177,7 +177,7 @@ class Drop:
 
     def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
         """Which entry each object of a layout is of, and the pose that the file gives it, if any."""
-        counts = _random(self.scene.spec.seed, "object counts", index)
+        counts = random_stream(self.scene.spec.seed, "object counts", index)
         assets: list[int] = []
         given: list[Float64Array | None] = []
         for position, entry in enumerate(self.scene.spec.objects):
@@ -191,7 +191,7 @@ class Drop:
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
         """Friction coefficient of each entry in a layout."""
         spec = self.scene.spec
-        rng = _random(spec.seed, "friction", index)
+        rng = random_stream(spec.seed, "friction", index)
         return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
 
     def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float) -> World:
@@ -374,10 +374,6 @@ def _fault(
 
 def _deepest(pairs: Iterable[Clearance]) -> float:
     return max([0.0, *(-pair.distance for pair in pairs)])
-
-
-def _random(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), *numbers]))
 
 
 def _pieces(

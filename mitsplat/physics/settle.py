@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).parents[1]
 
 _OWN = ("contacts", "drop", "friction", "placement", "worlds")
-MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.walls")
+MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.streams", "scene.walls")
 """Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
 LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)

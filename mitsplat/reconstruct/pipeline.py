@@ -57,7 +57,7 @@ class AssetJob:
 
 
 @dataclass(frozen=True)
-class Finished:
+class AssetResult:
     """An asset on disk.
 
     Attributes:
@@ -104,7 +104,7 @@ def make_photo_asset(
     capture: CaptureSettings,
     fit: FitSettings,
     progress: Progress | None = None,
-) -> Finished:
+) -> AssetResult:
     """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
 
     Args:
@@ -137,7 +137,7 @@ def make_photo_asset(
 
 def make_asset(
     capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
-) -> Finished:
+) -> AssetResult:
     """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
 
     Args:
@@ -172,7 +172,7 @@ def make_asset(
     write_asset_report(out, capture, result)
     # Last, so that an interrupted run is not mistaken for a finished one.
     _save_verdict(out, result, inputs)
-    return Finished(out, result.verdict, kept=False)
+    return AssetResult(out, result.verdict, kept=False)
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
@@ -214,7 +214,7 @@ def _files(folder: Path, capture: Capture) -> list[Path]:
     return [folder / "capture.json", folder / "points.npz", *pictures]
 
 
-def _finished(out: Path, inputs: str) -> Finished | None:
+def _finished(out: Path, inputs: str) -> AssetResult | None:
     """What an earlier run of the same inputs left, if it is whole."""
     if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, "asset.yaml")):
         return None
@@ -222,6 +222,6 @@ def _finished(out: Path, inputs: str) -> Finished | None:
         record = json.loads((out / VERDICT_FILE).read_text())
         if record.pop("inputs") != inputs:
             return None
-        return Finished(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
+        return AssetResult(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
     except (ValueError, KeyError, TypeError, OSError):
         return None

@@ -27,7 +27,7 @@ from mitsplat.capture.masks import agreed_masks, geometric_masks, object_points
 from mitsplat.capture.metric_frame import find_anchor, fit_similarity
 from mitsplat.capture.photos import prepare_photos
 from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
-from mitsplat.capture.structure_from_motion import Model
+from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from tests import rendered
 from tests.cli.test_cli import run
@@ -312,11 +312,11 @@ def test_a_crash_of_colmap_is_one_sentence(tmp_path: Path, monkeypatch: pytest.M
         capture_photos(tmp_path / "photos", tmp_path / "out")
 
 
-def model_of(capture: Capture, count: int | None = None) -> Model:
+def model_of(capture: Capture, count: int | None = None) -> SparseModel:
     """The first photos of a capture as structure from motion would have found them."""
     photos = capture.photos[:count]
     cameras, seen = ({photo.file.name: getattr(photo, key) for photo in photos} for key in ("camera", "seen"))
-    return Model(cameras, capture.points, capture.colours, seen)
+    return SparseModel(cameras, capture.points, capture.colours, seen)
 
 
 def test_photos_of_two_things_end_with_status_4(

@@ -22,7 +22,7 @@ from mitsplat.capture.metric_frame import (
     triangulate,
     vertical_from_cameras,
 )
-from mitsplat.capture.structure_from_motion import Model
+from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.capture.targets import Board, find_tags
 from mitsplat.errors import InputError
 
@@ -54,10 +54,10 @@ def lost(camera: Camera) -> Camera:
     return replace(camera, world_from_camera=pose)
 
 
-def model_of(cameras: list[Camera], points: np.ndarray) -> Model:
+def model_of(cameras: list[Camera], points: np.ndarray) -> SparseModel:
     seen = np.arange(len(points), dtype=np.int32)
     names = [f"{number:02}.png" for number in range(len(cameras))]
-    return Model(
+    return SparseModel(
         dict(zip(names, map(lost, cameras), strict=True)),
         points @ LOST[:3, :3].T + LOST[:3, 3],
         np.zeros((len(points), 3), dtype=np.uint8),

@@ -182,7 +182,7 @@ def test_exported_xml_renders_the_same_picture(
     picture = render_xml(tmp_path / "one.xml", tmp_path / "out")
     frame = ms.render_frame(scene, 1, layout=layout)
     ours = np.asarray(Image.open(picture), dtype=np.float64)
-    covered = frame.layers["alpha"] > 0.99
+    covered = frame.layers.alpha > 0.99
     assert covered.any()
     assert np.abs(ours - frame.image)[covered].mean() < 1.0
 

@@ -19,6 +19,7 @@ from mitsplat.bake.path_tracing import render_mesh
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.image_metrics import psnr_of
+from mitsplat.render.layers import render_splats
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats
 
@@ -54,8 +55,6 @@ def compare_views(
     progress: Callable[[float], None],
 ) -> tuple[tuple[BakedView, ...], float, float]:
     """Views of the mesh and the splats, and PSNR [dB] of all together: whole images, and the mesh's pixels alone."""
-    from mitsplat.render.layers import render_splats
-
     views, errors, on_object = [], [], []
     for number, camera in enumerate(cameras):
         progress(number / len(cameras))

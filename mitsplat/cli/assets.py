@@ -1,4 +1,7 @@
-"""Commands that make assets: of meshes, and of photographs."""
+"""Commands that make assets: of meshes, and of photographs.
+
+Commands import what they need inside of their functions, so that the start of every other one stays short.
+"""
 
 from __future__ import annotations
 

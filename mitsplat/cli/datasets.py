@@ -1,4 +1,7 @@
-"""Commands on scenes and datasets."""
+"""Commands on scenes and datasets.
+
+Commands import what they need inside of their functions, so that the start of every other one stays short.
+"""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ class _Actors(Generic[Result]):
 
     def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
         try:
-            import ray
+            import ray  # optional: the extra [cluster]
         except ImportError:
             raise MissingResourceError("the engine ray needs Ray: pip install 'mitsplat[cluster]'") from None
         self._ray = ray
@@ -221,12 +221,12 @@ class _Actor:
     """A worker on the cluster."""
 
     def __init__(self, stored: list[Any], gpu: bool) -> None:
-        import ray
+        import ray  # optional: the extra [cluster]
 
-        import mitsplat  # before Mitsuba
+        import mitsplat  # before Mitsuba, as it says which LLVM to load
 
         if gpu:
-            import mitsuba as mi
+            import mitsuba as mi  # after mitsplat
 
             mi.set_variant("cuda_ad_rgb")
         self._version = mitsplat.__version__

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray
+from mitsplat.plugins.backward import pack_cloud
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.gaussian import Cloud
 from mitsplat.splats import Splats
@@ -137,8 +138,6 @@ class GaussianModel(Adam):
 
     def cloud(self) -> Cloud:
         """The Gaussians as the renderer takes them."""
-        from mitsplat.plugins.backward import pack_cloud
-
         return pack_cloud(*self.activated(), self.bands)
 
     def sh_rates(self, rate: float, rest_rate: float) -> Any:

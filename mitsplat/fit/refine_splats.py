@@ -13,6 +13,8 @@ from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.image_metrics import psnr_of
+from mitsplat.plugins.backward import render_differentiable
+from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant, make_sensor
 from mitsplat.splats import Splats
@@ -87,9 +89,6 @@ def refine_splats(
     if not pictures or not len(splats):
         raise ValueError(f"refining needs pictures and splats (got {len(pictures)} and {len(splats)})")
     ensure_variant()
-    from mitsplat.plugins.backward import render_differentiable
-    from mitsplat.plugins.splat_proxy import view_of
-
     model = GaussianModel(splats, float(np.mean(splats.scales)))
     views = [view_of(make_sensor(picture.camera)) for picture in pictures]
     targets = [

@@ -30,6 +30,8 @@ from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, Sight
 from mitsplat.image_metrics import psnr_of
+from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
+from mitsplat.plugins.photometric import photometric_loss
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant
 from mitsplat.version import __version__
@@ -306,9 +308,6 @@ class _Fit:
         self, sight: Sight, number: int, quality: Quality, fraction: float, rng: np.random.Generator
     ) -> tuple[Any, Any]:
         """The loss, and the mean squared error alone."""
-        from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
-        from mitsplat.plugins.photometric import photometric_loss
-
         s = self.settings
         loss = mi.Float(0)
         weight = self._depth_weight(sight, fraction)

@@ -19,7 +19,9 @@ from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.image_metrics import psnr, ssim
+from mitsplat.plugins.backward import render_differentiable
 from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
 from mitsplat.render.layers import make_sensor
 
@@ -81,8 +83,6 @@ class Sight:
     @cached_property
     def view(self) -> Any:
         """The camera as the renderer takes it."""
-        from mitsplat.plugins.splat_proxy import view_of
-
         return view_of(make_sensor(self.camera))
 
     @property
@@ -130,8 +130,6 @@ class Sight:
 
     def render(self, model: GaussianModel, quality: Quality) -> tuple[Float32Array, Float32Array]:
         """Display-encoded colour times alpha, (H, W, 3), and alpha, (H, W), as the splats look from here."""
-        from mitsplat.plugins.backward import render_differentiable
-
         rgb, alpha = render_differentiable(model.cloud(), self.view, quality)
         shape = self.camera.height, self.camera.width
         return np.stack([np.array(c).reshape(shape) for c in rgb], axis=-1), np.array(alpha).reshape(shape)

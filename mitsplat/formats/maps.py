@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
@@ -31,8 +32,6 @@ UNKNOWN_FLOW = 1e10
 
 def write_exr(path: Path, frame: Frame) -> None:
     """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
-    import OpenEXR
-
     names = {"depth": "Z", "alpha": "A"}
     axes = {"normal": "XYZ"}
     channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsplat.engine.resources import WorkerMemory
+from mitsplat.plugins.tiles import PAIRS_MAX
 from mitsplat.quality import resolve_quality
+from mitsplat.scene.scene import plan_frame
 
 if TYPE_CHECKING:
     from mitsplat.camera import Camera
@@ -54,9 +56,6 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     The sum of terms in the Gaussians of assets, those of all instances, the tiles that they cover as seen from some of
     the scene's cameras (in the middle of the region, where they are dropped), rays, objects, and objects times pixels.
     """
-    from mitsplat.plugins.tiles import PAIRS_MAX
-    from mitsplat.scene.scene import plan_frame
-
     spec = scene.spec
     most = [max(entry.count[1], len(entry.poses)) for entry in spec.objects]
     placed = [(asset.splats, count) for asset, count in zip(scene.assets, most, strict=True)]

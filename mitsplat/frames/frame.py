@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -108,8 +109,6 @@ class Frame:
         return self.layers.light
 
     def _repr_png_(self) -> bytes:
-        import cv2
-
         _, data = cv2.imencode(".png", cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR))
         return bytes(data)
 

@@ -10,11 +10,13 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.pipeline import CaptureSettings, capture_photos
 from mitsplat.errors import InputError
 from mitsplat.files import add_content, write_text
+from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import VERDICT_FILE, Verdict
@@ -28,10 +30,6 @@ from mitsplat.reconstruct.reconstruct import (
 from mitsplat.reconstruct.report import write_asset_report
 from mitsplat.splats import Splats
 from mitsplat.version import __version__
-
-if TYPE_CHECKING:
-    from mitsplat.capture.pipeline import CaptureSettings
-    from mitsplat.fit.trainer import FitSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +117,6 @@ def make_photo_asset(
         InputError: If the photographs do not suffice.
         MissingResourceError: If a program or model that is needed is missing.
     """
-    from mitsplat.capture.pipeline import capture_photos
-    from mitsplat.fit.trainer import FitProgress, fit_capture
-
     taken = capture_photos(photos, out / "capture", capture, progress=progress)
     found = taken.capture
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -24,6 +25,8 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.plugins.backward import pack_cloud, render_differentiable
+from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.spherical_harmonics import sh_basis
@@ -154,9 +157,6 @@ class _Weigher:
         self._inputs = [mi.Float(np.ravel(values)) for values in fields]
 
     def __call__(self, view: MaskedView) -> Float64Array:
-        from mitsplat.plugins.backward import pack_cloud, render_differentiable
-        from mitsplat.plugins.splat_proxy import view_of
-
         colours = dr.zeros(mi.Float, 3 * self._count)
         dr.enable_grad(colours)
         cloud = pack_cloud(*self._inputs, colours, 1)
@@ -169,8 +169,6 @@ class _Weigher:
 
 def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
     """Elongated Gaussians one of whose tips more than one view sees outside its mask."""
-    import cv2
-
     ordered = np.sort(splats.scales.astype(np.float64), axis=1)
     needle = np.flatnonzero(ordered[:, 2] > NEEDLE * ordered[:, 1])
     result = np.zeros(len(splats), dtype=bool)

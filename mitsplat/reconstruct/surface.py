@@ -26,6 +26,7 @@ from skimage.measure import marching_cubes
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.plugins.sensors import view_of
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.splats import Splats
 
@@ -238,8 +239,6 @@ class _Grid:
 
     def fuse(self, state: _State, splats: Splats, camera: Camera, mask: Float32Array | None) -> None:
         """Add what one view says."""
-        from mitsplat.plugins.splat_proxy import view_of
-
         layers = render_splats(splats, camera, quality="fast")
         depth = np.where(layers.alpha > _OPAQUE, layers.depth, 0.0).astype(np.float32)
         view = view_of(make_sensor(camera))

@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -152,9 +152,7 @@ class TestContent:
 
     def test_an_image_without_instances_has_an_empty_label(self, scene, tmp_path):
         def empty(scene, index, *, layout):
-            frame = render(scene, index, layout=layout)
-            frame.labels = Labels(64, 48, (), {"hidden": 3})
-            return frame
+            return replace(render(scene, index, layout=layout), labels=Labels(64, 48, (), {"hidden": 3}))
 
         summary = write(scene, tmp_path / "out", frames=1, render=empty)
         assert (tmp_path / "out/labels/train/000000.txt").read_text() == ""

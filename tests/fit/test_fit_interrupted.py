@@ -158,7 +158,9 @@ def test_an_asset_whose_fit_was_interrupted_goes_on(
 ) -> None:
     """`asset` has no --overwrite to be told of: settings that changed, an interruption, the same command again."""
     captured = CaptureResult(fits.capture, 20, "a board", 0.5, doubtful={})
-    monkeypatch.setattr("mitsplat.capture.pipeline.capture_photos", lambda photos, out, settings, progress: captured)
+    monkeypatch.setattr(
+        "mitsplat.reconstruct.pipeline.capture_photos", lambda photos, out, settings, progress: captured
+    )
     monkeypatch.setattr(
         "mitsplat.reconstruct.pipeline.make_asset", lambda *args, **kwargs: AssetResult(tmp_path, GOOD, kept=False)
     )

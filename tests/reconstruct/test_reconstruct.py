@@ -215,8 +215,10 @@ def test_photos_go_through_all_stages(
 
     capture = known_object.capture.save(tmp_path / "asset" / "capture")
     captured = CaptureResult(capture, 32, "a board", 0.5, doubtful={"05.png": 0.6})
-    monkeypatch.setattr("mitsplat.capture.pipeline.capture_photos", lambda photos, out, settings, progress: captured)
-    monkeypatch.setattr("mitsplat.fit.trainer.fit_capture", fit_capture)
+    monkeypatch.setattr(
+        "mitsplat.reconstruct.pipeline.capture_photos", lambda photos, out, settings, progress: captured
+    )
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.fit_capture", fit_capture)
     monkeypatch.setattr("mitsplat.reconstruct.pipeline.make_asset", made_of)
     job = AssetJob(name="part")
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):

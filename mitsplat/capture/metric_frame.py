@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
+from skimage.transform import SimilarityTransform
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
@@ -238,14 +239,7 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
 
 def fit_similarity(source: Float64Array, target: Float64Array) -> tuple[Float64Array, Float64Array]:
     """The similarity (4, 4) that takes points (N, 3) closest to others, and the residuals (N, 3) (Umeyama 1991)."""
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    centred = source - mean_source
-    u, spread, vt = np.linalg.svd((target - mean_target).T @ centred)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = float(spread @ signs / (centred**2).sum())
-    matrix = np.eye(4)
-    matrix[:3, :3] = scale * (u * signs) @ vt
-    matrix[:3, 3] = mean_target - matrix[:3, :3] @ mean_source
+    matrix = np.asarray(SimilarityTransform.from_estimate(source, target).params, dtype=np.float64)
     return matrix, source @ matrix[:3, :3].T + matrix[:3, 3] - target
 
 

@@ -70,7 +70,7 @@ def refine_splats(
     pictures: Sequence[Picture],
     settings: RefineSettings = RefineSettings(),
     *,
-    progress: Callable[[int, float], None] | None = None,
+    observe: Callable[[int, float], None] | None = None,
 ) -> Splats:
     """Splats that look more like the pictures, by Adam on the mean squared error of encoded colours.
 
@@ -81,7 +81,7 @@ def refine_splats(
         splats: Where to start.
         pictures: What to come close to.
         settings: Steps and rates.
-        progress: Told after every step its number and its PSNR [dB].
+        observe: Told after every step its number and its PSNR [dB].
 
     Raises:
         ValueError: If there are no pictures, or no splats.
@@ -111,6 +111,6 @@ def refine_splats(
         decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
         rates = {name: getattr(settings, f"rate_{name}") * decay for name in model.values}
         model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * settings.rest_rate)})
-        if progress is not None:
-            progress(step, psnr_of(float(loss.numpy()[0]) / 3))
+        if observe is not None:
+            observe(step, psnr_of(float(loss.numpy()[0]) / 3))
     return model.splats()

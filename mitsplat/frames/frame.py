@@ -19,6 +19,7 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb
+from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop, light_image
 from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.masks import Silhouette
@@ -154,6 +155,9 @@ class Renderer:
         with ms.Renderer(scene, quality="balanced") as renderer:
             frames = [renderer.render(index) for index in range(12)]
 
+    It takes no device, because that is Mitsuba's variant, of which a process has one (see :mod:`mitsplat.variant`): a
+    second renderer could not keep to another. ``mi.set_variant("cuda_ad_rgb")`` before the first one takes the GPU.
+
     Attributes:
         scene: The scene.
         quality: All values of the splat renderer.
@@ -173,6 +177,7 @@ class Renderer:
         ensure_variant()
         self.scene = scene
         self.quality = quality
+        self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self._static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None
@@ -187,7 +192,15 @@ class Renderer:
 
     @one_at_a_time
     def render(self, index: int, *, layout: Layout | None = None) -> Frame:
-        """Render and label one frame; see :func:`render_frame`."""
+        """Render and label one frame; see :func:`render_frame`.
+
+        Raises:
+            InputError: As there, after the end of the renderer's ``with``, or in another variant than it was made in.
+        """
+        if self.integrator is None:
+            raise InputError("the renderer is closed: render before its `with` ends")
+        if mi.variant() != self._variant:
+            raise InputError(f"the renderer was made in Mitsuba's variant {self._variant} (got {mi.variant()} by now)")
         seconds: dict[str, float] = {}
         plan = plan_frame(self.scene, index)
         if layout is None:

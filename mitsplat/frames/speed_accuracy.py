@@ -109,7 +109,7 @@ def measure_steps(
     frames: int = 3,
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
-    note: Progress | None = None,
+    progress: Progress | None = None,
 ) -> list[Row]:
     """Measure steps against the preset ``exact``.
 
@@ -119,7 +119,7 @@ def measure_steps(
         frames: Pictures to compare, spread evenly over the scene's.
         overrides: Changes to the scene file by key, such as ``output.width``.
         allow_outside: Whether the scene may name files outside of its folder.
-        note: Hears (steps done, steps, name of the next).
+        progress: Hears (steps done, steps, name of the next).
 
     Raises:
         InputError: If the file is not as it should be, or ``frames`` is below 1.
@@ -135,8 +135,8 @@ def measure_steps(
     rows: dict[str, Row] = {}
     truth: _Shots | None = None
     for i, step in enumerate(plan):
-        if note is not None:
-            note(i, len(plan), step.name)
+        if progress is not None:
+            progress(i, len(plan), step.name)
         shots = _run_alone(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
         truth = truth or shots
         rows[step.name] = _compare(step.name, shots, truth)
@@ -170,7 +170,7 @@ def choose_preset(
     *,
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
-    note: Progress | None = None,
+    progress: Progress | None = None,
 ) -> Row:
     """The cheapest preset for a scene, from two of its frames; see :func:`measure_steps`.
 
@@ -179,7 +179,7 @@ def choose_preset(
     """
     check_tolerance(tolerance)
     steps = STEPS[: len(PRESETS)]
-    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, note=note)
+    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, progress=progress)
     return cheapest(rows, tolerance)
 
 

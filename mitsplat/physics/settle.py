@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -73,7 +73,7 @@ class _SettleOne:
     scene: Scene
     cached: bool
 
-    def __call__(self, index: int, note: Callable[[str], None], /) -> Layout:
+    def __call__(self, index: int, note: Note, /) -> Layout:
         return settle_layout(self.scene, index, progress=note, cached=self.cached)
 
 

@@ -8,7 +8,7 @@ removed after.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.plugins.backward import pack_cloud, render_differentiable
 from mitsplat.plugins.sensors import view_of
+from mitsplat.progress import Progress
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.spherical_harmonics import sh_basis
@@ -105,7 +106,7 @@ def isolate_object(
     splats: Splats,
     views: Sequence[MaskedView],
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Isolation:
     """The Gaussians of the object that the masks show.
 
@@ -124,7 +125,7 @@ def isolate_object(
     for done, view in enumerate(views, 1):
         weights += weigher(view)
         if progress is not None:
-            progress(done, len(views))
+            progress(done, len(views), "isolating the object")
     total = weights.sum(axis=1)
     seen = total > SEEN
     inside = seen & (weights[:, 0] >= INSIDE * total)

@@ -10,7 +10,7 @@ table bounds it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.plugins.sensors import view_of
+from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.splats import Splats
 
@@ -84,7 +85,7 @@ def reconstruct_surface(
     settings: SurfaceSettings = SurfaceSettings(),
     *,
     floor: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the splats in their own frame.
 
@@ -111,7 +112,7 @@ def reconstruct_surface(
     for number, camera in enumerate(cameras):
         grid.fuse(state, splats, camera, None if masks is None else masks[number])
         if progress is not None:
-            progress(number + 1, len(cameras))
+            progress(number + 1, len(cameras), "finding the surface")
     distance, known = grid.combine(state, settings.blur)
     if floor is not None:
         distance = np.minimum(distance, grid.heights() - np.float32(floor))

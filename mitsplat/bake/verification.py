@@ -18,7 +18,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.bake.path_tracing import render_mesh
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
-from mitsplat.image_metrics import psnr_of
+from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.progress import Progress
 from mitsplat.render.layers import render_splats
 from mitsplat.spherical_harmonics import evaluate_sh

@@ -11,8 +11,8 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
+from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.image_metrics import psnr_of
 from mitsplat.plugins.backward import render_differentiable
 from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality

@@ -24,12 +24,12 @@ from mitsplat.errors import InputError
 from mitsplat.files import add_content
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps
 from mitsplat.fit.folder import FitFolder, FitResult
+from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.optimizer import Adam, GaussianModel
 from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, Sight
-from mitsplat.image_metrics import psnr_of
 from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
 from mitsplat.plugins.photometric import photometric_loss
 from mitsplat.quality import Quality

@@ -17,8 +17,8 @@ from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
 from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
+from mitsplat.fit.image_metrics import psnr, ssim
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.image_metrics import psnr, ssim
 from mitsplat.plugins.backward import render_differentiable
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.sensors import view_of

@@ -20,17 +20,8 @@ from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.placement import Item, draw_poses, fixed_pose
-from mitsplat.physics.worlds import (
-    OVERFLOW,
-    Body,
-    Collider,
-    MujocoWorld,
-    Outcome,
-    WarpWorld,
-    World,
-    all_pieces,
-    run_to_rest,
-)
+from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
+from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene

@@ -26,7 +26,7 @@ from mitsplat.warp_start import quiet_warp
 
 PACKAGE = Path(__file__).parents[1]
 
-_OWN = ("contacts", "drop", "friction", "placement", "worlds")
+_OWN = ("contacts", "drop", "friction", "placement", "rest", "worlds")
 MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.streams", "scene.walls")
 """Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
@@ -19,14 +18,14 @@ from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
-from mitsplat.physics.placement import Item, draw_poses, fixed_pose
+from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
@@ -173,7 +172,7 @@ class Drop:
         given: list[Float64Array | None] = []
         for position, entry in enumerate(self.scene.spec.objects):
             count = int(counts.integers(*entry.count, endpoint=True))
-            poses: list[Float64Array | None] = [fixed_pose(pose) for pose in entry.poses]
+            poses: list[Float64Array | None] = [stated_pose(pose) for pose in entry.poses]
             poses = poses or [None] * count
             assets += [position] * len(poses)
             given += poses
@@ -242,10 +241,7 @@ class Drop:
             elif shape.box is None:
                 collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
             else:
-                pose = np.eye(4)
-                pose[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
-                pose[:3, 3] = shape.box.position
-                collider = Collider(shape.friction, box=(shape.box.size, pose))
+                collider = Collider(shape.friction, box=(shape.box.size, stated_pose(shape.box)))
             self._colliders.append(collider)
             self._obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
         surroundings = scene.environment
@@ -263,7 +259,7 @@ class Drop:
         keys: dict[PlacedSurface, str] = {}
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
-                keys[self._placed(entry, fixed_pose(pose))] = f"objects[{entry}].poses[{number}]"
+                keys[self._placed(entry, stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
         for pair in all_clearances(list(keys), self._obstacles, reach=_REACH):
             if -pair.distance > _DEEPEST_GIVEN:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")

@@ -52,7 +52,7 @@ from mitsplat.scene.spec import (
 )
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.untrusted_images import check_image
-from mitsplat.scene.walls import bin_walls, enclosure_walls
+from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
 from mitsplat.yaml_input import key_place, load_yaml
 
 __all__ = [
@@ -355,10 +355,7 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
         return walls
     if shape.box is None:
         return read_mesh(folder / str(shape.mesh))
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
-    transform[:3, 3] = shape.box.position
-    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
+    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=stated_pose(shape.box))
     return box
 
 

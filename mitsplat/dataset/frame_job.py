@@ -20,15 +20,14 @@ from mitsplat.files import Record, link_file, storage_errors, write_file, write_
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import layout_of
+from mitsplat.scene.scene import Scene, layout_of
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame
-    from mitsplat.scene.scene import Scene
 
 Render = Callable[..., "Frame"]
 """As :func:`mitsplat.frames.frame.render_frame`."""
-Settle = Callable[..., "Layout"]
+Settle = Callable[..., Layout]
 """As :func:`mitsplat.physics.settle.settle_layout`."""
 
 

@@ -27,14 +27,13 @@ from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mitsplat.dataset.folder import RUNS, SHEET, TIMINGS, Shard, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.prospects import refuse, run_faults
 from mitsplat.engine.pool import run_frames
-from mitsplat.engine.ray import run_on_ray
+from mitsplat.engine.ray import Cluster, run_on_ray
 from mitsplat.engine.resources import TYPICAL
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, storage_errors
@@ -43,11 +42,7 @@ from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note, Progress
-from mitsplat.scene.scene import layout_of
-
-if TYPE_CHECKING:
-    from mitsplat.engine.ray import Cluster
-    from mitsplat.scene.scene import Scene
+from mitsplat.scene.scene import Scene, layout_of
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mitsplat.camera import Camera
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.plugins.tiles import PAIRS_MAX
 from mitsplat.quality import resolve_quality
-from mitsplat.scene.scene import plan_frame
-
-if TYPE_CHECKING:
-    from mitsplat.camera import Camera
-    from mitsplat.scene.scene import Scene
-    from mitsplat.splats import Splats
+from mitsplat.scene.scene import Scene, plan_frame
+from mitsplat.splats import Splats
 
 BASE = 2**30
 """Python, libraries, compiled kernels and the simulation of a layout [bytes]."""

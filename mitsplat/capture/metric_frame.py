@@ -47,7 +47,7 @@ _TILT = np.cos(np.radians(30))
 
 
 @dataclass(frozen=True, eq=False)
-class Anchor:
+class MetricFrame:
     """Where a reconstruction is put.
 
     Attributes:
@@ -73,7 +73,7 @@ class Anchor:
     board: Float64Array | None = None
 
 
-def find_anchor(
+def find_metric_frame(
     model: SparseModel,
     images: Mapping[str, Path],
     *,
@@ -81,7 +81,7 @@ def find_anchor(
     tag: float | None = None,
     scale_from: tuple[str, str, float] | None = None,
     centred: bool = True,
-) -> Anchor:
+) -> MetricFrame:
     """Find scale and gravity by the best evidence there is.
 
     A ChArUco board decides both; so do AprilTags of known size; then ``scale_from`` the scale and the largest plane
@@ -164,7 +164,7 @@ def find_anchor(
     if board_pose is not None:
         board_pose = matrix @ board_pose
         board_pose[:3, :3] /= factor
-    return Anchor(
+    return MetricFrame(
         matrix=matrix,
         units="metre" if scale else "unknown",
         up="unknown" if plane is None else "z",

@@ -47,7 +47,7 @@ class HeldOut:
     psnr_corrected: float
 
 
-class Sight:
+class TrainingView:
     """A photo at one size.
 
     Args:
@@ -76,9 +76,9 @@ class Sight:
         self._depths: tuple[Any, Any] | None = None
 
     @cached_property
-    def half(self) -> Sight:
+    def half(self) -> TrainingView:
         """The same photo at half the size."""
-        return Sight(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
+        return TrainingView(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
 
     @cached_property
     def view(self) -> Any:

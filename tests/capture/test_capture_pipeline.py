@@ -24,7 +24,7 @@ from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import agreed_masks, geometric_masks, object_points
-from mitsplat.capture.metric_frame import find_anchor, fit_similarity
+from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
 from mitsplat.capture.photos import prepare_photos
 from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
@@ -346,7 +346,7 @@ def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
     given, _, result = captured
     model = model_of(result.capture)
     images = {photo.file.name: photo.file for photo in result.capture.photos}
-    seen, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed - {"photo03.png"})
+    seen, *_ = sorted(find_metric_frame(model, images, board=rendered.BOARD).confirmed - {"photo03.png"})
     model = replace(model, agreement=dict.fromkeys(model.cameras, 0.98) | {"photo03.png": 0.4, seen: 0.6})
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
     assert run("capture", given, "-o", tmp_path / "sure", "--square", 0.035, "--kind", "environment") == 0
@@ -371,7 +371,7 @@ def test_a_camera_that_the_board_contradicts_is_left_out(
     given, _, result = captured
     model = model_of(result.capture)
     images = {photo.file.name: photo.file for photo in result.capture.photos}
-    seen, doubted, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed)
+    seen, doubted, *_ = sorted(find_metric_frame(model, images, board=rendered.BOARD).confirmed)
     pose = model.cameras[seen].world_from_camera.copy()
     pose[:3, 3] += (0.02, 0, 0)
     cameras = {**model.cameras, seen: replace(model.cameras[seen], world_from_camera=pose)}

@@ -21,6 +21,7 @@ from mitsplat.labels.labels import Labels
 from mitsplat.masks import Box
 
 if TYPE_CHECKING:
+    from mitsplat.formats.format import FrameFiles
     from mitsplat.frames.frame import Frame
 
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
@@ -30,7 +31,41 @@ UNKNOWN_FLOW = 1e10
 """Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
 
 
-def write_exr(path: Path, frame: Frame) -> None:
+def write_instances(files: FrameFiles) -> None:
+    """Write the ids of a frame's labelled instances."""
+    files.add_png(f"instances/{files.name}.png", files.labelled)
+
+
+def write_semantic(files: FrameFiles) -> None:
+    """Write a frame's classes."""
+    picture = semantic_picture(files.frame.labels, files.ids, files.catalogue.class_names)
+    files.add_png(f"semantic/{files.name}.png", picture)
+
+
+def write_depth(files: FrameFiles) -> None:
+    """Write a frame's depth."""
+    files.add_png(f"depth/{files.name}.png", files.depth)
+
+
+def write_normals(files: FrameFiles) -> None:
+    """Write a frame's normals."""
+    files.add_png(f"normals/{files.name}.png", normal_picture(files.frame.normal))
+
+
+def write_flow(files: FrameFiles) -> None:
+    """Write the flow to the next view of the frame's layout, if there is one."""
+    frame = files.frame
+    if frame.plan.next_camera is not None:
+        flow = optical_flow(frame.depth, frame.camera, frame.plan.next_camera)
+        files.add_bytes(f"flow/{files.name}.flo", encode_flow(flow))
+
+
+def write_exr(files: FrameFiles) -> None:
+    """Write the layers of a frame."""
+    files.add(f"layers/{files.name}.exr", lambda path: save_exr(path, files.frame))
+
+
+def save_exr(path: Path, frame: Frame) -> None:
     """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
     names = {"depth": "Z", "alpha": "A"}
     axes = {"normal": "XYZ"}
@@ -173,8 +208,8 @@ def optical_flow(depth: npt.NDArray[np.floating[Any]], camera: Camera, following
     return flow.reshape(height, width, 2).astype(np.float32)
 
 
-def write_flow(path: Path, flow: Float32Array) -> None:
-    """Write optical flow (H, W, 2) as Middlebury's ``.flo``: a tag, width, height, then pairs of floats."""
+def encode_flow(flow: Float32Array) -> bytes:
+    """Optical flow (H, W, 2) as Middlebury's ``.flo``: a tag, width, height, then pairs of floats."""
     height, width = flow.shape[:2]
     header = b"PIEH" + np.array([width, height], dtype="<i4").tobytes()
-    path.write_bytes(header + np.ascontiguousarray(flow, dtype="<f4").tobytes())
+    return header + np.ascontiguousarray(flow, dtype="<f4").tobytes()

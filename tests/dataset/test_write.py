@@ -230,7 +230,7 @@ class TestSameBytes:
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as patch, pytest.raises(MissingResourceError, match=r"No space .*: make room"):
-            patch.setattr("mitsplat.formats.registry.yolo_lines", fail)
+            patch.setattr("mitsplat.formats.yolo.yolo_lines", fail)
             write(scene, out)
         assert (out / "images/train/000000.png").is_file()
         assert not list(out.rglob("*.txt"))

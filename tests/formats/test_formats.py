@@ -339,6 +339,7 @@ class TestCoco:
                 for label, entry in zip(frame.labels.instances, frames[frame.index]["instances"], strict=True):
                     expected = CAMERA.camera_from_world @ label.world_from_object
                     np.testing.assert_allclose(entry["camera_from_object"], expected, atol=1e-12)
+                    assert entry["object"] == label.asset
 
 
 class TestVoc:

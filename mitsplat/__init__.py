@@ -58,8 +58,8 @@ if TYPE_CHECKING:
     from mitsplat.render.layers import render_splats as render_splats
     from mitsplat.scene.layout import Layout as Layout
     from mitsplat.scene.scene import Scene as Scene
-    from mitsplat.scene.scene import SceneSpec as SceneSpec
     from mitsplat.scene.scene import load_scene as load_scene
+    from mitsplat.scene.spec import SceneSpec as SceneSpec
     from mitsplat.splats import Splats as Splats
 
 

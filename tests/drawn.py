@@ -13,7 +13,8 @@ from mitsplat.asset import Asset
 from mitsplat.labels.labels import LabelRules, Truth, label_instances
 from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.scene import plan_frame, random_stream
+from mitsplat.scene.scene import plan_frame
+from mitsplat.scene.streams import random_stream
 from tests.conftest import box_asset
 from tests.synthetic import CERTIFICATE, frame_around
 

@@ -26,28 +26,15 @@ from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.spec import (
     SCHEMA_VERSION,
-    AreaLight,
-    Bin,
-    Box,
     CameraHemisphere,
     CameraOrbit,
-    CameraPath,
-    CameraSpec,
-    Composite,
-    Enclosure,
     EnvironmentLight,
     Intrinsics,
-    LightKey,
     LightSpec,
-    ObjectPose,
-    ObjectSpec,
     Output,
     PointLight,
-    PoseKey,
-    Randomise,
     Region,
     SceneSpec,
-    Settle,
     Shape,
     SpotLight,
 )
@@ -55,42 +42,6 @@ from mitsplat.scene.streams import random_stream
 from mitsplat.scene.untrusted_images import check_image
 from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
 from mitsplat.yaml_input import key_place, load_yaml
-
-__all__ = [
-    "AreaLight",
-    "Bin",
-    "Box",
-    "CameraHemisphere",
-    "CameraOrbit",
-    "CameraPath",
-    "CameraSpec",
-    "Composite",
-    "Enclosure",
-    "EnvironmentLight",
-    "FramePlan",
-    "Intrinsics",
-    "LightKey",
-    "LightSpec",
-    "ObjectPose",
-    "ObjectSpec",
-    "Output",
-    "PointLight",
-    "PoseKey",
-    "Randomise",
-    "Region",
-    "Scene",
-    "SceneSpec",
-    "Settle",
-    "Shape",
-    "SpotLight",
-    "bin_walls",
-    "layout_of",
-    "load_scene",
-    "plan_frame",
-    "random_stream",
-    "scene_json_schema",
-]
-
 
 _DRAWN = (
     *("exposure", "vignetting", "motion_blur", "motion_angle", "iso"),

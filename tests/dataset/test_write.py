@@ -26,7 +26,8 @@ from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
 from mitsplat.labels.overlay import class_colour, draw_labels
 from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.scene import load_scene, plan_frame, random_stream
+from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.streams import random_stream
 from tests.synthetic import CERTIFICATE, frame_around
 
 PARSE_LINE = manifest.parse_line

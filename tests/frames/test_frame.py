@@ -20,7 +20,8 @@ from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.quality import PRESETS
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
-from mitsplat.scene.scene import FramePlan, LightSpec
+from mitsplat.scene.scene import FramePlan
+from mitsplat.scene.spec import LightSpec
 from tests.conftest import WriteScene
 from tests.render.test_render import make_splats
 

@@ -62,7 +62,7 @@ def test_constraints_pin_every_dependency() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    needed = [Requirement(line) for line in project["dependencies"] + extras["test"] + extras["dev"]]
+    needed = [Requirement(line) for line in project["dependencies"] + extras["test"] + extras["dev"] + extras["docs"]]
     lines = (line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#"))
     pinned = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
     for requirement in needed:

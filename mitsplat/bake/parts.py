@@ -122,7 +122,7 @@ def read_parts(
         linear = path.suffix.lower() in (".glb", ".gltf")
         try:
             mesh = trimesh.load_scene(mesh)
-        except (ValueError, TypeError, KeyError, OSError, NotImplementedError) as error:
+        except (ValueError, TypeError, KeyError, OSError, ImportError, NotImplementedError) as error:
             raise InputError(f"{source}: not a mesh that can be read ({error})") from error
     if not (metres_per_unit > 0 and np.isfinite(metres_per_unit)):
         raise InputError(f"{source}: metres_per_unit must be > 0 (got {metres_per_unit})")

@@ -66,11 +66,16 @@ def _mean_radiance(
         sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(directions))
     spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
-    radiance, hit = mi.Color3f(dr.select(valid, spectrum, 0.0)), dr.select(valid, mi.Float(1), 0)
+    # A path that meets a sliver may end in no number, a few of ten million in drawings: the mean is of the others.
+    finite = dr.all(dr.isfinite(spectrum))
+    radiance = mi.Color3f(dr.select(valid & finite, spectrum, 0.0))
+    hit, number = (dr.select(which, mi.Float(1), 0) for which in (valid, finite))
     # Together: what is left for later would trace all paths again.
-    dr.eval(radiance, hit)
-    sums = [np.asarray(dr.block_sum(channel, samples), dtype=np.float64) / samples for channel in (*radiance, hit)]
-    return np.stack(sums[:3], axis=1), sums[3]
+    dr.eval(radiance, hit, number)
+    *sums, hits, numbers = (
+        np.asarray(dr.block_sum(channel, samples), dtype=np.float64) for channel in (*radiance, hit, number)
+    )
+    return np.stack(sums, axis=1) / np.maximum(numbers, 1.0)[:, None], hits / samples
 
 
 def render_mesh(

@@ -299,7 +299,8 @@ def settle(
     with Console(stderr=True).status("settling") as status:
         found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
         settled = sorted(found, key=lambda layout: layout.index)
-    Console().print(certificate_table(settled))
+    # In 80 columns, as where output goes to a file, its headings would be cut to a letter or two.
+    Console(width=max(Console().width, 120)).print(certificate_table(settled))
     if preview:
         pictures = write_preview(loaded, settled[0], out)
         typer.echo(f"drop: {out} ({pictures} pictures)")

@@ -232,6 +232,16 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
     )
 
 
+def test_slivers_have_normals_too() -> None:
+    """CAD files are full of them; a ray that meets one without a normal gives no number, and no splats."""
+    corners = np.array([(0, 0, 0), (0.01, 0, 0), (0.005, 1e-13, 0), (0.005, 0, 0.01)])
+    mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+    assert not mesh.face_normals[0].any()
+    np.testing.assert_allclose(corner_normals(mesh)[0], [(0, 0, 1)] * 3, atol=1e-9)
+    needle = trimesh.Trimesh([(0, 0, 0), (0, 0, 0), (0, 0, 0)], [(0, 1, 2)], process=False)
+    np.testing.assert_allclose(np.linalg.norm(corner_normals(needle), axis=2), 1)
+
+
 def test_studio_has_mean_radiance_one() -> None:
     ball = white(trimesh.creation.icosphere(2, 0.02))
     scene = mitsuba_scene(read_parts(ball), bake_lights("studio"))

@@ -11,6 +11,7 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.plugins.sensors import view_of
 from mitsplat.render.layers import make_sensor
 
 RAYS_PER_LAUNCH = 1 << 21
@@ -85,8 +86,6 @@ def render_mesh(
     ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it
     is encoded, because the mean of encoded noise is too dark. Only the background counts encoded, as splats blend.
     """
-    from mitsplat.plugins.splat_proxy import view_of
-
     view, side = view_of(make_sensor(camera)), max(1, round(samples**0.5))
     samples, pixels = side * side, camera.width * camera.height
     across, width = dr.opaque(mi.UInt32, side), dr.opaque(mi.UInt32, camera.width)

@@ -38,7 +38,7 @@ from mitsplat.frames import speed_accuracy as chart
 from mitsplat.physics import settle
 from mitsplat.reconstruct import pipeline
 from mitsplat.reconstruct.evaluation import Verdict
-from mitsplat.reconstruct.pipeline import Finished
+from mitsplat.reconstruct.pipeline import AssetResult
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
@@ -588,12 +588,12 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
 
 
-def finished(folder: Path, **changes: Any) -> Finished:
+def finished(folder: Path, **changes: Any) -> AssetResult:
     figures = Verdict(
         photos=9, rejected=1, psnr=27.0, psnr_object=26.0, splat_iou=0.97, mesh_iou=0.96, offset=0.001, spread=0.001,
         lost=0.0, scale_error=None, units="metre", gaussians=12, faces=99, watertight=True, solid=True,
     )  # fmt: skip
-    return Finished(folder, replace(figures, **changes), kept=False)
+    return AssetResult(folder, replace(figures, **changes), kept=False)
 
 
 def test_mesh_passes_every_option_on(

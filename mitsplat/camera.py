@@ -5,7 +5,7 @@ Conventions are those of :mod:`mitsplat.splats`: x right, y down, z forward in t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -127,6 +127,32 @@ class Camera:
             distortion=tuple(float(c) for c in distortion),
             near=near,
         )
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Camera:
+        """The camera that :meth:`to_json` described.
+
+        Raises:
+            ValueError: If it is none that could be.
+        """
+        ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
+        same = ("width", "height", "world_from_camera", "near", "lens", "aperture_radius", "focus_distance")
+        known = {key: stored[key] for key in same}
+        return cls(fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(stored["distortion"]), **known)
+
+    def to_json(self) -> dict[str, Any]:
+        """The camera as JSON values, as datasets state it; floats survive the round trip exactly."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "intrinsics": self.intrinsics.tolist(),
+            "distortion": list(self.distortion),
+            "lens": self.lens,
+            "aperture_radius": self.aperture_radius,
+            "focus_distance": self.focus_distance,
+            "near": self.near,
+            "world_from_camera": self.world_from_camera.tolist(),
+        }
 
     @property
     def intrinsics(self) -> Float64Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import zipfile
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 
 _logger = logging.getLogger(__name__)
@@ -164,10 +164,7 @@ def convex_pieces(mesh: trimesh.Trimesh, *, threshold: float = 0.02) -> tuple[tr
 
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float) -> tuple[trimesh.Trimesh, ...]:
-    digest = hashlib.sha256(b"pieces 3")
-    digest.update(f"{version('coacd')} {threshold!r}".encode())
-    digest.update(vertices)
-    digest.update(faces)
+    digest = ContentHash("pieces 3", f"{version('coacd')} {threshold!r}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:

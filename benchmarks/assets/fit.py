@@ -16,6 +16,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.record import figure, recording
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
@@ -33,6 +34,11 @@ def main() -> None:
     parser.add_argument("--gsplat", action="store_true")
     args = parser.parse_args()
     mi.set_variant(args.variant)
+    with recording("assets.fit", parser, args, gpu=args.variant.startswith("cuda")):
+        compare(args)
+
+
+def compare(args: argparse.Namespace) -> None:
     capture = Capture.load(args.capture)
     settings = FitSettings(
         gaussians=args.gaussians,
@@ -48,10 +54,20 @@ def main() -> None:
     print("fit                  s      PSNR    SSIM   Gaussians")
     with tempfile.TemporaryDirectory() as folder:
         own = fit_capture(capture, folder, settings)
+    keep("mitsplat", own.seconds, own.psnr, own.ssim, len(own.splats))
     print(f"mitsplat {args.variant} {own.seconds:7.1f} {own.psnr:7.2f} {own.ssim:7.4f} {len(own.splats)}")
     if args.gsplat:
         seconds, psnr, ssim, count = fit_with_gsplat(capture, settings)
+        keep("gsplat", seconds, psnr, ssim, count)
         print(f"gsplat               {seconds:7.1f} {psnr:7.2f} {ssim:7.4f} {count}")
+
+
+def keep(name: str, seconds: float, psnr: float, ssim: float, count: int) -> None:
+    """Record a row."""
+    figure(seconds, "s", name, "seconds")
+    figure(psnr, "dB", name, "psnr")
+    figure(ssim, "", name, "ssim")
+    figure(count, "", name, "gaussians")
 
 
 def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, float, float, int]:

@@ -11,7 +11,6 @@ The manifest and the files that describe all frames are read in step, a frame at
 
 from __future__ import annotations
 
-import hashlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +31,7 @@ from mitsplat.audit.owned import Owned, check_listed
 from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
 from mitsplat.audit.scene import SceneReader
 from mitsplat.audit.truth import TrueFrame
+from mitsplat.content_hash import file_hash
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import SPLITS, Record
 
@@ -139,9 +139,8 @@ def _check_files(root: Path, record: Record) -> Violations:
         if not (root / file).is_file():
             yield file, "is missing"
             continue
-        with (root / file).open("rb") as stored:
-            if hashlib.file_digest(stored, "sha256").hexdigest() != digest:
-                yield file, "is not what was written: its SHA-256 differs from the manifest's"
+        if file_hash(root / file) != digest:
+            yield file, "is not what was written: its SHA-256 differs from the manifest's"
 
 
 def _check_rest(root: Path) -> Violations:

@@ -97,7 +97,7 @@ class LayersReader:
         room = _FLOW_ROUNDED + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
         found = flow.reshape(-1, 2)[known]
         stated = (np.abs(found) < _KNOWN_FLOW).all(axis=1)
-        in_front = ahead[known] > frame.record["camera"].get("near", 0.01) + step
+        in_front = ahead[known] > frame.record["camera"]["near"] + step
         wrong = in_front & (~stated | (np.abs(found - expected).max(axis=1) > room))
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels do not move as depth and cameras say"

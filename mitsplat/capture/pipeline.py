@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from mitsplat.capture.overview import capture_sheet
 from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, Model, find_cameras
 from mitsplat.capture.targets import Board
+from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.progress import Progress
@@ -222,17 +222,12 @@ def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
     """What decides a capture, in JSON."""
-
-    def digest(path: Path) -> str:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
     given = [path for path in (settings.poses, settings.masks, settings.mask_model) if path is not None]
     others = [path for place in given for path in (sorted(place.rglob("*")) if place.is_dir() else [place])]
     return {
-        "photos": {path.relative_to(photos).as_posix(): digest(path) for path in files},
+        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},
         "settings": json.loads(json.dumps(asdict(settings), default=str)),
-        "files": {str(path): digest(path) for path in others if path.is_file()},
+        "files": {str(path): file_hash(path) for path in others if path.is_file()},
     }
 
 

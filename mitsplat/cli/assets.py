@@ -87,9 +87,8 @@ def bake(
 
     if out.exists() and not out.is_dir():
         raise InputError(f"--out must be a folder (got the file {out})")
-    for option, value in (("--units", units), ("--density", density), ("--friction", friction)):
-        if not 0 < value < math.inf and not (value == 0 and option == "--friction"):
-            raise InputError(f"{option} must be finite and > 0 (got {value})")
+    if not 0 < units < math.inf:
+        raise InputError(f"--units must be finite and > 0 (got {units})")
     if seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")
     settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)

@@ -6,7 +6,6 @@ see :mod:`mitsplat.fit.folder`.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import add_content
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps
 from mitsplat.fit.folder import FitFolder, FitResult
 from mitsplat.fit.initial_points import seed_points
@@ -437,17 +436,17 @@ def _sight(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None =
 
 def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
     """SHA-256 of everything that decides a fit."""
-    digest = hashlib.sha256(json.dumps([__version__, asdict(settings)], sort_keys=True).encode())
+    digest = ContentHash()
+    digest.add_json([__version__, asdict(settings)])
     for photo in capture.photos:
         camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
-        digest.update(json.dumps([photo.name, camera]).encode())
-        digest.update(np.ascontiguousarray(photo.seen).tobytes())
+        digest.add(json.dumps([photo.name, camera]), np.ascontiguousarray(photo.seen).tobytes())
         for file in (photo.file, photo.mask):
-            digest.update(b"-" if file is None else file.read_bytes())
-    digest.update(capture.points.tobytes() + capture.colours.tobytes())
+            digest.add(b"-" if file is None else file.read_bytes())
+    digest.add(capture.points.tobytes(), capture.colours.tobytes())
     if depths is not None:
-        digest.update(depths.kind.encode())
+        digest.add(depths.kind)
         for name, file in sorted(depths.files.items()):
-            digest.update(name.encode())
-            add_content(digest, file)
+            digest.add(name)
+            digest.add_file(file)
     return digest.hexdigest()

@@ -26,7 +26,6 @@ from scipy.spatial.distance import pdist
 
 from mitsplat.camera import Camera
 from mitsplat.files import GrowingFile, Record, write_file, write_text
-from mitsplat.formats.coco import camera_of
 from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.json_stream import EntriesFile
@@ -85,7 +84,7 @@ class ScenesWriter:
             self._files = {
                 part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
             }
-        index, camera = str(record["index"]), camera_of(record)
+        index, camera = str(record["index"]), Camera.from_json(record["camera"])
         self._files["camera"].append(index, camera_entry(record, camera))
         self._files["gt"].append(index, pose_entries(record, camera))
         self._files["gt_info"].append(index, info_entries(record))

@@ -8,7 +8,8 @@
     Every pixel's segment, id = R + 256 G + 256² B; the environment is a segment of stuff, and what belongs to an
     instance without a label is void (id 0).
 ``annotations/poses_<split>.json``
-    Cameras, and the rigid transforms of the instances, in metres.
+    Cameras, and the rigid transforms of the instances, in metres. ``object`` is the position of an instance's entry
+    among the scene's ``objects``, from 0: names of assets may be given twice.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
 
 def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
     """Camera and 6-DoF poses of a frame."""
-    camera_from_world = camera_of(record).camera_from_world
+    camera_from_world = Camera.from_json(record["camera"]).camera_from_world
     return {
         **_image(record),
         "camera": record["camera"],
@@ -89,6 +90,7 @@ def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
             {
                 "id": label["id"],
                 "class": label["class"],
+                "object": label["asset"],
                 "asset": assets[label["asset"]],
                 "camera_from_object": (camera_from_world @ np.array(label["world_from_object"])).tolist(),
                 "world_from_object": label["world_from_object"],
@@ -210,15 +212,6 @@ def panoptic_image(
     if environment is not None:
         segments[ids == 0] = environment["id"]
     return np.stack([segments & 255, segments >> 8 & 255, segments >> 16], axis=-1).astype(np.uint8)
-
-
-def camera_of(record: Record) -> Camera:
-    """The camera that a record states."""
-    stored = record["camera"]
-    ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
-    pose, distortion = np.array(stored["world_from_camera"]), tuple(stored["distortion"])
-    lens = {key: stored[key] for key in ("lens", "aperture_radius", "focus_distance")}
-    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, distortion, **lens)
 
 
 def image_file(record: Record) -> str:

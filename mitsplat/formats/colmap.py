@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
 from mitsplat.files import GrowingFile, Record
-from mitsplat.formats.coco import camera_of, image_file
+from mitsplat.formats.coco import image_file
 from mitsplat.formats.format import Catalogue
 
 
@@ -27,7 +27,7 @@ class ModelWriter:
 
     def add(self, record: Record) -> None:
         """Describe a frame."""
-        camera = camera_of(record)
+        camera = Camera.from_json(record["camera"])
         model = camera_model(camera)
         if model not in self._models:
             self._models[model] = len(self._models) + 1

@@ -149,9 +149,11 @@ class Format:
     """A label format.
 
     Attributes:
+        entries: Names of its files and folders in the dataset's own folder.
         write: Writes the files of a frame.
         describe: Makes what writes the files that describe all frames.
     """
 
+    entries: tuple[str, ...]
     write: Callable[[FrameFiles], None] | None = None
     describe: Callable[[Path, Catalogue], Describer] | None = None

@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,7 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.files import SPLITS, Record, write_text
-from mitsplat.formats.format import Catalogue, FrameFiles
+from mitsplat.formats.format import Catalogue, Format, FrameFiles
 from mitsplat.labels.labels import UNLABELLED, InstanceLabel, Labels
 
 
@@ -35,6 +36,12 @@ class Task:
 
     folder: str
     numbers: Callable[[InstanceLabel], Float64Array]
+
+
+def format_of(task: str) -> Format:
+    """The format of a task."""
+    entries = (TASKS[task].folder.rstrip("/"),) if TASKS[task].folder else ("labels", "data.yaml")
+    return Format(entries, partial(write, task=task), partial(DataYaml, task=task))
 
 
 def write(files: FrameFiles, task: str) -> None:

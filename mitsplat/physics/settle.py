@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 from collections.abc import Callable, Iterable, Iterator
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 from mitsplat.progress import Note
 from mitsplat.scene.layout import Layout
@@ -117,21 +117,21 @@ def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> It
 def _scene_hash(scene: Scene) -> str:
     """Hash of what decides where the objects of a scene come to rest."""
     spec = scene.spec
-    digest = hashlib.sha256()
+    digest = ContentHash()
 
     def add(*values: object) -> None:
-        digest.update(repr(values).encode())
+        digest.add(repr(values))
 
     def add_mesh(mesh: trimesh.Trimesh | None) -> None:
         if mesh is not None:
             for array in (mesh.vertices, mesh.faces):
                 add(array.shape)
-                digest.update(np.ascontiguousarray(array).tobytes())
+                digest.add(np.ascontiguousarray(array).tobytes())
 
     for name in LIBRARIES:
         add(name, version(name))
     for module in MODULES:
-        digest.update((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
+        digest.add((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
     for mesh in scene.shape_meshes:

@@ -6,15 +6,16 @@ own inputs. The last stage is kept by a hash of everything that decides it, in `
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsplat.capture.capture import Capture
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import add_content, write_text
+from mitsplat.files import write_text
+from mitsplat.fit.folder import FIT_FILE, read_record
 from mitsplat.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import VERDICT_FILE, Verdict
@@ -86,14 +87,13 @@ def read_fit(path: Path) -> tuple[Path, float | None]:
     """
     if not path.is_dir():
         return path, None
-    record = path / "fit.json"
+    record = path / FIT_FILE
     try:
-        psnr = json.loads(record.read_text())["psnr"]
-    except FileNotFoundError:
-        raise InputError(f"{record}: no such file: has the fit finished?") from None
-    except (ValueError, KeyError, TypeError) as error:
+        psnr = read_record(record)["psnr"]
+        known = None if psnr is None else float(psnr)
+    except (KeyError, TypeError) as error:
         raise InputError(f"{record}: not the record of a fit ({error})") from error
-    return path / "splats.ply", None if psnr is None else float(psnr)
+    return path / "splats.ply", known
 
 
 def make_photo_asset(
@@ -197,14 +197,15 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
     if job.imported is not None:
         matrix = job.imported.capture_from_mesh
         imported = [
-            hashlib.sha256(job.imported.mesh.vertices.tobytes() + job.imported.mesh.faces.tobytes()).hexdigest(),
+            ContentHash(job.imported.mesh.vertices.tobytes(), job.imported.mesh.faces.tobytes()).hexdigest(),
             None if matrix is None else matrix.tolist(),
             job.imported.metres_per_unit,
         ]
     decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported]
-    digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
+    digest = ContentHash()
+    digest.add_json(decisive)
     for path in (*_files(folder, capture), splats):
-        add_content(digest, path)
+        digest.add_file(path)
     return digest.hexdigest()
 
 

@@ -26,6 +26,7 @@ from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.spec import (
+    SCHEMA_VERSION,
     AreaLight,
     Bin,
     Box,
@@ -267,7 +268,8 @@ def random_stream(seed: int, purpose: str, index: int) -> np.random.Generator:
 
 def scene_json_schema() -> dict[str, Any]:
     """JSON Schema of a scene file, for editors."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
+    named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:mitsplat:scene:{SCHEMA_VERSION}"}
+    return {**named, **SceneSpec.model_json_schema()}
 
 
 @contextmanager

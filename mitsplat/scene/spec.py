@@ -14,6 +14,10 @@ from mitsplat.camera import Lens
 from mitsplat.quality import KernelName, PresetName, ResponseName
 from mitsplat.yaml_input import FieldError
 
+SCHEMA_VERSION = 1
+"""Goes up when a scene file that was right is refused or means something else. Scene files, which people write, state
+none: what is new to them are keys, and an unknown key is refused by its name."""
+
 
 class StrictModel(BaseModel):
     """Immutable, without unknown keys, infinities or NaN."""

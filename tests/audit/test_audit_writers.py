@@ -6,6 +6,7 @@ import ast
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -108,8 +109,6 @@ class Swapped(Rotation):
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Any:
-        from types import SimpleNamespace
-
         x, y, z, w = Rotation.from_matrix(matrix).as_quat()
         return SimpleNamespace(as_quat=lambda: (w, x, y, z))
 
@@ -119,8 +118,8 @@ def with_camera(change: Callable[[camera.Camera], Any]) -> Patch:
 
     def patch(monkeypatch: pytest.MonkeyPatch) -> None:
         for owner in (coco, bop, colmap):
-            real = owner.camera_of
-            monkeypatch.setattr(owner, "camera_of", lambda record, real=real: change(real(record)))
+            read = SimpleNamespace(from_json=lambda stored: change(camera.Camera.from_json(stored)))
+            monkeypatch.setattr(owner, "Camera", read)
 
     return patch
 
@@ -231,6 +230,16 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "poses: world for camera": ("poses", with_camera(world_for_camera), POSES, "camera_from_object is not"),
     "poses: millimetres": ("poses", with_camera(millimetres_for_metres), POSES, "camera_from_object is not"),
+    "poses: objects from one": (
+        "poses",
+        entry(
+            coco,
+            "pose_entry",
+            lambda e: [instance.update(object=instance["object"] + 1) for instance in e["instances"]],
+        ),
+        POSES,
+        "object is",
+    ),
     "voc: pixels from zero": (
         "voc",
         changing(voc, "annotation", lambda made, *args: made.replace("<xmin>", "<xmin>1")),
@@ -473,3 +482,13 @@ def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
     words[8], words[9] = words[9], words[8]
     path.write_text(" ".join(words) + "\n")
     assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}
+
+
+def test_a_lens_focused_nearer_than_cameras_see_by_default(tmp_path: Path) -> None:
+    """Formats and audit make the camera of a record anew, ``near`` included, without which it could not be focused."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
+    lens = Intrinsics(fov_x=60.0, aperture=0.002, focus=0.008, near=0.004)
+    seen = scene.spec.camera.model_copy(update={"intrinsics": lens})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))
+    out = write(scene, tmp_path / "out", ["bop", "colmap", "poses"])
+    assert audit_dataset(out).violations == ()

@@ -310,7 +310,7 @@ def test_bake_takes_every_option(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("options", "sentence"),
     [
         (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
-        (["--density", "nan"], "--density must be finite and > 0 (got nan)"),
+        (["--density", "nan"], "density must be a number > 0 in kg/m^3 (got nan)"),
         (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
         (["--gaussians", "0"], "gaussians must be at least 1 (got 0)"),
     ],

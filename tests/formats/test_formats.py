@@ -23,7 +23,7 @@ from ruamel.yaml import YAML
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.formats import coco, maps
+from mitsplat.formats import coco, maps, voc
 from mitsplat.formats.registry import Catalogue, write_collection, write_frame
 from mitsplat.formats.yolo import rotated_box
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
@@ -342,6 +342,7 @@ class TestCoco:
                 for label, entry in zip(frame.labels.instances, frames[frame.index]["instances"], strict=True):
                     expected = CAMERA.camera_from_world @ label.world_from_object
                     np.testing.assert_allclose(entry["camera_from_object"], expected, atol=1e-12)
+                    assert entry["object"] == label.asset
 
 
 class TestVoc:
@@ -376,6 +377,23 @@ class TestVoc:
         assert flags_of("seen through a hole", 0) == ("1", "1")
         assert flags_of("cut in two", 0) == ("0", "1")
         assert flags_of("two of a class touch", 1) == ("0", "0")
+
+    @pytest.mark.parametrize(
+        ("seen", "boxed", "whole", "flags"),
+        [
+            (95, 100, 100, (False, False)),
+            (94, 100, 100, (False, True)),
+            (17, 17, 20, (False, False)),
+            (16, 16, 20, (True, False)),
+        ],
+    )
+    def test_shares_at_the_limits_set_no_flag(
+        self, seen: int, boxed: int, whole: int, flags: tuple[bool, bool]
+    ) -> None:
+        """5 % hidden and 15 % beyond the box are not more than that, though 1 - 95/100 > 0.05 in floating point."""
+        amodal = SimpleNamespace(box=(3, 4, 3 + boxed, 5), mask=np.ones((1, boxed), dtype=bool))
+        label = SimpleNamespace(box=amodal.box, amodal=amodal, area=seen, silhouette_area=whole)
+        assert voc.flags(label) == flags  # type: ignore[arg-type]
 
     def test_splits_and_classes(self, written: Written) -> None:
         for split in ("train", "val"):

@@ -117,19 +117,9 @@ def test_frame_is_remade_from_its_record(
     (tmp_path / "labels" / frame.plan.split).mkdir(parents=True)
     record = json.loads(json.dumps(write_frame(frame, tmp_path, first.spec, Catalogue.of(first))))
 
-    taken = record["camera"]
-    (fx, _, cx), (_, fy, cy), _ = taken["intrinsics"]
-    camera = Camera(
-        taken["width"],
-        taken["height"],
-        *(fx, fy, cx, cy),
-        np.array(taken["world_from_camera"]),
-        tuple(taken["distortion"]),
-        taken["near"],
-    )
     plan = FramePlan(
         **{name: record[name] for name in ("index", "layout", "view", "split", "draws", "seed")},
-        camera=camera,
+        camera=Camera.from_json(record["camera"]),
         next_camera=None,
         lights=tuple(TypeAdapter(LightSpec).validate_python(light) for light in record["lights"]),
     )

@@ -15,6 +15,7 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, load_scene, plan_frame, random_stream, scene_json_schema
+from mitsplat.scene.spec import SCHEMA_VERSION
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
@@ -439,6 +440,8 @@ def test_light_path_warms_evenly_in_reciprocal_temperature(scene_data: SceneData
 
 def test_schema_describes_every_key() -> None:
     schema = scene_json_schema()
+    assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert schema["$id"] == f"urn:mitsplat:scene:{SCHEMA_VERSION}"
     json.dumps(schema)
     models = [schema, *schema["$defs"].values()]
     undescribed = [

@@ -78,7 +78,7 @@ def name_of(benchmark: str, parser: argparse.ArgumentParser, options: argparse.N
         value = getattr(options, action.dest)
         if action.option_strings and value == action.default:
             continue
-        values = [] if value in (True, None) else value if isinstance(value, list) else [value]
+        values = [] if value is True or value is None else value if isinstance(value, list) else [value]
         words = [slug(Path(one).stem if isinstance(one, Path) or "/" in str(one) else one) for one in values]
         parts.append("_".join([slug(action.dest), *words] if action.option_strings else words))
     return "-".join(part for part in parts if part)

@@ -97,6 +97,7 @@ def options(*words: str) -> tuple[argparse.ArgumentParser, argparse.Namespace]:
         (("--frames", "8", "--out", "a"), "render.frame"),
         (("rate", "--frames", "6", "--ten"), "render.frame-rate-frames_6-ten"),
         (("--scene", "scenes/real.yaml"), "render.frame-scene_real"),
+        (("--frames", "1"), "render.frame-frames_1"),
     ],
 )
 def test_a_name_tells_runs_apart_by_what_matters(words: tuple[str, ...], name: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
@@ -204,8 +205,6 @@ class Camera:
             shown = slopes * fisheye_radius(np.arctan(slope), self.distortion) / slope
             pixels[front] = shown * (self.fx, self.fy) + (self.cx, self.cy)
         elif front.any():
-            import cv2
-
             projected, _ = cv2.projectPoints(
                 local[front], np.zeros(3), np.zeros(3), self.intrinsics, np.array(self.distortion)
             )
@@ -224,8 +223,6 @@ class Camera:
             for _ in range(20):
                 angle -= (fisheye_radius(angle, self.distortion) - radius) / fisheye_rate(angle, self.distortion)
             return np.asarray(slopes * np.tan(np.clip(angle, 0, FISHEYE_MAX)) / radius, dtype=np.float64)
-        import cv2
-
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         undistorted = cv2.undistortPoints(
             slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria

@@ -20,7 +20,7 @@ from ruamel.yaml.scanner import RoundTripScanner
 from mitsplat.errors import InputError
 from mitsplat.format_version import FORMAT_VERSION, check_format_version
 
-Model = TypeVar("Model", bound=BaseModel)
+Validated = TypeVar("Validated", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
@@ -86,8 +86,8 @@ class _Finding(NamedTuple):
 
 
 def load_yaml(
-    path: str | Path, model: type[Model], *, overrides: Mapping[str, Any] | None = None, newest: int | None = None
-) -> Model:
+    path: str | Path, model: type[Validated], *, overrides: Mapping[str, Any] | None = None, newest: int | None = None
+) -> Validated:
     """Read a YAML 1.2 file into ``model``; types are checked strictly (no text for numbers) and no code is run.
 
     Args:

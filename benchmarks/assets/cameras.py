@@ -6,16 +6,17 @@ from other people's reconstructions: agreement, not truth.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.record import figure, recording
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.metric_frame import fit_similarity
 
 
-def main(capture: Path, poses: Path) -> None:
+def compare(capture: Path, poses: Path) -> None:
     found = Capture.load(capture)
     published = {path.stem: np.loadtxt(path) for path in sorted(poses.glob("*.txt"))}
     photos = [photo for photo in found.photos if Path(photo.name).stem in published]
@@ -25,13 +26,28 @@ def main(capture: Path, poses: Path) -> None:
     extent = np.ptp(centres, axis=0)
     errors = 100 * np.linalg.norm(residuals, axis=1)
     print(f"{len(photos)} of {len(published)} published photos registered, {len(found.rejected)} rejected")
+    figure(len(photos), "", "registered")
+    figure(len(published), "", "published")
+    figure(len(found.rejected), "", "rejected")
     for name, scale in (("longest edge", extent.max()), ("diagonal", np.linalg.norm(extent))):
         values = errors / scale
+        rms = np.sqrt(np.mean(values**2))
+        for what, value in {"rms": rms, "median": np.median(values), "largest": values.max()}.items():
+            figure(value, "%", name, what)
         print(
-            f"centres, % of the {name} of their box: rms {np.sqrt(np.mean(values**2)):.3f}, median "
+            f"centres, % of the {name} of their box: rms {rms:.3f}, median "
             f"{np.median(values):.3f}, largest {values.max():.3f} ({photos[int(values.argmax())].name})"
         )
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("poses", type=Path)
+    options = parser.parse_args()
+    with recording("assets.cameras", parser, options, ignore=("poses",)):
+        compare(options.capture, options.poses)
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main()

@@ -16,11 +16,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.record import figure, recording
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.fit.trainer import FitSettings, fit_capture
-from mitsplat.fit.training_view import Sight
+from mitsplat.fit.training_view import TrainingView
 
 
 def main() -> None:
@@ -33,6 +34,11 @@ def main() -> None:
     parser.add_argument("--gsplat", action="store_true")
     args = parser.parse_args()
     mi.set_variant(args.variant)
+    with recording("assets.fit", parser, args, gpu=args.variant.startswith("cuda")):
+        compare(args)
+
+
+def compare(args: argparse.Namespace) -> None:
     capture = Capture.load(args.capture)
     settings = FitSettings(
         gaussians=args.gaussians,
@@ -48,10 +54,20 @@ def main() -> None:
     print("fit                  s      PSNR    SSIM   Gaussians")
     with tempfile.TemporaryDirectory() as folder:
         own = fit_capture(capture, folder, settings)
+    keep("mitsplat", own.seconds, own.psnr, own.ssim, len(own.splats))
     print(f"mitsplat {args.variant} {own.seconds:7.1f} {own.psnr:7.2f} {own.ssim:7.4f} {len(own.splats)}")
     if args.gsplat:
         seconds, psnr, ssim, count = fit_with_gsplat(capture, settings)
+        keep("gsplat", seconds, psnr, ssim, count)
         print(f"gsplat               {seconds:7.1f} {psnr:7.2f} {ssim:7.4f} {count}")
+
+
+def keep(name: str, seconds: float, psnr: float, ssim: float, count: int) -> None:
+    """Record a row."""
+    figure(seconds, "s", name, "seconds")
+    figure(psnr, "dB", name, "psnr")
+    figure(ssim, "", name, "ssim")
+    figure(count, "", name, "gaussians")
 
 
 def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, float, float, int]:
@@ -62,8 +78,8 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
 
     torch.manual_seed(settings.seed)
     scale = min(1.0, settings.size / max(capture.photos[0].camera.width, capture.photos[0].camera.height))
-    sights = [Sight(photo, scale, masked=False) for photo in capture.training]
-    held_out = [Sight(photo, scale, masked=False) for photo in capture.held_out]
+    sights = [TrainingView(photo, scale, masked=False) for photo in capture.training]
+    held_out = [TrainingView(photo, scale, masked=False) for photo in capture.held_out]
     centres = np.array([sight.camera.centre for sight in sights])
     extent = 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     rng = np.random.default_rng([settings.seed, 0])
@@ -97,7 +113,7 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
     strategy.check_sanity(params, optimisers)
     state = strategy.initialize_state()
 
-    def tensors(sight: Sight) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def tensors(sight: TrainingView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         view = sight.camera.camera_from_world.copy()
         view[:3, 3] /= extent
         colour = sight.picture.astype(np.float32)
@@ -105,7 +121,7 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
             torch.tensor(v, dtype=torch.float32, device="cuda") for v in (view, sight.camera.intrinsics, colour)
         )
 
-    def render(sight: Sight, degree: int) -> tuple[torch.Tensor, dict[str, object]]:
+    def render(sight: TrainingView, degree: int) -> tuple[torch.Tensor, dict[str, object]]:
         view, intrinsics, _ = data[id(sight)]
         picture, _, info = rasterization(
             params["means"],

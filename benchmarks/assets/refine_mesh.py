@@ -18,6 +18,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.assets.known import chamfer, solid
+from benchmarks.record import figure, recording
 from mitsplat.bake.surfels import place_surfels
 from mitsplat.camera import Camera
 from mitsplat.plugins.device import plain_mesh, ray_scene
@@ -72,6 +73,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=MeshRefineSettings.steps)
     parser.add_argument("--smoothness", type=float, default=MeshRefineSettings.smoothness)
     args = parser.parse_args()
+    with recording("assets.refine_mesh", parser, args):
+        measure(args)
+
+
+def measure(args: argparse.Namespace) -> None:
     ensure_variant()
     rng = np.random.default_rng(0)
     truth = solid()
@@ -87,8 +93,12 @@ def main() -> None:
     def tell(name: str, mesh: trimesh.Trimesh) -> None:
         shown = masked(mesh, [view.camera for view in held], 1)
         overlap = np.mean([iou(one.mask > 0, view.mask > 0) for one, view in zip(shown, held, strict=True)])
+        distance = chamfer(mesh, truth)
+        figure(len(mesh.faces), "", name.partition(",")[0], "faces")
+        figure(100 * distance, "%", name.partition(",")[0], "chamfer")
+        figure(overlap, "", name.partition(",")[0], "iou")
         print(
-            f"{name}: Chamfer {chamfer(mesh, truth):.4%} of the diagonal, IoU with true held-out masks {overlap:.4f}",
+            f"{name}: Chamfer {distance:.4%} of the diagonal, IoU with true held-out masks {overlap:.4f}",
             flush=True,
         )
 
@@ -96,7 +106,10 @@ def main() -> None:
     began = time.perf_counter(), time.process_time()
     settings = MeshRefineSettings(steps=args.steps, smoothness=args.smoothness)
     found = refine_mesh(mesh, views, settings, floor=0.0)
-    print(f"{found} ({time.perf_counter() - began[0]:.0f} s, {time.process_time() - began[1]:.0f} CPU s)")
+    seconds = time.perf_counter() - began[0], time.process_time() - began[1]
+    figure(seconds[1], "s", "cpu")
+    figure(str(found), "", "verdict")
+    print(f"{found} ({seconds[0]:.0f} s, {seconds[1]:.0f} CPU s)")
     tell("refined", found.mesh)
 
 

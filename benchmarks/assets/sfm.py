@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.record import figure, recording
 from mitsplat.capture.photos import find_photos, prepare_photos
 from mitsplat.capture.structure_from_motion import find_cameras
 
@@ -28,6 +29,13 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20, help="first photos to take")
     parser.add_argument("--runs", type=int, default=30)
     options = parser.parse_args()
+    with recording("assets.sfm", parser, options):
+        found = results(options)
+    sys.exit(found > 1)
+
+
+def results(options: argparse.Namespace) -> int:
+    """How many different ones there are."""
     found = set()
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -48,8 +56,11 @@ def main() -> None:
                 f"{seconds:.1f} CPU s, {digest[:16]}",
                 flush=True,
             )
+    figure(options.count, "", "photos")
+    figure(options.runs, "", "runs")
+    figure(len(found), "", "results")
     print(f"{len(found)} different results of {options.runs} runs")
-    sys.exit(len(found) > 1)
+    return len(found)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mitsplat as ms
+from benchmarks.record import figure, recording
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.scene.scene import random_stream
 from mitsplat.scene.spec import FORMATS
+from mitsplat.scene.streams import random_stream
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = 8
@@ -52,6 +53,12 @@ def main() -> None:
     parser.add_argument("--size", default="128x96")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    with recording("labels.audit", parser, options, ignore=("out",)):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Make the frames and audit them."""
     width, height = map(int, options.size.split("x"))
     overrides = {
         "environment": None,
@@ -71,6 +78,16 @@ def main() -> None:
         made = time.perf_counter()
         found = audit_dataset(out)
         audited = time.perf_counter()
+    for count, what in (
+        (summary.frames, "frames"),
+        (len(scene.spec.output.formats), "formats"),
+        (found.instances, "instances"),
+        (found.files, "files"),
+        (sum(found.dropped.values()), "dropped"),
+        (found.low_polygons, "low polygons"),
+        (len(found.violations), "violations"),
+    ):
+        figure(count, "", what)
     print(f"{summary.frames} frames of {width}x{height} px in {made - start:.0f} s, audited in {audited - made:.0f} s")
     print(f"{found.instances} instances in {found.files} files; not labelled: {found.dropped}; marked: {found.marked}")
     print(f"masks in parts whose polygon is below an IoU of 0.99: {found.low_polygons}")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.record import figure, recording
 from mitsplat.plugins.device import ray_scene
 from mitsplat.render.layers import ensure_variant
 
@@ -37,12 +38,18 @@ def cast(mesh: Any, rotation: Any, shift: Any, matrix: Any, width: int, height: 
 
 def main() -> None:
     """Print the differences."""
-    from bop_toolkit_lib import inout, misc, visibility
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--delta", type=float, default=15.0)
     options = parser.parse_args()
+    with recording("labels.bop", parser, options, ignore=("dataset",)):
+        compare(options)
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Cast every model of every image."""
+    from bop_toolkit_lib import inout, misc, visibility
+
     ensure_variant()
     root = options.dataset / "bop"
     info = inout.load_json(root / "models/models_info.json", keys_to_int=True)
@@ -84,6 +91,15 @@ def main() -> None:
                 ys, xs = large.nonzero()
                 box = misc.calc_2d_bbox(xs - width, ys - height, (width, height))
                 boxes.append(np.abs(np.array(box) - stated["bbox_obj"]).max())
+    for value, unit, what in (
+        (frames, "", "images"),
+        (len(shares), "", "instances"),
+        (np.max(silhouettes), "", "silhouettes worst"),
+        (np.median(silhouettes), "", "silhouettes median"),
+        (np.max(boxes), "px", "boxes worst"),
+        ((np.min(shares), np.max(shares)), "", "visible fraction"),
+    ):
+        figure(value, unit, what)
     print(f"{frames} images, {len(shares)} instances; models measure what is stated within {max(sizes):.4f} mm")
     print(f"visible pixels of masks and scene_gt_info: at most {max(counts)} apart")
     print(f"pixels of silhouettes that differ: median {np.median(silhouettes):.2%}, worst {np.max(silhouettes):.2%}")

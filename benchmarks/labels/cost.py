@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 import mitsplat as ms
+from benchmarks.record import figure, recording
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.labels.labels import LabelRules, Truth, label_instances
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
@@ -69,6 +70,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=7)
     parser.add_argument("--size", default="1280x720")
     options = parser.parse_args()
+    with recording("labels.cost", parser, options):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Render, label and write."""
     width, height = map(int, options.size.split("x"))
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)
@@ -79,7 +86,9 @@ def main() -> None:
     print(f"load: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; this process on one of them")
     print(f"{width}x{height}, labelled instances per frame: {[len(frame.labels.instances) for frame in frames]}")
     for stage in ("render", "silhouettes", "label"):
-        print(f"  {stage:12s} ({statistics.median(frame.seconds[stage] for frame in frames):.3f} s)")
+        median = statistics.median(frame.seconds[stage] for frame in frames)
+        figure(median, "s", "wall", stage)
+        print(f"  {stage:12s} ({median:.3f} s)")
     catalogue = Catalogue.of(scene)
     for name, formats in SETS.items():
         spec = scene.spec.model_copy(update={"output": scene.spec.output.model_copy(update={"formats": formats})})
@@ -93,6 +102,8 @@ def main() -> None:
                 labelling.append(labelled - start)
                 writing.append(clocks() - labelled)
         label, write = np.median(labelling, axis=0), np.median(writing, axis=0)
+        figure(label[0], "s", name, "label")
+        figure(write[0], "s", name, "write")
         print(
             f"  label {label[0]:.3f} + write {write[0]:.3f} = {label[0] + write[0]:.3f} s "
             f"(wall {label[1] + write[1]:.3f} s): {name}; image {spec.output.image}"

@@ -12,11 +12,15 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pycocotools import mask as coco_mask
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the package itself needs mitsplat
+from record import figure, recording
 
 Instances = dict[str, list[Any]]
 
@@ -99,10 +103,22 @@ def main() -> None:
     parser.add_argument("tool", choices=("datumaro", "fiftyone"))
     parser.add_argument("dataset", type=Path)
     options = parser.parse_args()
+    command = "python", "benchmarks/labels/imports.py"
+    with recording("labels.imports", parser, options, ignore=("dataset",), command=command):
+        compare(options)
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Import everything."""
     truth = Truth(options.dataset)
+    held = [instances for split in truth.splits.values() for instances in split.values()]
+    figure(len(held), "", "images")
+    figure(sum(map(len, held)), "", "instances")
     {"datumaro": by_datumaro, "fiftyone": by_fiftyone}[options.tool](options.dataset, truth)
     if missing := [name for instances in truth.splits.values() for name in instances]:
         raise SystemExit(f"images that were not imported: {missing}")
+    for count, what in ((truth.images, "images"), (truth.boxes, "boxes"), (truth.masks, "masks")):
+        figure(count, "", "compared", what)
     print(f"{options.tool}: {truth.images} images, {truth.boxes} boxes, {truth.masks} masks as in the manifest")
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
+from benchmarks.record import figure, recording
 from mitsplat.labels.labels import Labels
 
 os.environ["YOLO_OFFLINE"] = "true"
@@ -69,16 +70,29 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=6)
     parser.add_argument("--model", default="yolo11n-seg.yaml")
     options = parser.parse_args()
+    with recording("labels.train", parser, options, ignore=("dataset",)):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Compare both splits, and train."""
     import ultralytics
 
     root = options.dataset.resolve()
     data = YAML(typ="safe").load(root / "data.yaml")
     data |= {"nc": len(data["names"]), "channels": 3}
+    total = 0
     for split in ("train", "val"):
         images, whole, parted, worst = compare(root, data, split)
+        total += images
+        figure(worst, "px", split, "boxes worst")
+        for values, kind in ((whole, "whole"), (parted, "parted")):
+            figure(len(values), "", split, kind, "instances")
+            figure(min(values, default=float("nan")), "", split, kind, "least iou")
         ious = [f"{np.min(values):.4f} ({len(values)} instances)" if values else "none" for values in (whole, parted)]
         print(f"{split}: {images} images; least IoU with the manifest's masks, over 200 px in one part {ious[0]}, ")
         print(f"  smaller or in parts {ious[1]}; boxes within {worst:.3f} px; classes as in the manifest")
+    figure(total, "", "images")
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         model = ultralytics.YOLO(options.model)
@@ -87,7 +101,10 @@ def main() -> None:
             plots=False, val=True, verbose=False, project=folder, exist_ok=True,
         )  # fmt: skip
         losses = (Path(model.trainer.save_dir) / "results.csv").read_text().splitlines()
-    print(f"Ultralytics {ultralytics.__version__}: one epoch in {time.perf_counter() - start:.0f} s")
+    seconds = time.perf_counter() - start
+    figure(ultralytics.__version__, "", "ultralytics")
+    figure(seconds, "s", "epoch")
+    print(f"Ultralytics {ultralytics.__version__}: one epoch in {seconds:.0f} s")
     for name, value in zip(losses[0].split(","), losses[-1].split(","), strict=True):
         if "loss" in name:
             print(f"  {name.strip()}: {value.strip()}")

@@ -42,6 +42,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, maximum_filter, minimum_filter
 
 # isort: on
+from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.bake.path_tracing import trace_radiance
@@ -57,8 +58,7 @@ from mitsplat.render.layers import (
     make_splats_shape,
     render_layers,
 )
-from mitsplat.scene.scene import AreaLight, EnvironmentLight, LightSpec, SpotLight
-from mitsplat.scene.spec import Composite
+from mitsplat.scene.spec import AreaLight, Composite, EnvironmentLight, LightSpec, SpotLight
 from scenes.build import materials as m
 from scenes.build.parts import build_part
 
@@ -459,6 +459,12 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=72, help="paths per pixel of a photograph")
     options = parser.parse_args()
     ensure_variant()
+    with recording("light.shadows", parser, options, ignore=("out",)):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Compare, and print the tables."""
     results = {}
     for name in options.scenes:
         for light in options.lights:
@@ -469,8 +475,13 @@ def main() -> None:
         print(f"\n{quantity:16s}" + "".join(f"{column:>16s}" for column in COLUMNS))
         rows = {key: [result[f"{quantity} {column}"] for column in COLUMNS] for key, result in results.items()}
         rows["mean", ""] = np.mean(list(rows.values()), axis=0)
+        for column, mean in zip(COLUMNS, rows["mean", ""], strict=True):
+            figure(mean, "" if quantity == "flip" else "dB", quantity, column)
         for key, row in rows.items():
             print(f"{' '.join(key):16s}" + "".join(f"{v:16.3f}" if quantity == "flip" else f"{v:16.1f}" for v in row))
+    figure(len(results), "", "photographs")
+    gains = [r["shadow traced"] - max(r["shadow none"], r["shadow image"]) for r in results.values()]
+    figure(min(gains), "dB", "least gain of traced")
     others = ("ratio rms", "object brightness", "edges", "width", "width error traced", "width error image")
     print("\n" + " " * 16 + "".join(f"{column:>20s}" for column in others))
     for key, result in results.items():

@@ -20,6 +20,7 @@ from unittest.mock import patch
 import numpy as np
 
 import mitsplat as ms
+from benchmarks.record import figure, recording
 from mitsplat.frames.frame import Renderer, light_properties, plan_frame
 from mitsplat.quality import resolve_quality
 from mitsplat.render.layers import Layers, ensure_variant, make_integrator, render_layers
@@ -85,6 +86,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--truth", type=int, default=2048)
     args = parser.parse_args()
+    with recording("light.traced", parser, args):
+        measure(args)
+
+
+def measure(args: argparse.Namespace) -> None:
+    """Print and keep the rows."""
     pictures = Pictures(args.scene, args.frames)
     with filtered(False):
         exact, _ = pictures.render(pictures.integrator(shadow_error=0, shadow_samples=args.truth), 0)
@@ -102,6 +109,9 @@ def main() -> None:
             errors["objects"].append(np.mean(off[objects] ** 2))
             errors["shadows"].append(np.mean(off[shadow] ** 2))
         rms = {where: float(np.sqrt(np.mean(values))) for where, values in errors.items()}
+        figure(cost, "s", name, "cpu")
+        for where, error in rms.items():
+            figure(error, "", name, where)
         print(f"{name:32} {cost:6.2f} CPU s   shadows {rms['shadows']:.4f}   objects {rms['objects']:.4f}", flush=True)
 
     for rays in (1, 4, 16, 64):

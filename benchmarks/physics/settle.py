@@ -29,6 +29,7 @@ from ruamel.yaml import YAML
 from scipy.stats import chi2_contingency
 from trimesh.creation import annulus, box, cylinder, torus
 
+from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces
@@ -117,6 +118,15 @@ def try_settle(scene: Scene, index: int) -> Layout | None:
 def show(name: str, layouts: list[Layout], given_up: int, seconds: float) -> None:
     found = [layout.certificate for layout in layouts]
     times = [certificate.time_to_rest for certificate in found]
+    for value, unit, what in (
+        (len(found), "", "layouts"),
+        (given_up, "", "given up"),
+        (sum(c.attempts for c in found), "", "draws"),
+        (np.median(times), "s", "rest median"),
+        (max(times), "s", "rest slowest"),
+        (seconds / (len(found) + given_up), "s", "cpu"),
+    ):
+        figure(value, unit, name, what)
     refused = Counter(reason.split(" by ")[0] for certificate in found for reason in certificate.refused)
     print(
         f"{name}: {len(found)} layouts, {given_up} given up, {sum(c.attempts for c in found)} draws; "
@@ -137,6 +147,7 @@ def settle_all(name: str, scene: Scene, count: int) -> list[Layout]:
     seconds, wall = time.process_time() - start, time.perf_counter() - wall
     held = [layout for layout in layouts if layout is not None]
     show(name, held, count - len(held), seconds)
+    figure(60 * count / wall, "1/min", name, "one process")
     print(f"  {60 * count / wall:.1f} layouts a minute of wall time in one process", flush=True)
     return held
 
@@ -150,6 +161,7 @@ def measure_rate(count: int) -> None:
             finished = [time.perf_counter() for _ in layouts]
             # Each process makes its simulation for the first layout that it settles.
             rate = 60 * count / (finished[-1] - finished[1])
+            figure(rate, "1/min", f"{objects} objects, {stepper}", "two processes")
             print(f"  {rate:.1f} layouts a minute of wall time in two processes", flush=True)
 
 
@@ -167,6 +179,8 @@ def measure_faces(count: int) -> None:
         sign = np.sign(np.take_along_axis(np.array(up), axis[:, None], axis=1))[:, 0]
         off = np.degrees(np.arccos(np.minimum(1, np.abs(up).max(axis=1))))
         rows.append(np.bincount(2 * axis + (sign > 0), minlength=6))
+        figure(len(up), "", stepper, "boxes")
+        figure((off > 1).sum(), "", stepper, "on no face")
         print(f"{stepper}: {len(up)} boxes, on -x +x -y +y -z +z: {rows[-1].tolist()}, on no face: {(off > 1).sum()}")
     a, b, d = sides / 2
     corner = np.arcsin(a * b / np.sqrt((a * a + d * d) * (b * b + d * d)))
@@ -174,6 +188,9 @@ def measure_faces(count: int) -> None:
     pairs = np.array(rows).reshape(2, 3, 2).sum(axis=2)
     print(f"large faces found: {pairs[:, 2] / pairs.sum(axis=1)}")
     table = np.stack([pairs[:, 2], pairs[:, :2].sum(axis=1)])
+    for stepper, share in zip(STEPPERS, pairs[:, 2] / pairs.sum(axis=1), strict=True):
+        figure(share, "", stepper, "large faces")
+    figure(chi2_contingency(table).pvalue, "", "p")
     print(f"warp against mujoco: p = {chi2_contingency(table).pvalue:.3f}")
 
 
@@ -200,7 +217,7 @@ def measure_bin(count: int) -> None:
 def measure_rest(count: int) -> None:
     """Drop ten objects with each of some seeds once, without a second draw; then wait for five seconds more."""
     from mitsplat.physics.drop import drop_of
-    from mitsplat.physics.worlds import _surface_motion, run_to_rest
+    from mitsplat.physics.rest import _surface_motion, run_to_rest
 
     for stepper in STEPPERS:
         drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)
@@ -220,6 +237,14 @@ def measure_rest(count: int) -> None:
             for body, before, after in zip(world.bodies, outcome.poses, world.poses, strict=True):
                 total += 1
                 moved += _surface_motion([body], before[None], after[None]) > 5e-3
+        for value, unit, what in (
+            (count, "", "drops"),
+            (len(times), "", "at rest"),
+            (np.median(times), "s", "median"),
+            (total, "", "objects"),
+            (moved, "", "moved"),
+        ):
+            figure(value, unit, stepper, what)
         print(
             f"{stepper}: {len(times)} of {count} at rest in 6 s, median {np.median(times):.2f} s; "
             f"{moved} of {total} objects moved by more than 5 mm in the next 5 s",
@@ -265,8 +290,15 @@ def measure_share(count: int) -> None:
             timed("rendering", partial(render_frame, scene, 10 * index, layout=layout))
     # The first one makes what all share: parts and compiled kernels.
     image = np.mean(spent["rendering"][1:])
+    figure(image, "s", "rendering cpu")
     for stepper in STEPPERS:
         layout_seconds = np.mean(spent[stepper][1:])
+        for value, unit, what in (
+            (layout_seconds, "s", "cpu"),
+            (spent[stepper][0], "s", "cpu first"),
+            (layout_seconds / 10 / image, "", "share"),
+        ):
+            figure(value, unit, stepper, what)
         print(
             f"{stepper}: {layout_seconds:.2f} CPU s a layout, {spent[stepper][0]:.2f} the first; rendering {image:.2f} "
             f"CPU s an image: settling adds {layout_seconds / 10 / image:.1%} to one at ten views of a layout",
@@ -290,7 +322,8 @@ def main() -> None:
     parser.add_argument("--count", type=int)
     parser.add_argument("--device", default="cpu", help="of worlds: cpu, or cuda:0")
     arguments = parser.parse_args()
-    with warp_settings():
+    gpu = arguments.measure == "worlds" and arguments.device != "cpu"
+    with recording("physics.settle", parser, arguments, gpu=gpu), warp_settings():
         if arguments.measure == "worlds":
             measure_worlds(arguments.count or (8 if arguments.device == "cpu" else 256), arguments.device)
         else:

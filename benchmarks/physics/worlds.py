@@ -10,10 +10,12 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from benchmarks.record import figure
 from mitsplat.arrays import Float64Array
 from mitsplat.physics import worlds as physics
 from mitsplat.physics.friction import PairFrictionSolver
-from mitsplat.physics.worlds import Body, Collider, World, run_to_rest
+from mitsplat.physics.rest import run_to_rest
+from mitsplat.physics.worlds import Body, Collider, World
 
 WORLDS = 1, 8, 64, 256
 DURATION = 2.5  # simulated, for coming to rest and the second after that [s]
@@ -35,6 +37,8 @@ def time_worlds(
         frames = batch.run()
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         rested = sum(has_rested(bodies, world, batch.interval, bounds) for world in frames.swapaxes(0, 1))
+        figure(60 * rested / wall, "1/min", f"{worlds} worlds", "layouts")
+        figure(rested, "", f"{worlds} worlds", "rested")
         per_world = 1e3 / DURATION / worlds
         print(
             f"{worlds} worlds of {len(bodies)} objects on {device}: {wall * per_world:.1f} ms of wall time and "

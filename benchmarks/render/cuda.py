@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
+from benchmarks.record import figure, recording
 from mitsplat.colour import encode_srgb
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.quality import resolve_quality
@@ -72,12 +73,15 @@ def time_ours(splats: Splats) -> None:
         marching, whole = median_ms(run_march, dr.sync_thread), median_ms(run_all, dr.sync_thread)
         print(f"mitsplat {name}: whole {whole:.2f} ms (project, bin, sort {binning:.2f}, march {marching:.2f}), "
               f"{lists.visible} visible, {lists.pairs} pairs")  # fmt: skip
-    kernels = []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        run_all()
-        kernels = dr.kernel_history()
-    print(f"  of which inside kernels: {sum(k['execution_time'] for k in kernels):.2f} ms in {len(kernels)} launches")
+        for part, milliseconds in {"whole": whole, "bin": binning, "march": marching}.items():
+            figure(milliseconds, "ms", name, part)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            run_all()
+            kernels = dr.kernel_history()
+        inside = sum(k["execution_time"] for k in kernels)
+        figure(inside, "ms", name, "kernels")
+        print(f"  of which inside kernels: {inside:.2f} ms in {len(kernels)} launches")
 
 
 def time_gsplat(splats: Splats) -> np.ndarray:
@@ -100,7 +104,9 @@ def time_gsplat(splats: Splats) -> np.ndarray:
         return image
 
     tensor_sh = tensor(splats.sh)
-    print(f"gsplat forward: {median_ms(run, torch.cuda.synchronize):.2f} ms")
+    milliseconds = median_ms(run, torch.cuda.synchronize)
+    figure(milliseconds, "ms", "gsplat")
+    print(f"gsplat forward: {milliseconds:.2f} ms")
     return run()[0].cpu().numpy()
 
 
@@ -111,12 +117,21 @@ def main() -> None:
     parser.add_argument("--no-volprim", action="store_true")
     options = parser.parse_args()
     mi.set_variant("cuda_ad_rgb")
+    with recording("render.cuda", parser, options, ignore=("captures",), gpu=True):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Print and keep every time."""
     splats, name = crowd(options.captures)
+    figure(len(splats), "", "gaussians")
     print(f"{name}, {CAMERA.width}x{CAMERA.height}")
     time_ours(splats)
     if not options.no_volprim:
         scene = volprim_scene(splats, CAMERA)
-        print(f"ellipsoids + volprim_rf_basic: {median_ms(lambda: render_volprim(scene), dr.sync_thread, 3):.0f} ms")
+        milliseconds = median_ms(lambda: render_volprim(scene), dr.sync_thread, 3)
+        figure(milliseconds, "ms", "volprim")
+        print(f"ellipsoids + volprim_rf_basic: {milliseconds:.0f} ms")
     try:
         import gsplat  # noqa: F401
     except ImportError:
@@ -126,6 +141,7 @@ def main() -> None:
     layers = render_splats(splats, CAMERA)
     ours = encode_srgb(layers.rgb)
     error = np.mean((np.clip(theirs, 0, 1) - np.clip(ours, 0, 1)) ** 2)
+    figure(-10 * np.log10(error), "dB", "gsplat", "psnr")
     print(f"difference of the two images: {-10 * np.log10(error):.1f} dB (alpha is not composited alike)")
 
 

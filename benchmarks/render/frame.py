@@ -18,6 +18,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 import mitsplat as ms
+from benchmarks.record import figure, recording
 from benchmarks.render.captures import CAMERA, crowd
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.scene.scene import layout_of
@@ -38,17 +39,23 @@ def time_frames(path: Path, frames: int, overrides: dict[str, Any]) -> None:
     scene = ms.load_scene(path, overrides=overrides)
     start = time.perf_counter()
     layout = ms.settle_layout(scene, layout_of(scene, 0))
-    print(f"settle one layout ({len(layout.instances)} objects): {time.perf_counter() - start:.2f} s")
+    seconds = time.perf_counter() - start
+    figure(seconds, "s", "settle first")
+    figure(len(layout.instances), "", "objects")
+    print(f"settle one layout ({len(layout.instances)} objects): {seconds:.2f} s")
     rows = []
     for index in range(frames + 1):
         start = time.perf_counter()
         frame = ms.render_frame(scene, index % scene.spec.output.views, layout=layout)
         rows.append({**frame.seconds, "whole frame": time.perf_counter() - start})
+    figure(rows[0]["whole frame"], "s", "first frame")
     print(f"first frame (compiles or loads kernels): {rows[0]['whole frame']:.2f} s")
     size = scene.spec.output
     print(f"median of {frames} frames, {size.width}x{size.height}, seconds:")
     for stage in rows[1]:
-        print(f"  {stage:12s} {statistics.median(row[stage] for row in rows[1:]):.3f}")
+        median = statistics.median(row[stage] for row in rows[1:])
+        figure(median, "s", stage)
+        print(f"  {stage:12s} {median:.3f}")
 
 
 def time_light(path: Path, overrides: dict[str, Any], repeats: int = 8) -> None:
@@ -63,7 +70,9 @@ def time_light(path: Path, overrides: dict[str, Any], repeats: int = 8) -> None:
             wall.append(time.perf_counter() - start[0])
             processor.append(time.process_time() - start[1])
     for name, times in (("seconds", wall), ("processor seconds of all threads", processor)):
+        clock = "light" if times is wall else "light cpu"
         plain, lit = (statistics.median(times[2 + k :: 2]) for k in (0, 1))
+        figure(lit - plain, "s", clock)
         print(f"frame without light {plain:.3f}, with {lit:.3f}: light takes {lit - plain:.3f} {name}")
 
 
@@ -75,6 +84,7 @@ def compare_with_volprim(repeats: int = 5) -> None:
     start = time.perf_counter()
     render_volprim(scene)
     theirs = time.perf_counter() - start
+    figure(theirs, "s", "volprim")
     print(f"{name}, {CAMERA.width}x{CAMERA.height}: ellipsoids + volprim_rf_basic {theirs:.2f} s")
     for preset in ("fast", "balanced"):
         ours = []
@@ -83,6 +93,8 @@ def compare_with_volprim(repeats: int = 5) -> None:
             ms.render_splats(splats, CAMERA, quality=preset)
             ours.append(time.perf_counter() - start)
         mine = statistics.median(ours[1:])
+        figure(mine, "s", "captures", preset)
+        figure(theirs / mine, "", "captures", preset, "ratio")
         print(f"  render_splats, {preset}: {mine:.3f} s, ratio {theirs / mine:.0f}")
 
 
@@ -96,11 +108,14 @@ def main() -> None:
     options = parser.parse_args()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     overrides = ten_objects(options.scene) if options.ten else {}
-    time_frames(options.scene, options.frames, overrides)
-    time_light(options.scene, overrides)
-    print(f"peak memory of the frames: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
-    if not options.no_volprim:
-        compare_with_volprim()
+    with recording("render.frame", parser, options, ignore=("no_volprim",)):
+        time_frames(options.scene, options.frames, overrides)
+        time_light(options.scene, overrides)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        figure(peak, "GiB", "peak")
+        print(f"peak memory of the frames: {peak:.2f} GiB")
+        if not options.no_volprim:
+            compare_with_volprim()
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
+from benchmarks.record import figure, recording
 from mitsplat.frames.frame import Renderer
 from mitsplat.quality import PRESETS
 from mitsplat.render.layers import ensure_variant, make_integrator, make_sensor, make_splats_shape
@@ -45,6 +46,8 @@ def print_differences(scenes: int) -> None:
             splats, ids = make(3 + seed % 6, 1000 + seed)
             shares = reference_shares(splats, ids, CAMERA)
             totals += (shares[..., 0].size, *differences(shown(splats, ids, EXACT), shares))
+    for what, count in zip(("pixels", "lesser", "undecided"), totals, strict=True):
+        figure(count, "", "twin", what)
     print(f"{2 * scenes} scenes, {totals[0]} pixels: {totals[1]} with a lesser instance; {totals[2]} undecided ones")
 
 
@@ -93,6 +96,10 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
         least = {case: min(seconds[1:]) for case, seconds in times.items()}
         share = unsure[-1] if unsure else 0.0
         told = ", ".join(f"{case} {least[case] / least['one']:.2f}" for case in ("first walk", "all"))
+        figure(least["one"], "s", name, preset, "one")
+        figure(share, "", name, preset, "again")
+        for case in ("first walk", "all"):
+            figure(least[case] / least["one"], "", name, preset, case)
         print(f"{name}, {preset}: march of one instance {least['one']:.3f} s, times that: {told}; again: {share:.1%}")
         unsure.clear()
 
@@ -105,15 +112,21 @@ def main() -> None:
     options = parser.parse_args()
     ensure_variant()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
-    scene = ms.load_scene(options.scene)
+    with recording("render.instances", parser, options):
+        measure(options.scene, options.scenes)
+
+
+def measure(path: Path, scenes: int) -> None:
+    """Print and keep both."""
+    scene = ms.load_scene(path)
     layout, plan = ms.settle_layout(scene, layout_of(scene, 0)), plan_frame(scene, 3)
     renderer = Renderer(scene, quality=PRESETS["fast"])
     placed = mi.load_dict(renderer.describe(layout, plan.lights))
-    print_costs(options.scene.name, renderer.integrator, placed, plan.camera)
+    print_costs(path.name, renderer.integrator, placed, plan.camera)
     camera = ms.Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=1280, height=720, fov_x=50)
     crowded = mi.load_dict({"type": "scene", **crowd()})
     print_costs("eight in one place", make_integrator(shadow="none"), crowded, camera)
-    print_differences(options.scenes)
+    print_differences(scenes)
 
 
 if __name__ == "__main__":

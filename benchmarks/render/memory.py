@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
+from benchmarks.record import figure, recording
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.render.layers import ensure_variant, make_integrator, make_splats_shape, render_layers, render_silhouettes
 
@@ -37,6 +38,9 @@ def report(name: str, run: Callable[[], object]) -> None:
     before = peak()
     run()
     dr.sync_thread()
+    figure(before, "GiB", "loaded")
+    figure(peak(), "GiB", "peak")
+    figure(peak() - before, "GiB", "added")
     print(f"{name:60s}{before:7.2f} loaded{peak():7.2f} at most", flush=True)
 
 
@@ -101,7 +105,8 @@ def main() -> None:
         return
     mi.set_variant(options.variant)
     ensure_variant()
-    CASES[options.case](options.objects if options.case == "silhouettes" else options.gaussians)
+    with recording("render.memory", parser, options, gpu=options.variant.startswith("cuda")):
+        CASES[options.case](options.objects if options.case == "silhouettes" else options.gaussians)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How the time of the splat renderer grows, how far its march is from the machine's peak, and Mitsuba's own path.
 
-    python -m benchmarks.render.splats [--volprim]
+    python -m benchmarks.render.splats [--volprim] [--captures FOLDER]
 
 Seconds are processor seconds of all threads, which other load on the machine changes little; the fastest of two.
 The peak is that of fused multiply-adds in a loop without memory, which the same compiler made.
@@ -13,16 +13,18 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 # isort: off
-from benchmarks.render.captures import CAMERA, crowd, synthetic  # imports mitsplat, which must come before Dr.Jit
+from benchmarks.render.captures import CAMERA, CAPTURES, crowd, synthetic  # imports mitsplat before Dr.Jit
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 # isort: on
+from benchmarks.record import figure, recording
 from mitsplat.camera import Camera
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.quality import PRESETS, Quality
@@ -87,6 +89,8 @@ def print_growth() -> None:
 
     def show(label: str, splats: Splats, camera: Camera, quality: Quality) -> None:
         binning, marching, pairs = stages(splats, camera, quality)
+        for part, value, unit in (("bin", binning, "s"), ("march", marching, "s"), ("pairs", pairs / 1e6, "M")):
+            figure(value, unit, label, part)
         print(f"{label:44s}{binning:8.3f}{marching:8.3f}{pairs / 1e6:7.1f}M")
 
     fast, balanced = PRESETS["fast"], PRESETS["balanced"]
@@ -113,20 +117,27 @@ def print_peak() -> None:
         replace(splats, opacities=splats.opacities * 0.02), CAMERA, replace(endless, alpha_min=1e-5)
     )
     rate, peak = pairs * TILE * TILE / seconds, fma_peak()
+    figure(rate / 1e9, "G/s", "evaluations")
+    figure(peak / 1e9, "G/s", "multiply adds")
+    figure(rate * FMA_PER_EVALUATION / peak, "", "share of peak")
     print(
         f"march: {rate / 1e9:.2f} G evaluations per processor second; at {FMA_PER_EVALUATION} multiply-adds each "
         f"{rate * FMA_PER_EVALUATION / peak:.0%} of the peak of {peak / 1e9:.0f} G"
     )
 
 
-def print_volprim() -> None:
+def print_volprim(captures: Path) -> None:
     """Whole images of the captures, beside Mitsuba's ellipsoids + volprim_rf_basic."""
-    splats, name = crowd()
+    splats, name = crowd(captures)
     scene = volprim_scene(splats, CAMERA)
     theirs = fastest(lambda: render_volprim(scene), repeats=1)
+    figure(len(splats), "", "gaussians")
+    figure(theirs, "s", "volprim")
     print(f"{name}, {CAMERA.width}x{CAMERA.height}: ellipsoids + volprim_rf_basic {theirs:.1f} s")
     for preset in PRESETS:
         ours = fastest(lambda preset=preset: render_splats(splats, CAMERA, quality=preset))  # type: ignore[misc]
+        figure(ours, "s", preset)
+        figure(theirs / ours, "", preset, "ratio")
         print(f"  render_splats {preset:10s}{ours:7.2f} s, ratio {theirs / ours:.0f}")
 
 
@@ -134,14 +145,16 @@ def main() -> None:
     """Parse the command line and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--volprim", action="store_true", help="only the comparison with Mitsuba's own path")
+    parser.add_argument("--captures", type=Path, default=CAPTURES)
     options = parser.parse_args()
     ensure_variant()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
-    if options.volprim:
-        print_volprim()
-        return
-    print_growth()
-    print_peak()
+    with recording("render.splats", parser, options, ignore=("captures",)):
+        if options.volprim:
+            print_volprim(options.captures)
+            return
+        print_growth()
+        print_peak()
 
 
 if __name__ == "__main__":

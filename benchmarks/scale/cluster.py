@@ -26,6 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.record import figure, recording
 from benchmarks.scale.faults import ROOT, SCENE, hashes
 
 LIGHTS = """
@@ -103,6 +104,13 @@ def main() -> None:
     options = parser.parse_args()
     if os.geteuid() != 0:
         sys.exit("machines that share nothing take root: sudo python -m benchmarks.scale.cluster")
+    with recording("scale.cluster", parser, options):
+        same = measure(options)
+    sys.exit(not same)
+
+
+def measure(options: argparse.Namespace) -> bool:
+    """Whether nothing is missing and nothing differs."""
     folder = Path(tempfile.mkdtemp(prefix="mitsplat-cluster-", dir="/tmp"))
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
     os.environ.setdefault("WARP_CACHE_PATH", str(Path.home() / ".cache/warp"))
@@ -117,7 +125,7 @@ def main() -> None:
         options_of_head += f" --port {port} --num-cpus 0"
         with (folder / "head.log").open("wb") as log:
             head = subprocess.Popen([ray, "start", *options_of_head.split()], stdout=log, stderr=log)
-        compare(path, options.frames, machines)
+        return compare(path, options.frames, machines)
     finally:
         machines.close()
         if head is not None:
@@ -126,7 +134,7 @@ def main() -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def compare(path: Path, frames: int, machines: Machines) -> None:
+def compare(path: Path, frames: int, machines: Machines) -> bool:
     """The dataset of one process and that of the cluster."""
     import ray
     from ray._private.state import actors  # what is public of it takes a dashboard
@@ -169,10 +177,20 @@ def compare(path: Path, frames: int, machines: Machines) -> None:
     expected, found = hashes(folder / "alone"), hashes(folder / "cluster")
     differing = {file for file in expected.keys() | found.keys() if expected.get(file) != found.get(file)}
     workers = Counter(actor["Address"]["NodeID"][:6] for actor in actors().values())
+    for count, what in (
+        (summary.rendered, "frames"),
+        (frames // 4, "killed after"),
+        (frames // 2, "joined after"),
+        (len(workers), "nodes"),
+        (events["lost"], "lost"),
+        (len(found), "files"),
+        (len(differing), "differing"),
+    ):
+        figure(count, "", what)
     print(f"workers by node: {dict(workers)}; frames in hand that were lost with their machine: {events['lost']}")
     print(f"{summary.rendered} frames, {len(found)} files, {len(differing)} differ {sorted(differing)[:5]}")
     ray.shutdown()
-    sys.exit(bool(differing) or summary.rendered != frames)
+    return not differing and summary.rendered == frames
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from pycocotools import mask as coco_mask
 
+from benchmarks.record import figure, recording
 from benchmarks.scale.faults import SCENE
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.manifest import encode_line
@@ -161,8 +162,11 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def run(scene: Any, out: Path, frames: int, syncs: Syncs) -> None:
+def run(scene: Any, out: Path, frames: int, syncs: Syncs, name: str) -> None:
     """One call, with what it took by tenths of the frames."""
+    walls: list[float] = []
+    cpus: list[float] = []
+    sizes: list[float] = []
 
     def clocks() -> list[float]:
         return [time.perf_counter() - Frames.seconds - syncs.seconds, time.process_time() - Frames.cpu, syncs.seconds]
@@ -173,9 +177,14 @@ def run(scene: Any, out: Path, frames: int, syncs: Syncs) -> None:
         nonlocal step
         if text == "starting":
             step = max(1, (frames - done) // 10)
+            figure(time.perf_counter() - begun, "s", name, "opened")
+            figure(resident(), "MiB", name, "opened memory")
             print(f"opened in {time.perf_counter() - begun:.1f} s, {done} frames, {resident():.0f} MiB", flush=True)
         elif done % step == 0:
             wall, cpu, synced = (1e3 * (b - a) / step for a, b in zip(last, clocks(), strict=True))
+            walls.append(wall)
+            cpus.append(cpu)
+            sizes.append(resident())
             print(
                 f"to frame {done:8d}: {wall:.3f} ms a record ({cpu:.3f} ms CPU) and {synced:.3f} ms in fsync; "
                 f"{resident():.0f} MiB",
@@ -187,6 +196,12 @@ def run(scene: Any, out: Path, frames: int, syncs: Syncs) -> None:
     summary = dataset.write_dataset(scene, out, frames=frames, progress=hear)
     wall, cpu, synced = (b - a for a, b in zip(last, clocks(), strict=True))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    for rows, unit, what in ((walls, "ms", "record"), (cpus, "ms", "record cpu"), (sizes, "MiB", "memory")):
+        if rows:
+            figure((min(rows), max(rows)), unit, name, what)
+    figure(wall + synced, "s", name, "end")
+    figure(cpu, "s", name, "end cpu")
+    figure(peak, "MiB", name, "peak")
     print(
         f"ended in {wall + synced:.1f} s ({cpu:.1f} s CPU; fsync {synced:.1f} s), {summary.frames} frames; "
         f"{resident():.0f} MiB, at most {peak:.0f} MiB so far",
@@ -206,6 +221,12 @@ def main() -> None:
     options = parser.parse_args()
     if options.frames % (2 * VIEWS):
         parser.error(f"--frames must be a multiple of {2 * VIEWS}")
+    with recording("scale.driver", parser, options, ignore=("folder",)):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Both runs."""
     Frames.instances = options.instances
     dataset.FrameMaker = Frames  # type: ignore[misc, assignment]
     os.fsync = syncs = Syncs(options.sync_every)  # type: ignore[assignment]
@@ -218,8 +239,8 @@ def main() -> None:
         if options.begun:
             begin(scene, out, options.begun)
             print(f"begun with {options.begun} frames", flush=True)
-        for _ in range(2):
-            run(scene, out, options.frames, syncs)
+        for name in ("run", "again"):
+            run(scene, out, options.frames, syncs, name)
         print(syncs.told())
         sizes = {name: (out / name).stat().st_size for name in ("manifest.jsonl", "annotations/instances_train.json")}
         print({name: f"{size / 1e6:.0f} MB" for name, size in sizes.items()})

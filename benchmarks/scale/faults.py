@@ -23,6 +23,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from benchmarks.record import figure, recording
+
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = f"""
 name: nuts
@@ -94,6 +96,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--synthetic", action="store_true")
     options = parser.parse_args()
+    with recording("scale.faults", parser, options):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Kill until there were enough."""
     rng = random.Random(options.seed)
     counts: Counter[str] = Counter()
     differing: set[str] = set()
@@ -136,6 +144,11 @@ def main() -> None:
                 found = hashes(out)
                 differing |= {file for file in {*found, *expected} if found.get(file) != expected.get(file)}
                 shutil.rmtree(out)
+    for name in ("kills", "kills of the run", "kills of a worker", "partial files left", "torn lines left"):
+        figure(counts[name], "", name)
+    figure(counts["datasets finished"], "", "datasets")
+    figure(len(expected), "", "files")
+    figure(len(differing), "", "differing")
     for name, count in sorted(counts.items()):
         print(f"{name}: {count}")
     print(f"files of a dataset: {len(expected)}; differing after resumption: {len(differing)} {sorted(differing)[:5]}")

@@ -31,6 +31,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from benchmarks.record import figure, recording
 from mitsplat.asset import Asset, read_mesh
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import given_masks
@@ -268,13 +269,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=list(READERS), choices=list(READERS))
     options = parser.parse_args()
+    with recording("scale.fuzz", parser, options):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """One reader after the other."""
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         make_samples(Path(folder))
         for name in options.only:
             counts = fuzz(name, Path(folder), options.seed, 60 * options.minutes / len(options.only))
             total += counts
+            figure(sum(counts.values()), "", name, "inputs")
             print(f"{name}: {dict(sorted(counts.items()))}", flush=True)
+    figure(sum(total.values()), "", "inputs")
+    for outcome in ("read", "refused", "fault", "crash or hang"):
+        figure(total[outcome], "", outcome)
     print(f"all: {sum(total.values())} inputs, {dict(sorted(total.items()))}")
 
 

@@ -3,10 +3,10 @@
     python -m benchmarks.scale.growth workers [--scene FILE] [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale.growth scene [--frames 6] [--size 320x180]
     python -m benchmarks.scale.growth memory [--frames 2000] [--views 50]
-    python -m benchmarks.scale.growth project --seconds 1.55 --bytes 2.5e5 [--settle 3] [--views 12]
+    python -m benchmarks.scale.growth project [--seconds 0.6] [--bytes 2.5e5] [--settle 3] [--views 12]
 
-``workers`` also compares the manifests' SHA-256. ``project`` prints a table from figures that the others measured; its
-model is in ``docs/reliability.md``.
+``workers`` also compares the manifests' SHA-256. ``project`` prints the table of ``docs/reliability.md``, which has its
+model, from recorded results or from the figures given.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.figures import read_results
+from benchmarks.record import figure, recording
+from benchmarks.scale import projection
 from benchmarks.scale.faults import SCENE
 from mitsplat.dataset.folder import Shard
 from mitsplat.dataset.shards import merge_shards
@@ -31,8 +34,6 @@ from mitsplat.scene.scene import load_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKCELL = ROOT / "scenes/workcell.yaml"
-FSYNCED = 2e-3
-"""Assumed time in which one process appends and fsyncs the two lines of a frame [s]."""
 
 
 def overrides(size: str, **further: object) -> dict[str, object]:
@@ -68,12 +69,15 @@ def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> No
     changes = overrides(size, **{"output.formats": ["yolo", "coco"]})
     scene = load_scene(path, overrides=changes, allow_outside=True)
     print(f"{len(scene.assets)} assets, {size}, {frames} frames; load before: {os.getloadavg()[0]:.1f}")
-    found = set()
+    found, alone = set(), float("nan")
     with tempfile.TemporaryDirectory() as folder:
         for count in counts:
             out, clock = Path(folder) / f"local{count}", Clock(count)
             write_dataset(scene, out, frames=frames, workers=count, progress=clock)
             found.add(manifest_hash(out))
+            alone = clock.speed if count == 1 else alone
+            figure(clock.speed, "1/s", f"{count} workers", "speed")
+            figure(clock.speed / alone, "", f"{count} workers", "ratio")
             print(f"{count} local workers: {clock.speed:.2f} images/s; manifest {manifest_hash(out)[:16]}", flush=True)
         shards = [Path(folder) / f"shard{number}" for number in (1, 2)]
         for number, shard in enumerate(shards, start=1):
@@ -90,6 +94,9 @@ def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> No
             write_dataset(scene, out, frames=frames, workers=None, cluster=Cluster(), progress=clock)
             found.add(manifest_hash(out))
             print(f"Ray, CPU=2 a worker: {clock.speed:.2f} images/s; manifest {manifest_hash(out)[:16]}")
+    figure(frames, "", "frames")
+    figure(len(found), "", "manifests")
+    figure(min(found)[:16], "", "manifest")
     print(f"different manifests: {len(found)}; load after: {os.getloadavg()[0]:.1f}")
 
 
@@ -106,6 +113,8 @@ def measure_scene(frames: int, size: str) -> None:
             scene, times = load_scene(path, allow_outside=True), Clock(1)
             write_dataset(scene, Path(folder) / "out", frames=frames, progress=times)
         gaps = np.diff(times.times)[1:]
+        figure(count * len(scene.assets[0].splats), "", f"{count} objects", "gaussians")
+        figure(1 / statistics.median(gaps), "1/s", f"{count} objects", "speed")
         print(f"{count:7d}  {count * len(scene.assets[0].splats):9d}  {1 / statistics.median(gaps):.2f}", flush=True)
 
 
@@ -131,24 +140,27 @@ def measure_memory(frames: int, views: int) -> None:
     print(
         f"{frames} frames of 64x48, {layouts} layouts: {1024 * slope:.1f} KiB a frame, from frame {kept[0, 0]:.0f} on"
     )
+    figure(frames, "", "frames")
+    figure(layouts, "", "layouts")
+    figure(1024 * slope, "KiB", "slope")
+    figure(kept[0, 0], "", "slope from")
+    shown = rows[:: max(1, len(rows) // 20)]
+    for done, size in shown:
+        figure(round(size), "MiB", "at frame", done)
     print("MiB at frame:")
-    print(json.dumps([(done, round(size)) for done, size in rows[:: max(1, len(rows) // 20)]]))
+    print(json.dumps([(done, round(size)) for done, size in shown]))
 
 
 def project(seconds: float, size: float, settle: float, views: int) -> None:
     """The cost of 10^6 images by number of workers, and where more of them no longer help."""
-    images = 1e6
-    each = seconds + settle / views
-    limit = 1 / FSYNCED
-    print(f"a frame takes a worker {each:.2f} s ({settle:g} s of settling over {views} views) and {size / 1e6:.2f} MB")
+    found = projection.project(seconds, size, settle, views)
+    settling = f"{settle:g} s of settling over {views} views"
+    print(f"a frame takes a worker {found.each:.2f} s ({settling}) and {size / 1e6:.2f} MB")
     print("workers  images/s    days  worker-hours   TB")
-    for workers in (1, 2, 10, 100, 300, 1000, 3000):
-        speed = min(workers / each, limit)
-        mark = " saturated" if speed == limit else ""
-        hours = workers * images / speed / 3600
-        days, stored = images / speed / 86400, images * size / 1e12
-        print(f"{workers:7d}  {speed:8.2f}  {days:6.2f}  {hours:12.0f}  {stored:.2f}{mark}")
-    print(f"one writer saturates at {limit:.0f} images/s, {limit * each:.0f} workers; shards have a writer each")
+    for row in found.rows:
+        mark = " saturated" if row.saturated else ""
+        print(f"{row.workers:7d}  {row.speed:8.2f}  {row.days:6.2f}  {row.hours:12.0f}  {row.terabytes:.2f}{mark}")
+    print(f"one writer saturates at {found.limit:.0f} images/s, {found.most:.0f} workers; shards have a writer each")
 
 
 def main() -> None:
@@ -159,19 +171,32 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--scene", type=Path, default=WORKCELL)
     parser.add_argument("--size", default="320x180")
-    parser.add_argument("--seconds", type=float, default=1.55)
-    parser.add_argument("--bytes", type=float, default=2.5e5)
-    parser.add_argument("--settle", type=float, default=3.0)
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--bytes", type=float)
+    parser.add_argument("--settle", type=float)
     parser.add_argument("--views", type=int)
     options = parser.parse_args()
+    if options.what == "project":
+        known = {name: value for name, (value, _) in read_results()["projection"]["figures"].items()}
+        project(
+            options.seconds or known["rendering"] + known["writing"],
+            options.bytes or 1e6 * known["megabytes"],
+            options.settle or known["settle"],
+            options.views or known["views"],
+        )
+        return
+    with recording("scale.growth", parser, options):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """What takes time."""
     if options.what == "workers":
         measure_workers(options.scene, options.workers, options.frames or 12, options.size)
     elif options.what == "scene":
         measure_scene(options.frames or 6, options.size)
-    elif options.what == "memory":
-        measure_memory(options.frames or 2000, options.views or 50)
     else:
-        project(options.seconds, options.bytes, options.settle, options.views or 12)
+        measure_memory(options.frames or 2000, options.views or 50)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from ruamel.yaml import YAML
 
+from benchmarks.record import figure, recording
 from benchmarks.scale.faults import ROOT, workers_of
 from mitsplat.asset import Asset
 from mitsplat.dataset.write import write_dataset
@@ -28,7 +29,9 @@ from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
 
 MIB = 2**20
+WORKCELL = ROOT / "scenes/workcell.yaml"
 CASES = {
+    "default scene": None,
     "small": {},
     "2 M Gaussians": {"gaussians": 2e6},
     "2 M Gaussians of SH degree 0": {"gaussians": 2e6, "sh": 1},
@@ -80,6 +83,7 @@ def measure_workers(counts: list[int], **options: float | str) -> None:
     print(f"{options}: workers, PSS of all of them [MiB], of the driver [MiB]")
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(write_room(Path(folder), **options), allow_outside=True)  # type: ignore[arg-type]
+        largest = 0
         for count in counts:
             sizes: list[tuple[int, int]] = []
 
@@ -90,7 +94,10 @@ def measure_workers(counts: list[int], **options: float | str) -> None:
                     sizes.append((sum(found), of_process("self", "smaps_rollup", "Pss")))  # noqa: B023
 
             write_dataset(scene, Path(folder) / f"out{count}", workers=count, progress=hear)
-            largest, driver = max(sizes)
+            before, (largest, driver) = largest, max(sizes)
+            figure((largest - before) / MIB, "MiB", f"{count} workers", "added")
+            figure(largest / MIB, "MiB", f"{count} workers", "pss")
+            figure(driver / MIB, "MiB", f"{count} workers", "driver")
             print(f"{count:3d} {largest / MIB:8.0f} {driver / MIB:8.0f}", flush=True)
 
 
@@ -99,9 +106,12 @@ def measure_budget() -> None:
     print("peak [MiB]  budget [MiB]")
     for name, options in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
-            path = write_room(Path(folder), **options)  # type: ignore[arg-type]
+            path = write_room(Path(folder), **options) if options is not None else WORKCELL  # type: ignore[arg-type]
             command = [sys.executable, "-m", "benchmarks.scale.workers", "frames", "--scene", str(path)]
             said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+        peak, budget = map(float, said.split())
+        figure(peak, "MiB", name, "peak")
+        figure(budget, "MiB", name, "budget")
         print(f"{said.strip()}  {name}", flush=True)
 
 
@@ -123,12 +133,14 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--scene", type=Path)
     options = parser.parse_args()
-    if options.what == "workers":
-        measure_workers(options.workers, gaussians=options.gaussians, size=options.size)
-    elif options.what == "budget":
-        measure_budget()
-    else:
+    if options.what == "frames":
         make_frames(options.scene)
+        return
+    with recording("scale.workers", parser, options):
+        if options.what == "workers":
+            measure_workers(options.workers, gaussians=options.gaussians, size=options.size)
+        else:
+            measure_budget()
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.read_back import Violations
@@ -188,8 +189,6 @@ def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] 
 
 def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
     """Channels by name, and what prevents reading them."""
-    import OpenEXR
-
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}, ""

@@ -41,7 +41,7 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class CameraSpec(_Strict):
+class PhotoCamera(_Strict):
     """A camera's keys: those of :class:`~mitsplat.camera.Camera`."""
 
     width: int
@@ -62,7 +62,7 @@ class PhotoSpec(_Strict):
     name: str = Field(min_length=1)
     file: str = Field(min_length=1)
     mask: str | None = None
-    camera: CameraSpec
+    camera: PhotoCamera
 
 
 class CaptureSpec(_Strict):
@@ -327,8 +327,8 @@ def _photo_spec(photo: Photo, folder: Path) -> PhotoSpec:
         name=photo.name,
         file=photo.file.relative_to(folder).as_posix(),
         mask=None if photo.mask is None else photo.mask.relative_to(folder).as_posix(),
-        camera=CameraSpec(
-            **{key: getattr(camera, key) for key in CameraSpec.model_fields if key != "world_from_camera"},
+        camera=PhotoCamera(
+            **{key: getattr(camera, key) for key in PhotoCamera.model_fields if key != "world_from_camera"},
             world_from_camera=tuple(map(tuple, camera.world_from_camera.tolist())),
         ),
     )

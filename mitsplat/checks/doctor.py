@@ -21,10 +21,12 @@ from mitsplat.llvm import OLDEST_USABLE, VARIABLE
 from mitsplat.warp_start import quiet_warp
 
 NEEDED_MEMORY = 2.5
-"""For the default scene, see :func:`mitsplat.frames.budget.worker_memory` [GiB]."""
+"""What :func:`mitsplat.frames.budget.worker_memory` allows a worker of the default scene, rounded up [GiB];
+``python -m benchmarks.scale.workers budget`` has it beside what is used."""
 
-NEEDED_DISK = 2.0
-"""What a first run leaves on the disk: compiled kernels, pieces, layouts and a small dataset [GiB]."""
+NEEDED_DISK = 0.5
+"""Twice a dataset of a thousand frames of 0.25 MB [GiB]. What a first run compiles and keeps is little beside it, see
+``python -m benchmarks.scale.first_run``."""
 
 
 TRIAL = """
@@ -122,7 +124,7 @@ def _cache() -> Finding:
 def _warp() -> Finding:
     remedy = "pip install warp-lang"
     try:
-        import warp
+        import warp  # whether it can be imported is the question
 
         with quiet_warp():
             devices = ", ".join(str(device) for device in warp.get_devices())

@@ -1,4 +1,7 @@
-"""Commands that make assets: of meshes, and of photographs."""
+"""Commands that make assets: of meshes, and of photographs.
+
+Commands import what they need inside of their functions, so that the start of every other one stays short.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.capture.targets import Board
-    from mitsplat.reconstruct.pipeline import Finished
+    from mitsplat.reconstruct.pipeline import AssetResult
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -405,7 +408,7 @@ def _board(squares: str, square: float) -> Board:
     return Board(int(columns), int(rows), square)
 
 
-def _tell_asset(done: Finished) -> None:
+def _tell_asset(done: AssetResult) -> None:
     """What came of an asset, and status 4 where a threshold is missed."""
     found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
     closed = "watertight" if found.watertight else "open"

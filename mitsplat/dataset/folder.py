@@ -22,6 +22,7 @@ from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, storage_errors, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 from mitsplat.formats.registry import TABLE, Catalogue, CollectionWriter
+from mitsplat.version import __version__
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
@@ -283,8 +284,6 @@ def _remove_partial(out: Path) -> None:
 
 def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
     """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
-    from mitsplat.version import __version__
-
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],

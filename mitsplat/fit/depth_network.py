@@ -76,7 +76,7 @@ def open_session(model: Path) -> Any:
         MissingResourceError: If onnxruntime is not installed.
     """
     try:
-        import onnxruntime
+        import onnxruntime  # optional: the extra [depth]
     except ImportError as error:
         raise MissingResourceError(
             f"depths by a model need onnxruntime: pip install 'mitsplat[depth]' ({error})"

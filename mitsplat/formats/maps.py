@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
@@ -66,14 +67,11 @@ def write_exr(files: FrameFiles) -> None:
 
 def save_exr(path: Path, frame: Frame) -> None:
     """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
-    import OpenEXR
-
-    fixed = ("depth", "instance", "proxy_instance", "normal", "light")
-    layers = {**{name: getattr(frame, name) for name in fixed}, **frame.layers}
     names = {"depth": "Z", "alpha": "A"}
     axes = {"normal": "XYZ"}
     channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}
-    for layer, values in layers.items():
+    for layer in ("depth", "instance", "proxy_instance", "normal", "light", "alpha", "captured", "highlight"):
+        values = getattr(frame.layers, layer)
         if values.ndim == 2:
             channels[names.get(layer, layer)] = values
         else:

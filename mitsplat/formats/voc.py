@@ -56,7 +56,9 @@ def flags(label: InstanceLabel) -> tuple[bool, bool]:
     x0, y0, x1, y1 = label.box
     left, top = label.amodal.box[:2]
     boxed = int(label.amodal.mask[y0 - top : y1 - top, x0 - left : x1 - left].sum())
-    return 1 - boxed / label.silhouette_area > TRUNCATED, 1 - label.area / boxed > OCCLUDED
+    # Products, because 1 - 95/100 is rounded to more than 0.05.
+    beyond, hidden = label.silhouette_area - boxed, boxed - label.area
+    return beyond > TRUNCATED * label.silhouette_area, hidden > OCCLUDED * boxed
 
 
 class SetsWriter:

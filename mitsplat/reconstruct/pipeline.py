@@ -9,13 +9,15 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.pipeline import CaptureSettings, capture_photos
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 from mitsplat.files import write_text
 from mitsplat.fit.folder import FIT_FILE, read_record
+from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import VERDICT_FILE, Verdict
@@ -29,10 +31,6 @@ from mitsplat.reconstruct.reconstruct import (
 from mitsplat.reconstruct.report import write_asset_report
 from mitsplat.splats import Splats
 from mitsplat.version import __version__
-
-if TYPE_CHECKING:
-    from mitsplat.capture.pipeline import CaptureSettings
-    from mitsplat.fit.trainer import FitSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +56,7 @@ class AssetJob:
 
 
 @dataclass(frozen=True)
-class Finished:
+class AssetResult:
     """An asset on disk.
 
     Attributes:
@@ -104,7 +102,7 @@ def make_photo_asset(
     capture: CaptureSettings,
     fit: FitSettings,
     progress: Progress | None = None,
-) -> Finished:
+) -> AssetResult:
     """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
 
     Args:
@@ -119,9 +117,6 @@ def make_photo_asset(
         InputError: If the photographs do not suffice.
         MissingResourceError: If a program or model that is needed is missing.
     """
-    from mitsplat.capture.pipeline import capture_photos
-    from mitsplat.fit.trainer import FitProgress, fit_capture
-
     taken = capture_photos(photos, out / "capture", capture, progress=progress)
     found = taken.capture
 
@@ -137,7 +132,7 @@ def make_photo_asset(
 
 def make_asset(
     capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
-) -> Finished:
+) -> AssetResult:
     """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
 
     Args:
@@ -172,7 +167,7 @@ def make_asset(
     write_asset_report(out, capture, result)
     # Last, so that an interrupted run is not mistaken for a finished one.
     _save_verdict(out, result, inputs)
-    return Finished(out, result.verdict, kept=False)
+    return AssetResult(out, result.verdict, kept=False)
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
@@ -215,7 +210,7 @@ def _files(folder: Path, capture: Capture) -> list[Path]:
     return [folder / "capture.json", folder / "points.npz", *pictures]
 
 
-def _finished(out: Path, inputs: str) -> Finished | None:
+def _finished(out: Path, inputs: str) -> AssetResult | None:
     """What an earlier run of the same inputs left, if it is whole."""
     if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, "asset.yaml")):
         return None
@@ -223,6 +218,6 @@ def _finished(out: Path, inputs: str) -> Finished | None:
         record = json.loads((out / VERDICT_FILE).read_text())
         if record.pop("inputs") != inputs:
             return None
-        return Finished(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
+        return AssetResult(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
     except (ValueError, KeyError, TypeError, OSError):
         return None

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 import mitsplat
+from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.camera import Camera
 from mitsplat.render.layers import ensure_variant
@@ -91,17 +92,31 @@ def main() -> None:
     if arguments.variant:
         mi.set_variant(arguments.variant)
     ensure_variant()
+    command = "python", "-m", "scenes.build"
+    with recording("scenes.build", parser, arguments, ignore=("out",), command=command):
+        bake_all(arguments)
+
+
+def bake_all(arguments: argparse.Namespace) -> None:
+    """Bake, save, and say how close each is to its mesh."""
+    parts: list[float] = []
     for name in arguments.names or [ENVIRONMENT, *PARTS]:
         start = time.perf_counter()
         result = bake_environment(arguments.seed) if name == ENVIRONMENT else bake_part(name, arguments.seed)
         folder = arguments.out / name
         result.asset.save(folder, splats="splats.spz")
+        figure(result.psnr, "dB", name, "psnr")
+        figure(len(result.asset.splats), "", name, "gaussians")
+        parts += [] if name == ENVIRONMENT else [result.psnr]
         stored = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
         print(
             f"{name}: {len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB (object {result.psnr_object:.1f} dB), "
             f"{stored:.2f} MB, {time.perf_counter() - start:.0f} s, mitsplat {mitsplat.__version__}",
             flush=True,
         )
+    if parts:
+        figure(len(parts), "", "parts")
+        figure((min(parts), max(parts)), "dB", "parts", "psnr")
 
 
 if __name__ == "__main__":

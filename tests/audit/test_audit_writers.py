@@ -151,8 +151,8 @@ def record_camera(change: Callable[[Any], Any]) -> Patch:
     real = writers.write_frame
 
     def write_frame(frame: Any, *args: Any) -> Any:
-        frame.camera = change(frame.camera)
-        return real(frame, *args)
+        seen = replace(frame, plan=replace(frame.plan, camera=change(frame.camera)))
+        return real(seen, *args)
 
     return lambda patch: patch.setattr("mitsplat.dataset.frame_job.write_frame", write_frame)
 

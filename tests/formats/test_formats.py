@@ -23,7 +23,7 @@ from ruamel.yaml import YAML
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.formats import coco, maps
+from mitsplat.formats import coco, maps, voc
 from mitsplat.formats.registry import Catalogue, write_collection, write_frame
 from mitsplat.formats.yolo import rotated_box
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
@@ -32,6 +32,7 @@ from mitsplat.masks import Silhouette
 from mitsplat.scene.scene import load_scene
 from mitsplat.scene.spec import FORMATS
 from tests.labels.test_labels import Seen, read_yolo, resample, whole
+from tests.synthetic import frame_around
 
 WIDTH, HEIGHT = 160, 120
 CLASSES = ("bolt", "nut")
@@ -112,28 +113,24 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
     )
     following = Camera.look_at((0.05, 0, 1), (0.05, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60)
     plan = SimpleNamespace(
+        index=index,
         layout=index // 2,
         view=index % 2,
         split="train" if index % 4 < 2 else "val",
-        seed=index,
+        camera=CAMERA,
         next_camera=following,
         lights=(),
-    )
-    return SimpleNamespace(
-        index=index,
-        plan=plan,
-        layout=SimpleNamespace(to_json=lambda: {"certificate": {}}),
-        camera=CAMERA,
-        image=rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8),
-        rgb=np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32),
-        depth=depth,
-        instance=ids,
-        proxy_instance=ids,
-        normal=np.broadcast_to(np.float32([0, -0.6, 0.8]), (HEIGHT, WIDTH, 3)) * (ids > 0)[..., None],
-        light=np.ones((HEIGHT, WIDTH, 3), dtype=np.float32),
-        labels=labels,
         draws={},
-        layers={},
+        seed=index,
+    )
+    return frame_around(
+        plan,
+        SimpleNamespace(to_json=lambda: {"certificate": {}}),
+        labels,
+        image=rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8),
+        ids=ids,
+        depth=depth,
+        normal=np.broadcast_to(np.float32([0, -0.6, 0.8]), (HEIGHT, WIDTH, 3)) * (ids > 0)[..., None],
     )
 
 
@@ -377,6 +374,23 @@ class TestVoc:
         assert flags_of("seen through a hole", 0) == ("1", "1")
         assert flags_of("cut in two", 0) == ("0", "1")
         assert flags_of("two of a class touch", 1) == ("0", "0")
+
+    @pytest.mark.parametrize(
+        ("seen", "boxed", "whole", "flags"),
+        [
+            (95, 100, 100, (False, False)),
+            (94, 100, 100, (False, True)),
+            (17, 17, 20, (False, False)),
+            (16, 16, 20, (True, False)),
+        ],
+    )
+    def test_shares_at_the_limits_set_no_flag(
+        self, seen: int, boxed: int, whole: int, flags: tuple[bool, bool]
+    ) -> None:
+        """5 % hidden and 15 % beyond the box are not more than that, though 1 - 95/100 > 0.05 in floating point."""
+        amodal = SimpleNamespace(box=(3, 4, 3 + boxed, 5), mask=np.ones((1, boxed), dtype=bool))
+        label = SimpleNamespace(box=amodal.box, amodal=amodal, area=seen, silhouette_area=whole)
+        assert voc.flags(label) == flags  # type: ignore[arg-type]
 
     def test_splits_and_classes(self, written: Written) -> None:
         for split in ("train", "val"):

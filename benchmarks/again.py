@@ -1,0 +1,88 @@
+"""Records figures anew: runs the commands of results again, one after the other.
+
+    python -m benchmarks.again NAME...      # of benchmarks/results/NAME.json; the name is enough to begin with
+    python -m benchmarks.again --idle       # those by the clock, on a machine that does nothing else
+    python -m benchmarks.again --all        # all that run on this machine from a checkout alone
+    python -m benchmarks.again ... --list   # says what would run, and how long it took
+
+What names CAPTURE, PHOTOS, DATASET or another thing that a checkout lacks, or a GPU, is run by hand, and so is
+``python -m scenes.build --out FOLDER``, which without a folder replaces the shipped assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks.figures import read_results
+from benchmarks.record import ROOT
+
+IDLE = (
+    "render.frame",
+    "render.frame-ten",
+    "render.chart-workcell",
+    "physics.settle-rate-count_6",
+    "physics.settle-share",
+)
+"""Figures by the clock, or that other programs swell most."""
+ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared")
+"""What a checkout lacks."""
+
+
+def command_of(result: Mapping[str, Any]) -> list[str]:
+    """What records a result; the command line's own chart does not, its benchmark does."""
+    words = shlex.split(result["command"])
+    if words[:2] == ["mitsplat", "chart"]:
+        words = [
+            "python",
+            "-m",
+            "benchmarks.render.chart",
+            *("--frames" if word == "-n" else word for word in words[2:]),
+        ]
+    return [sys.executable, *words[1:]] if words[0] == "python" else words
+
+
+def recordable(result: Mapping[str, Any]) -> bool:
+    """Whether a checkout on this machine is enough."""
+    command = result["command"]
+    own = command.startswith(("python -m benchmarks.", "mitsplat chart"))
+    return own and not ELSEWHERE.search(command) and not result["machine"]["gpu"]
+
+
+def main() -> None:
+    """Run, and go on when one fails."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--idle", action="store_true")
+    parser.add_argument("--all", action="store_true")
+    parser.add_argument("--list", action="store_true")
+    options = parser.parse_args()
+    results = {name: result for name, result in read_results().items() if "command" in result}
+    for name in options.names:
+        if not any(known.startswith(name) for known in results):
+            parser.error(f"no result begins with {name}")
+    chosen = {
+        name: result
+        for name, result in results.items()
+        if any(name.startswith(given) for given in options.names)
+        or (options.idle and name in IDLE)
+        or (options.all and recordable(result))
+    }
+    failed = []
+    for command, seconds in {shlex.join(command_of(one)): one["seconds"] for one in chosen.values()}.items():
+        print(f"{command}  ({f'{seconds:.0f} s the last time' if seconds else 'time unknown'})", flush=True)
+        if not options.list and subprocess.run(shlex.split(command), cwd=ROOT, check=False).returncode:
+            failed.append(command)
+    if failed:
+        sys.exit("failed: " + "; ".join(failed))
+    if not options.list:
+        subprocess.run([sys.executable, "-m", "benchmarks.figures"], cwd=ROOT, check=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,264 @@
+"""Writes the documentation's figures from what benchmarks recorded, so that none is typed by hand.
+
+    python -m benchmarks.figures            # writes docs/figures.md and docs/reliability.md
+    python -m benchmarks.figures --check    # says what is not as the results are, with status 1
+    python -m benchmarks.figures --age      # how much has changed since each result
+
+Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` stands for
+
+* ``RESULT FIGURE FORMAT``: one figure, as Python formats it; ``*1000:.1f`` multiplies it before;
+* ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
+* ``caption RESULT ...``: command, machine, load and revision of results;
+* ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results.
+
+What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.record import MEASURED, RESULTS, ROOT
+from benchmarks.scale.projection import project
+
+TEMPLATES = ROOT / "benchmarks" / "templates"
+PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md"}
+SAID = "said.md"
+VIEWS, BYTES = 12, 2.5e5
+"""Frames of a layout, and bytes of a frame, in the projection: those of the default scene."""
+LATE = 50
+"""Commits by which a revision is older than the newest one when a caption says so."""
+
+Results = Mapping[str, Mapping[str, Any]]
+
+
+class FigureError(Exception):
+    """A template names what no result has."""
+
+
+def read_results(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
+    """Everything recorded, by name, and what follows from it."""
+    results = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+    results["projection"] = {"figures": projected(results)}
+    return results
+
+
+def projected(results: Results) -> dict[str, list[Any]]:
+    """What a million images cost, from the recorded times of a frame, its files and a layout."""
+    frame = value_of(results, "render.frame", "whole_frame")
+    rendering = max(frame) if isinstance(frame, list) else frame
+    writing = value_of(results, "labels.cost", "yolo_coco.write")
+    settle = value_of(results, "physics.settle-share", "warp.cpu")
+    found = project(rendering + writing, BYTES, settle, VIEWS)
+    figures: dict[str, list[Any]] = {
+        "rendering": [rendering, "s"],
+        "writing": [writing, "s"],
+        "settle": [settle, "s"],
+        "views": [VIEWS, ""],
+        "megabytes": [BYTES / 1e6, "MB"],
+        "each": [found.each, "s"],
+        "limit": [found.limit, "1/s"],
+        "most": [found.most, ""],
+    }
+    for row in found.rows:
+        name = f"workers_{row.workers}"
+        speed = f"{row.speed:.2f}" + (" (saturated)" if row.saturated else "")
+        figures |= {f"{name}.speed": [speed, "1/s"], f"{name}.days": [row.days, ""], f"{name}.hours": [row.hours, ""]}
+        figures[f"{name}.terabytes"] = [row.terabytes, "TB"]
+    return figures
+
+
+def value_of(results: Results, result: str, name: str) -> Any:
+    """A figure without its unit."""
+    if result not in results:
+        raise FigureError(f"no result {result}")
+    figures = results[result]["figures"]
+    if name not in figures:
+        raise FigureError(f"{result} has no figure {name}; it has {', '.join(figures)}")
+    return figures[name][0]
+
+
+def formatted(value: Any, spec: str) -> str:
+    """A number, a pair of the least and the most, or text; what is unknown is a dash."""
+    factor, _, form = spec.rpartition(":")
+    if value is None:
+        return "–"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list):
+        ends = list(dict.fromkeys(formatted(one, spec) for one in value))
+        return " to ".join(ends)
+    try:
+        number = value * float(factor.removeprefix("*")) if factor else value
+        return format(number, form).replace("%", " %").replace("-", "−")
+    except ValueError as error:
+        raise FigureError(f"{value} cannot be written as {spec}: {error}") from error
+
+
+def caption(result: Mapping[str, Any], newest: int = 0) -> str:
+    """Where figures are from: command, machine, load and revision, and how much older it is than the newest one."""
+    load, day = load_of(result), f"{result['revision']} of {result['date']}"
+    late = newest - (result.get("commits") or newest)
+    day += f", {late} commits before the newest figure" if late >= LATE else ""
+    text = f"`{result['command']}` on {machine_of(result)}" + (f", {load}" if load else "")
+    if result["recorded"] == "transcribed":
+        text += f"; taken over from the notes of revision {day}, not recorded anew since"
+    else:
+        text += f"; recorded at revision {day}{' with changes' if result['changed'] else ''}"
+        text += f" in {result['seconds']:.0f} s"
+    return text + (f". {result['note']}" if result.get("note") else ".")
+
+
+def machine_of(result: Mapping[str, Any]) -> str:
+    """Processor, memory and GPU, as far as they are known."""
+    machine = result["machine"]
+    known = f"{machine['cores']} cores" if machine["cores"] else ""
+    known += (" of " if known else "") + machine["processor"] if machine["processor"] else ""
+    known += f" with {machine['memory_gib']} GiB" if machine["memory_gib"] else ""
+    return " and ".join(part for part in (known, machine["gpu"]) if part)
+
+
+def load_of(result: Mapping[str, Any]) -> str:
+    """Load average at the start and the end, or what notes say of it."""
+    load = result["load"]
+    return f"load {load['start']} to {load['end']}" if load["start"] is not None else load.get("said") or ""
+
+
+def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
+    """A table of results, with the commits between their revision and the newest one."""
+    lines = [
+        "| command | machine | load | revision | commits since | recorded |",
+        "| --- | --- | --- | --- | ---: | --- |",
+    ]
+    for result in results:
+        if result["recorded"] == "transcribed":
+            how = "taken over from notes"
+        else:
+            how = f"in {result['seconds']:.0f} s" + (", with changes" if result["changed"] else "")
+        how += f". {result['note']}" if result.get("note") else ""
+        load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
+        late = "–" if result.get("commits") is None else newest - result["commits"]
+        lines.append(f"| `{result['command']}` | {machine_of(result)} | {load} | {day} | {late} | {how} |")
+    return "\n".join(lines)
+
+
+def filled(text: str, results: Results) -> str:
+    """A template with its figures."""
+    newest = max((result.get("commits") or 0 for result in results.values()), default=0)
+
+    def fill(match: re.Match[str]) -> str:
+        words = match[1].split()
+        try:
+            match words:
+                case ["runs"]:
+                    return runs((result for result in results.values() if "command" in result), newest)
+                case ["caption" | "runs" as what, *names] if names:
+                    if missing := [name for name in names if "command" not in results.get(name, {})]:
+                        raise FigureError(f"no result {missing[0]}")
+                    if what == "runs":
+                        return runs((results[name] for name in names), newest)
+                    return "  \n".join(f"*{caption(results[name], newest)}*" for name in names)
+                case ["cells", result, prefix, *cells] if cells:
+                    pairs = [cell.partition(":") for cell in cells]
+                    return " | ".join(
+                        formatted(value_of(results, result, f"{prefix}.{key}"), spec) for key, _, spec in pairs
+                    )
+                case [result, name, spec]:
+                    return formatted(value_of(results, result, name), spec)
+                case [result, name]:
+                    return formatted(value_of(results, result, name), "")
+        except FigureError as error:
+            raise FigureError(f"{{{{ {match[1].strip()} }}}}: {error}") from None
+        raise FigureError(f"{{{{ {match[1].strip()} }}}} is no figure")
+
+    return re.sub(r"\{\{(.*?)\}\}", fill, text)
+
+
+def wrapped(text: str, width: int = 120) -> str:
+    """Paragraphs of plain text in lines of a width; a sign that begins a list stays behind what it follows."""
+    blocks = text.split("\n\n")
+    for place, block in enumerate(blocks):
+        if block[:1].isalnum() or (block.startswith(("`", "[", "(")) and not block.startswith("```")):
+            lines = textwrap.fill(" ".join(block.split()), width, break_long_words=False, break_on_hyphens=False)
+            end = "\n" * (len(block) - len(block.rstrip("\n")))
+            blocks[place] = re.sub(r"\n([-+*#>=]|\d+[.)]) ", r" \1\n", lines) + end
+    return "\n\n".join(blocks)
+
+
+def pages(results: Results) -> dict[Path, str]:
+    """What every generated page must be."""
+    found = {}
+    for name, page in PAGES.items():
+        text = wrapped(filled((TEMPLATES / name).read_text(encoding="utf-8"), results))
+        found[ROOT / page] = (
+            f"{text}\n<!-- Written by python -m benchmarks.figures: edit benchmarks/templates/{name} -->\n"
+        )
+    return found
+
+
+def unsaid(results: Results) -> Iterable[str]:
+    """Sentences that pages written by hand lack, or have with other figures; pages that are not there lack none."""
+    file = ""
+    for line in filled((TEMPLATES / SAID).read_text(encoding="utf-8"), results).splitlines():
+        if line.startswith("# "):
+            file = line[2:].strip()
+        elif line.startswith("* "):
+            path = ROOT / file
+            words = path.read_text(encoding="utf-8").split() if path.exists() else line.split()
+            if " ".join(line[2:].split()) not in " ".join(words):
+                yield f"{file} should say: {line[2:]}"
+
+
+def differences(results: Results) -> list[str]:
+    """What of the documentation is not as the results are."""
+    found = [
+        f"{path.relative_to(ROOT)} is not what the results give; run python -m benchmarks.figures"
+        for path, text in pages(results).items()
+        if not path.exists() or path.read_text(encoding="utf-8") != text
+    ]
+    return [*found, *unsaid(results)]
+
+
+def print_ages(results: Results) -> None:
+    """Commits since each result that changed something figures depend on."""
+    for name, result in results.items():
+        if "command" in result:
+            command = ["git", "-C", str(ROOT), "rev-list", "--count", f"{result['revision']}..HEAD", "--", *MEASURED]
+            said = subprocess.run(command, capture_output=True, text=True, check=False)
+            count = said.stdout.strip() if said.returncode == 0 else "unknown"
+            print(f"{count:>8s} commits since {result['revision']} ({result['recorded']}): {name}")
+
+
+def main() -> None:
+    """Write, check, or tell ages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--age", action="store_true")
+    options = parser.parse_args()
+    try:
+        results = read_results()
+        if options.age:
+            print_ages(results)
+            return
+        if not options.check:
+            for path, text in pages(results).items():
+                path.write_text(text, encoding="utf-8")
+                print(f"written: {path.relative_to(ROOT)}")
+        found = differences(results)
+    except FigureError as error:
+        sys.exit(str(error))
+    for text in found:
+        print(text, file=sys.stderr)
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()

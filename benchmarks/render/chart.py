@@ -1,0 +1,40 @@
+"""Speed against accuracy, as ``mitsplat chart`` measures it, kept for the documentation.
+
+    python -m benchmarks.render.chart FILE [--frames 2] [--size 1280x720]
+
+FILE is a scene, or a file of splats, for which Mitsuba's own path is measured as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks.record import figure, recording
+from mitsplat.frames.speed_accuracy import measure_steps
+
+UNITS = {"seconds": "s", "psnr": "dB", "memory": "GiB"}
+
+
+def main() -> None:
+    """Print a line for every step."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--frames", type=int, default=2)
+    parser.add_argument("--size", help="of the pictures, such as 640x480; as the scene says by default")
+    options = parser.parse_args()
+    overrides: dict[str, Any] = {}
+    if options.size:
+        overrides = dict(zip(("output.width", "output.height"), map(int, options.size.split("x")), strict=True))
+    with recording("render.chart", parser, options):
+        for row in measure_steps(options.file, frames=options.frames, overrides=overrides):
+            values = {key: value for key, value in asdict(row).items() if key != "name"}
+            print(f"{row.name:30s}" + "".join(f"{key} {value:.4g}  " for key, value in values.items()), flush=True)
+            for key, value in values.items():
+                figure(value, UNITS.get(key, ""), row.name, key)
+
+
+if __name__ == "__main__":
+    main()

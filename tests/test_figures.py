@@ -1,0 +1,179 @@
+"""The documentation's figures: those that benchmarks recorded, and no others."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import again, figures, record
+from benchmarks.figures import FigureError, caption, differences, filled, formatted, read_results, unsaid
+from benchmarks.record import figure, name_of, recording, revision
+from mitsplat.checks import doctor
+
+ROOT = Path(__file__).parents[1]
+RESULTS = read_results()
+
+
+def test_the_pages_are_what_the_results_give() -> None:
+    assert differences(RESULTS) == []
+
+
+def test_a_figure_that_changed_is_missed() -> None:
+    changed = copy.deepcopy(RESULTS)
+    changed["scale.faults-seed_51-frames_6"]["figures"]["kills"][0] += 1
+    found = " ".join(differences(changed))
+    assert "docs/reliability.md is not" in found and "docs/figures.md" not in found
+
+
+def test_a_sentence_with_another_figure_is_missed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "TEMPLATES", tmp_path)
+    (tmp_path / "said.md").write_text("# page.md\n\n* It takes {{ one seconds .1f }} s.\n")
+    (tmp_path / "page.md").write_text("Some words. It takes\n1.3 s. More.\n")
+    assert list(unsaid({"one": {"figures": {"seconds": [1.26, "s"]}}})) == []
+    assert list(unsaid({"one": {"figures": {"seconds": [1.46, "s"]}}})) == ["page.md should say: It takes 1.5 s."]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "render.none whole .2f",
+        "render.frame none .2f",
+        "cells render.frame render x:.1f",
+        "caption none",
+        "caption",
+        "render.frame",
+        "",
+    ],
+)
+def test_what_no_result_has_is_an_error(text: str) -> None:
+    with pytest.raises(FigureError):
+        filled(f"{{{{ {text} }}}}", RESULTS)
+
+
+@pytest.mark.parametrize(
+    ("value", "spec", "text"),
+    [
+        (0.523, ".2f", "0.52"),
+        (12345, ",d", "12,345"),
+        (0.35, ".0%", "35 %"),
+        ([0.351, 0.404], ".2f", "0.35 to 0.40"),
+        ([0.351, 0.352], ".2f", "0.35"),
+        (0.002, "*1000:.1f", "2.0"),
+        (-1.5, ".1f", "−1.5"),
+        (None, ".2f", "–"),
+        ("∞", ".1f", "∞"),
+    ],
+)
+def test_how_figures_are_written(value: object, spec: str, text: str) -> None:
+    assert formatted(value, spec) == text
+
+
+def test_a_figure_that_cannot_be_written_so_is_an_error() -> None:
+    with pytest.raises(FigureError, match=r"0\.5 cannot be written as ,d"):
+        formatted(0.5, ",d")
+
+
+def options(*words: str) -> tuple[argparse.ArgumentParser, argparse.Namespace]:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", nargs="?")
+    parser.add_argument("--scene", type=Path, default=Path("scenes/workcell.yaml"))
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--ten", action="store_true")
+    parser.add_argument("--out", type=Path)
+    return parser, parser.parse_args(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ((), "render.frame"),
+        (("--frames", "8", "--out", "a"), "render.frame"),
+        (("rate", "--frames", "6", "--ten"), "render.frame-rate-frames_6-ten"),
+        (("--scene", "scenes/real.yaml"), "render.frame-scene_real"),
+        (("--frames", "1"), "render.frame-frames_1"),
+    ],
+)
+def test_a_name_tells_runs_apart_by_what_matters(words: tuple[str, ...], name: str) -> None:
+    assert name_of("render.frame", *options(*words), ("out",)) == name
+
+
+def test_a_run_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["frame.py", "--frames", "3"])
+    with recording("render.frame", *options("--frames", "3"), folder=tmp_path):
+        figure(0.123456789, "s", "whole frame")
+        figure([1, math.inf], "dB", "fast, EWA", "psnr")
+        figure(math.nan, "", "none")
+    (path,) = tmp_path.iterdir()
+    found = json.loads(path.read_text())
+    assert path.name == "render.frame-frames_3.json"
+    assert found["command"] == "python -m benchmarks.render.frame --frames 3"
+    assert found["figures"] == {"whole_frame": [0.123457, "s"], "fast_ewa.psnr": [[1, "∞"], "dB"], "none": [None, ""]}
+    assert found["recorded"] == "run" and found["machine"]["cores"] and found["load"]["start"] is not None
+    assert caption(found).startswith("`python -m benchmarks.render.frame --frames 3` on ")
+
+
+def test_a_run_that_fails_is_not_kept(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), recording("render.frame", *options(), folder=tmp_path):
+        figure(1, "s", "whole frame")
+        raise RuntimeError
+    figure(1, "s", "heard by none")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_revision_outside_of_a_checkout_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert revision(tmp_path) == {"revision": "unknown", "commits": None, "changed": None}
+    monkeypatch.setenv("PATH", "")
+    assert revision() == {"revision": "unknown", "commits": None, "changed": None}
+
+
+def test_a_result_that_cannot_be_kept_costs_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    with recording("render.frame", *options(), folder=tmp_path / "file"):
+        figure(1, "s", "whole frame")
+    assert "the result was not kept" in capsys.readouterr().err
+
+
+def test_which_commands_are_run_again() -> None:
+    chosen = {name for name, result in RESULTS.items() if "command" in result and again.recordable(result)}
+    assert {"render.frame", "labels.cost", "render.chart-workcell", "scale.fuzz-minutes_8-seed_1000"} <= chosen
+    assert not {name for name in chosen if "cuda" in name}
+    assert not chosen & {
+        "assets.statue",
+        "labels.train",
+        "render.chart-plant-size_640x480",
+        "scenes.build",
+        "engine.plan",
+    }
+    assert set(again.IDLE) <= RESULTS.keys()
+    words = again.command_of({"command": "mitsplat chart scenes/workcell.yaml -n 2"})
+    assert words[1:] == ["-m", "benchmarks.render.chart", "scenes/workcell.yaml", "--frames", "2"]
+
+
+def test_captions_say_what_is_old_or_changed() -> None:
+    result = {**RESULTS["labels.cost"], "changed": True, "note": "So."}
+    assert " with changes in " in caption(result) and caption(result).endswith("So.")
+    assert "not recorded anew since" in caption({**result, "recorded": "transcribed"})
+    assert "commits before" not in caption(result, result["commits"] + 49)
+    assert "50 commits before the newest figure" in caption(result, result["commits"] + 50)
+
+
+def test_every_benchmark_keeps_its_figures() -> None:
+    scripts = [path for path in record.ROOT.glob("benchmarks/*/*.py") if "__main__" in path.read_text()]
+    assert len(scripts) > 25
+    assert [path.name for path in scripts if "with recording(" not in path.read_text()] == []
+
+
+def test_the_doctor_asks_for_what_was_measured() -> None:
+    memory = {name: value / 1024 for name, (value, _) in RESULTS["scale.workers-budget"]["figures"].items()}
+    peak, budget = memory["default_scene.peak"], memory["default_scene.budget"]
+    assert peak < budget < doctor.NEEDED_MEMORY < budget + 0.5
+    first_run = RESULTS["scale.first_run"]["figures"]["second.disk"][0]
+    dataset = 1000 * figures.BYTES / 2**30
+    assert first_run + dataset < doctor.NEEDED_DISK < 3 * (first_run + dataset)

@@ -120,6 +120,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     spec = load_yaml(path, SceneSpec, overrides=overrides)
     if not allow_outside:
         _confine(spec, path)
+    _check_lens(spec, path)
     named = _read_named(spec, path)
     _check_images(spec, path, named)
     with _blaming(path, "environment"):
@@ -218,6 +219,15 @@ def _confine(spec: SceneSpec, path: Path) -> None:
         if name is not None and not is_inside(path.parent, name):
             with _blaming(path, *keys):
                 raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
+
+
+def _check_lens(spec: SceneSpec, path: Path) -> None:
+    """Refuse intrinsics that no camera of the image's size can have, such as a fisheye's that sees behind itself."""
+    with _blaming(path, "camera", "intrinsics"):
+        try:
+            _camera_at(np.eye(4), spec.camera.intrinsics, spec.output)
+        except ValueError as error:
+            raise InputError(str(error)) from error
 
 
 def whole(index: SupportsIndex, name: str) -> int:

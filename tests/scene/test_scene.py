@@ -470,3 +470,14 @@ def test_schema_describes_every_key() -> None:
     assert schema["properties"]["camera"]["discriminator"]["propertyName"] == "kind"
     count = schema["$defs"]["ObjectSpec"]["properties"]["count"]
     assert [option["type"] for option in count["anyOf"]] == ["integer", "array"]
+
+
+def test_a_fisheye_that_sees_too_far_aside_is_refused(scene_data: SceneData, write_scene: WriteScene) -> None:
+    """Its corner lies 1000 / 500 = 2 focal lengths from the middle; without distortion 85 degrees lie at 1.48."""
+    lens = {"fx": 500, "size": [1600, 1200], "lens": "fisheye", "distortion": [0, 0, 0, 0]}
+    scene_data["output"] = {"width": 160, "height": 120}
+    scene_data["camera"]["intrinsics"] = lens
+    found = refusal(write_scene(scene_data))
+    assert found.startswith("camera.intrinsics: ")
+    assert "85 degrees" in found
+    load_scene(write_scene(scene_data | {"camera": scene_data["camera"] | {"intrinsics": lens | {"fx": 700}}}))

@@ -1,11 +1,12 @@
-# Two commands do everything: `make render` and `make test`. PYTHON names the interpreter that makes .venv.
+# Two commands do everything: `make render` and `make test`; `make docs` builds the site. PYTHON names the interpreter that makes .venv.
 PYTHON ?= python3
 VENV := .venv
 STAMPS := .make
 PIP_INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 INPUTS := pyproject.toml constraints.txt
+SPHINX := --builder html --fresh-env --fail-on-warning --keep-going --nitpicky --quiet
 
-.PHONY: render test lint clean
+.PHONY: render test lint docs clean
 
 render: $(STAMPS)/package
 	$(VENV)/bin/mitsplat render scenes/workcell.yaml -o out/workcell --resume
@@ -17,9 +18,15 @@ lint: $(STAMPS)/tools
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
 	$(VENV)/bin/mypy
+	$(VENV)/bin/python -m pytest -q tests/test_house.py
+
+# docs/_build/html/index.html; NOTEBOOKS=1 also runs the notebooks, so that the pages show what they print.
+docs: $(STAMPS)/docs
+	$(VENV)/bin/python -m sphinx $(SPHINX) docs docs/_build/html
+	$(VENV)/bin/python docs/links.py docs/_build/html
 
 clean:
-	rm -rf $(VENV) $(STAMPS) build mitsplat.egg-info
+	rm -rf $(VENV) $(STAMPS) docs/_build build mitsplat.egg-info
 
 $(STAMPS)/venv:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -33,4 +40,8 @@ $(STAMPS)/package: $(STAMPS)/venv $(INPUTS)
 
 $(STAMPS)/tools: $(STAMPS)/package
 	$(PIP_INSTALL) --editable '.[test,dev]'
+	@touch $@
+
+$(STAMPS)/docs: $(STAMPS)/package
+	$(PIP_INSTALL) --editable '.[docs]'
 	@touch $@

@@ -17,6 +17,8 @@ use_bundled_llvm()
 
 import mitsuba as _mi  # noqa: E402 - after Dr.Jit was told which LLVM to load
 
+from mitsplat.variant import register_plugins as _register_plugins  # noqa: E402 - imports Mitsuba
+
 _HOME = {
     "Asset": "asset",
     "Camera": "camera",
@@ -56,8 +58,8 @@ if TYPE_CHECKING:
     from mitsplat.render.layers import render_splats as render_splats
     from mitsplat.scene.layout import Layout as Layout
     from mitsplat.scene.scene import Scene as Scene
-    from mitsplat.scene.scene import SceneSpec as SceneSpec
     from mitsplat.scene.scene import load_scene as load_scene
+    from mitsplat.scene.spec import SceneSpec as SceneSpec
     from mitsplat.splats import Splats as Splats
 
 
@@ -71,12 +73,6 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-def _register_plugins(_old: str | None = None, new: str | None = None) -> None:
-    from mitsplat.variant import register_plugins
-
-    register_plugins(new)
-
-
-_mi.detail.add_variant_callback(_register_plugins)
+_mi.detail.add_variant_callback(lambda _old, new: _register_plugins(new))
 if _mi.variant():
-    _register_plugins(None, _mi.variant())
+    _register_plugins(_mi.variant())

@@ -30,6 +30,7 @@ from scipy.spatial import QhullError
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.files import file_inside
+from mitsplat.format_version import FORMAT_VERSIONS
 from mitsplat.splats import Splats
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
@@ -66,6 +67,7 @@ class AssetSpec(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
+    format_version: int = Field(1, ge=1, description="Version of what this file says; 1 if absent.")
     name: str = Field(min_length=1, description="Name of the asset.")
     class_name: str | None = Field(None, alias="class", min_length=1, description="Class to learn; else the name.")
     kind: Literal["object", "environment"] = "object"
@@ -196,6 +198,7 @@ class Asset:
         stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
         try:
             spec = AssetSpec(
+                format_version=FORMAT_VERSIONS[ASSET_FILE],
                 name=self.name,
                 class_name=self.class_name,
                 kind=self.kind,
@@ -315,9 +318,9 @@ def read_spec(folder: str | PathLike[str]) -> AssetSpec:
     """What an asset folder's ``asset.yaml`` says.
 
     Raises:
-        InputError: If it is missing or breaks a rule.
+        InputError: If it is missing, of a newer version or breaks a rule.
     """
-    return load_yaml(Path(folder) / ASSET_FILE, AssetSpec)
+    return load_yaml(Path(folder) / ASSET_FILE, AssetSpec, newest=FORMAT_VERSIONS[ASSET_FILE])
 
 
 def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:

@@ -5,10 +5,11 @@ Conventions are those of :mod:`mitsplat.splats`: x right, y down, z forward in t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
@@ -128,6 +129,32 @@ class Camera:
             near=near,
         )
 
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Camera:
+        """The camera that :meth:`to_json` described.
+
+        Raises:
+            ValueError: If it is none that could be.
+        """
+        ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
+        same = ("width", "height", "world_from_camera", "near", "lens", "aperture_radius", "focus_distance")
+        known = {key: stored[key] for key in same}
+        return cls(fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(stored["distortion"]), **known)
+
+    def to_json(self) -> dict[str, Any]:
+        """The camera as JSON values, as datasets state it; floats survive the round trip exactly."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "intrinsics": self.intrinsics.tolist(),
+            "distortion": list(self.distortion),
+            "lens": self.lens,
+            "aperture_radius": self.aperture_radius,
+            "focus_distance": self.focus_distance,
+            "near": self.near,
+            "world_from_camera": self.world_from_camera.tolist(),
+        }
+
     @property
     def intrinsics(self) -> Float64Array:
         """Intrinsic matrix K for pixel centres at +0.5, shape (3, 3)."""
@@ -178,8 +205,6 @@ class Camera:
             shown = slopes * fisheye_radius(np.arctan(slope), self.distortion) / slope
             pixels[front] = shown * (self.fx, self.fy) + (self.cx, self.cy)
         elif front.any():
-            import cv2
-
             projected, _ = cv2.projectPoints(
                 local[front], np.zeros(3), np.zeros(3), self.intrinsics, np.array(self.distortion)
             )
@@ -198,8 +223,6 @@ class Camera:
             for _ in range(20):
                 angle -= (fisheye_radius(angle, self.distortion) - radius) / fisheye_rate(angle, self.distortion)
             return np.asarray(slopes * np.tan(np.clip(angle, 0, FISHEYE_MAX)) / radius, dtype=np.float64)
-        import cv2
-
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         undistorted = cv2.undistortPoints(
             slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria

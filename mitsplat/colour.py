@@ -41,5 +41,5 @@ def colour_science() -> Any:
     """colour-science, without its warning that plots need matplotlib."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import colour
+        import colour  # takes a second, and warns as it is imported
     return colour

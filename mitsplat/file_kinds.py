@@ -9,10 +9,12 @@ from mitsplat.errors import InputError
 _SPLATS = "splats, which an asset.yaml names under `splats:`; `mitsplat chart` renders them"
 _MESH = "a mesh, of which `mitsplat bake` makes an asset"
 _PICTURE = "a picture"
+_DRAWING = "solids of a CAD program: export them from there as a mesh, .glb with its colours, or .stl"
 _BY_SUFFIX = {
     **dict.fromkeys((".splat", ".ksplat", ".spz", ".sog"), _SPLATS),
     **dict.fromkeys((".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae"), _MESH),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff"), _PICTURE),
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".sldprt", ".ipt", ".fcstd"), _DRAWING),
     ".ply": "splats or a mesh: an asset.yaml names it under `splats:` or `mesh:`",
     ".xml": "a Mitsuba scene, which `mitsplat render` renders",
     ".yaml": "a scene or an asset.yaml",

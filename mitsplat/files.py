@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import shutil
 import struct
@@ -14,6 +13,7 @@ from typing import Any
 
 from PIL import Image
 
+from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError, MissingResourceError
 
 Record = dict[str, Any]
@@ -27,19 +27,6 @@ IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-def add_content(digest: hashlib._Hash, path: Path) -> None:
-    """Add the SHA-256 of a file's content to a digest.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-
-
 def write_file(path: Path, write: Callable[[Path], object]) -> str:
     """Make a file by ``write(temporary path)``, then move it to ``path`` at once and for good; its folder is made.
 
@@ -50,7 +37,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     write(temporary)
     with temporary.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        digest = file_hash(file)
         os.fsync(file.fileno())
     temporary.replace(path)
     return digest

@@ -36,7 +36,7 @@ def check_llvm() -> None:
     Raises:
         MissingResourceError: If Dr.Jit has loaded no LLVM, or one that is too old.
     """
-    import drjit
+    import drjit  # after `use_bundled_llvm`, because it looks for LLVM once
 
     version = drjit.detail.llvm_version()
     if version[0] >= OLDEST_USABLE:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import zipfile
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 
 _logger = logging.getLogger(__name__)
@@ -34,6 +34,9 @@ _MOST_FACES = 200_000
 # A mesh of more faces is a scan, whose noise is taken off before it is split: by this share of its size, and no more
 # than this [m], a third of what objects may sink into a table.
 _SCAN_FACES, _DEVIATION, _MOST_DEVIATION = 3000, 5e-4, 1e-4
+# A surface of which sharp valleys are more than this share of all edges, by length, is ragged: no shape, but what is
+# left of a bad fit, and comes apart into more pieces than it has faces. Parts and scans have 0.15 at most.
+_RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
 # Of CoACD's search for every cut; a scan has more cuts than it has concavities, and any of them will do.
 _ITERATIONS, _SCAN_ITERATIONS = 150, 60
 # Faces that meet at a larger angle form an edge that can poke into something [rad].
@@ -161,10 +164,7 @@ def convex_pieces(mesh: trimesh.Trimesh, *, threshold: float = 0.02) -> tuple[tr
 
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float) -> tuple[trimesh.Trimesh, ...]:
-    digest = hashlib.sha256(b"pieces 2")
-    digest.update(f"{version('coacd')} {threshold!r}".encode())
-    digest.update(vertices)
-    digest.update(faces)
+    digest = ContentHash("pieces 3", f"{version('coacd')} {threshold!r}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
@@ -195,17 +195,31 @@ def _split(part: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:
     scan = len(part.faces) > _SCAN_FACES
     closed = scan and part.is_volume
     solid = simplify_solid(part, min(_DEVIATION * part.scale, _MOST_DEVIATION)) if closed else part
+    ragged = _valleys(solid) > _RAGGED
+    if ragged:
+        threshold = max(threshold, _RAGGED_THRESHOLD)
+        _logger.warning(
+            "a mesh of %d faces is ragged: physics follows it to %g of its size", len(solid.faces), threshold
+        )
     coacd.set_log_level("error")
     found = coacd.run_coacd(
         coacd.Mesh(solid.vertices, solid.faces),
         threshold=threshold,
         preprocess_mode="off" if closed else "auto",
-        mcts_iterations=_SCAN_ITERATIONS if scan else _ITERATIONS,
+        mcts_iterations=_SCAN_ITERATIONS if scan or ragged else _ITERATIONS,
         seed=0,
     )
     pieces = [trimesh.Trimesh(vertices, faces, process=False).convex_hull for vertices, faces in found]
     # Slivers carry no contact that their neighbours lack, and have no hull in single precision.
     return [piece for piece in pieces if piece.volume > 1e-6 * hull.volume]
+
+
+def _valleys(mesh: trimesh.Trimesh) -> float:
+    """Share of the edges, by length, at which the surface folds inwards by more than :data:`_SHARP`."""
+    ends = mesh.vertices[mesh.face_adjacency_edges]
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    sharp = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _SHARP)
+    return float(lengths[sharp].sum() / max(lengths.sum(), 1e-300))
 
 
 def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:

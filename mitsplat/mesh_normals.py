@@ -24,5 +24,19 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
         shares = (mesh.faces[col] == mesh.faces[row, k][:, None]).any(axis=1)
         np.add.at(normals[:, k], row[shares], weighted[col[shares]])
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    flat = mesh.face_normals[corner].reshape(-1, 3, 3)
+    flat = _flat_normals(mesh)[corner].reshape(-1, 3, 3)
     return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))
+
+
+def _flat_normals(mesh: trimesh.Trimesh) -> Float64Array:
+    """Unit normals (F, 3) of faces: of slivers too, which trimesh gives none and whose reflections would be NaN."""
+    normals = np.array(mesh.face_normals, dtype=np.float64)
+    none = ~normals.any(axis=1)
+    if none.any():
+        corners = mesh.triangles[none]
+        # Scaled first, so that the product of two tiny edges does not vanish.
+        edges = (corners[:, 1:] - corners[:, :1]) / np.maximum(np.ptp(corners, axis=(1, 2), keepdims=True), 1e-300)
+        across = np.cross(edges[:, 0], edges[:, 1])
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        normals[none] = np.where(length > 0, across / np.maximum(length, 1e-300), (0.0, 0.0, 1.0))
+    return normals

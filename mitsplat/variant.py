@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from mitsplat.errors import InputError
 from mitsplat.llvm import check_llvm
+from mitsplat.plugins import refuse, register
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Those that the plugins run in; the first is the default."""
@@ -53,8 +54,6 @@ def ensure_variant() -> None:
 def register_plugins(variant: str | None) -> None:
     """Register the plugins under a variant, unless they are those of that variant already."""
     global _registered
-    from mitsplat.plugins import refuse, register
-
     with _turn:
         if variant is None or variant == _registered:
             return

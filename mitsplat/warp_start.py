@@ -18,7 +18,7 @@ def quiet_warp() -> Iterator[None]:
 
     That a machine has no GPU is no news: the warning, which no setting mutes, is left out.
     """
-    import warp as wp
+    import warp as wp  # takes a third of a second, which only physics needs
 
     global _started
     kept = wp.config.log_level

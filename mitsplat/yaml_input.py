@@ -18,8 +18,9 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.scanner import RoundTripScanner
 
 from mitsplat.errors import InputError
+from mitsplat.format_version import FORMAT_VERSION, check_format_version
 
-Model = TypeVar("Model", bound=BaseModel)
+Validated = TypeVar("Validated", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
@@ -84,16 +85,20 @@ class _Finding(NamedTuple):
     missing: bool
 
 
-def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, Any] | None = None) -> Model:
+def load_yaml(
+    path: str | Path, model: type[Validated], *, overrides: Mapping[str, Any] | None = None, newest: int | None = None
+) -> Validated:
     """Read a YAML 1.2 file into ``model``; types are checked strictly (no text for numbers) and no code is run.
 
     Args:
         path: The file.
         model: The pydantic model that states its rules.
         overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+        newest: Newest version of the file's format that is read; None for files without versions.
 
     Raises:
-        InputError: If the file cannot be read, is not YAML, repeats a key or breaks a rule of ``model``.
+        InputError: If the file cannot be read, is not YAML, repeats a key, is of a newer version or breaks a rule of
+            ``model``.
     """
     path = Path(path)
     tree = _parse(path)
@@ -101,6 +106,8 @@ def load_yaml(path: str | Path, model: type[Model], *, overrides: Mapping[str, A
     data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
         _set(data, keys, value)
+    if newest is not None:  # first: whatever else is wrong with a newer file may be right for newer code
+        check_format_version(data, newest, _place(path, _line(tree, (FORMAT_VERSION,)), ()))
     try:
         # Strict JSON mode is what YAML means: lists fill tuples, whole numbers fill floats, nothing else is converted.
         return model.model_validate_json(json.dumps(data), strict=True)

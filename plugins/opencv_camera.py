@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.plugins.parameters import Parameters
 from mitsplat.plugins.rays import View
 
 
@@ -61,20 +62,19 @@ class OpenCVCamera(mi.Sensor):
         ).reshape(4, 4)
         if np.abs(self.world_from_mitsuba[:3, :3].T @ self.world_from_mitsuba[:3, :3] - np.eye(3)).max() > 1e-4:
             raise InputError("sensor 'opencv_camera': 'to_world' must be a rotation and a translation")
+        given = Parameters(props, "sensor 'opencv_camera'")
         width, height = self.film().size()
-        self.fx, self.fy = _positive(props, "fx", None), _positive(props, "fy", None)
-        self.cx = _number(props, "cx", width / 2)
-        self.cy = _number(props, "cy", height / 2)
-        self.near = _positive(props, "near_clip", 0.01)
+        self.fx, self.fy = given.positive("fx", None), given.positive("fy", None)
+        self.cx = given.number("cx", width / 2)
+        self.cy = given.number("cy", height / 2)
+        self.near = given.positive("near_clip", 0.01)
         text = props.get("distortion", "")
         try:
             self.distortion = tuple(float(v) for v in str(text).replace(",", " ").split())
         except ValueError:
             raise InputError(f"sensor 'opencv_camera': 'distortion' must be numbers (got {text!r})") from None
-        self.lens = props.get("lens", "opencv")
-        if self.lens not in ("opencv", "fisheye"):
-            raise InputError(f"sensor 'opencv_camera': 'lens' must be opencv or fisheye (got {self.lens!r})")
-        self.thin_lens = _number(props, "aperture_radius", 0.0), _positive(props, "focus_distance", 1.0)
+        self.lens = given.choice("lens", "opencv", "fisheye")
+        self.thin_lens = given.number("aperture_radius", 0.0), given.positive("focus_distance", 1.0)
         self.m_needs_sample_3 = self.thin_lens[0] > 0
         intrinsics = self.fx, self.fy, self.cx, self.cy
         try:
@@ -116,22 +116,6 @@ class OpenCVCamera(mi.Sensor):
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""
         return f"OpenCVCamera[f = ({self.fx}, {self.fy}), c = ({self.cx}, {self.cy}), distortion = {self.distortion}]"
-
-
-def _number(props: mi.Properties, name: str, default: float | None) -> float:
-    value = props.get(name, default)
-    if value is None:
-        raise InputError(f"sensor 'opencv_camera': {name!r} is missing")
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"sensor 'opencv_camera': {name!r} must be a number (got {value!r})")
-    return float(value)
-
-
-def _positive(props: mi.Properties, name: str, default: float | None) -> float:
-    value = _number(props, name, default)
-    if not value > 0:
-        raise InputError(f"sensor 'opencv_camera': {name!r} must be > 0 (got {value})")
-    return value
 
 
 mi.register_sensor("opencv_camera", lambda props: OpenCVCamera(props))

@@ -115,6 +115,8 @@ def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vie
         starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
         dr.scatter(marks, mi.UInt32(repeats.astype(np.uint32)), mi.UInt32(starts.astype(np.uint32)))
         owner = dr.cumsum(marks)
+    if total and not counts[0]:  # those without Gaussians before the first that has some
+        owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
     offsets = wrapped(mi.Int32, shift.astype(np.int32))
     local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, offsets, owner))
     dr.eval(owner, local)

@@ -11,18 +11,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.errors import InputError
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
-from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, srgb_to_linear, upload_cloud
-from mitsplat.plugins.light import Accuracy, Surface, light_factor
+from mitsplat.plugins.light import Accuracy, light_factor
+from mitsplat.plugins.lit_surface import Seen, lit_surface
 from mitsplat.plugins.march import Image, trace
 from mitsplat.plugins.mirrored import SplatMirror
 from mitsplat.plugins.occlusion import Caster
+from mitsplat.plugins.parameters import Parameters
 from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
-from mitsplat.plugins.proxies import Hit, Occluder, Proxies
+from mitsplat.plugins.proxies import Occluder, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.sensors import view_of
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
@@ -51,9 +51,6 @@ AOVS = (
     "highlight.B",
 )
 """Channels after R, G, B, A: linear colour before light, depths along z [m], ids, world normal, light, highlight."""
-
-AGREEMENT = 0.02
-"""Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,34 +165,27 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        given = Parameters(props, "integrator 'splat_proxy'")
         refined: dict[str, Any] = {
-            "response": _text(props, "response", "perspective"),
-            "kernel": _text(props, "kernel", "exact"),
+            "response": given.text("response", "perspective"),
+            "kernel": given.text("kernel", "exact"),
             "samples": props.get("samples", 1),
             "lens_rings": props.get("lens_rings", 2),
         }
-        self.quality = replace(resolve_quality(_text(props, "quality", "balanced")), **refined)
-        self.shadow = _text(props, "shadow", "traced")
-        if self.shadow not in ("traced", "none"):
-            raise InputError(f"integrator 'splat_proxy': 'shadow' must be 'traced' or 'none' (got {self.shadow!r})")
-        self.occluders = _text(props, "occluders", "proxies")
-        if self.occluders not in ("proxies", "splats"):
-            raise InputError(
-                f"integrator 'splat_proxy': 'occluders' must be 'proxies' or 'splats' (got {self.occluders!r})"
-            )
-        self.shadow_error = _number(props, "shadow_error", 0.03)
+        self.quality = replace(resolve_quality(given.text("quality", "balanced")), **refined)
+        self.shadow = given.choice("shadow", "traced", "none")
+        self.occluders = given.choice("occluders", "proxies", "splats")
+        self.shadow_error = given.number("shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
-            raise InputError(f"integrator 'splat_proxy': 'shadow_error' must be in [0, 1) (got {self.shadow_error!r})")
-        self.bounce, self.highlight = _truth(props, "bounce", True), _truth(props, "highlight", True)
-        self.hide_emitters = _truth(props, "hide_emitters", False)
-        self.mesh_samples, self.max_depth = (
-            _count(props, "mesh_samples", 64, 1, 65536),
-            _count(props, "max_depth", 8, 2, 64),
-        )
-        self.white = _number(props, "white", 0.0)
+            given.refuse("shadow_error", "be in [0, 1)", self.shadow_error)
+        self.shadow_samples = given.whole("shadow_samples", 64, 1, 4096)
+        self.bounce, self.highlight = given.truth("bounce", True), given.truth("highlight", True)
+        self.hide_emitters = given.truth("hide_emitters", False)
+        self.mesh_samples = given.whole("mesh_samples", 64, 1, 65536)
+        self.max_depth = given.whole("max_depth", 8, 2, 64)
+        self.white = given.number("white", 0.0)
         if not 0 <= self.white < np.inf:
-            raise InputError(f"integrator 'splat_proxy': 'white' must be >= 0 (got {self.white!r})")
-        self.shadow_samples = _count(props, "shadow_samples", 64, 1, 4096)
+            given.refuse("white", "be >= 0", self.white)
         self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
@@ -284,7 +274,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         lit_alpha = dr.select(plain, 1, splat.alpha)
         if self.shadow == "traced" and scene.emitters():
             shown = plain & (splat.centre_alpha < 0.5)
-            seen = _Seen(
+            seen = Seen(
                 rays.d,
                 lit_alpha,
                 dr.select(shown, behind.depth, splat.depth) if behind else splat.depth,
@@ -298,7 +288,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
-                lambda pixel: _surface(contents, view, rays.o, pixel, seen, hit, ground),
+                lambda pixel: lit_surface(contents.traits, view, rays.o, pixel, seen, hit, ground),
                 view,
                 accuracy=accuracy,
                 seed=seed,
@@ -487,89 +477,6 @@ def _same(a: tuple[Any, Quality, list[Any]], b: tuple[Any, Quality, list[Any]]) 
 
 def _identical(some: Sequence[Any], others: Sequence[Any]) -> bool:
     return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What pixels show.
-
-    Attributes:
-        direction: Of their rays.
-        alpha, depth, instance: As in the layers.
-        trait: Row of what is shown in :class:`Traits`.
-        mesh: Whether it is a visible mesh.
-    """
-
-    direction: Any
-    alpha: Any
-    depth: Any
-    instance: Any
-    trait: Any
-    mesh: Any
-
-
-def _surface(contents: _Contents, view: View, eye: Any, pixel: Any, seen: _Seen, hit: Hit, static: Hit) -> Surface:
-    """Points that light is traced at: on the proxy where it agrees with what is seen, else at the seen depth."""
-    seen, hit, static = gathered(seen, pixel), gathered(hit, pixel), gathered(static, pixel)
-    ray, depth, instance = mi.Ray3f(eye, seen.direction), seen.depth, seen.instance
-    cosine = view.cosine(ray)
-    met = hit.distance < dr.inf
-    known = ~met | (hit.instance == instance)
-    # What shows through or beside a dynamic object's proxy lies on a static one.
-    behind = instance == 0
-    same = dr.select(behind, static.distance < dr.inf, met & known)
-    proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
-    shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
-    towards = mi.Normal3f(-ray.d)
-    # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
-    on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
-    z = dr.select(on_proxy, proxy_depth, depth)
-    position = ray(z / cosine)
-    valid = (seen.alpha > 1 / 255) & (z > 0)
-    reach = dr.max(dr.abs(position))
-    return Surface(
-        position=position,
-        normal=mi.Vector3f(dr.select(same, shown[0], towards)),
-        face=mi.Vector3f(dr.select(same, shown[1], towards)),
-        lift=dr.select(on_proxy, shown[2], 0),
-        to_camera=-ray.d,
-        offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
-        instance=mi.Float(instance),
-        trait=mi.Float(seen.trait),
-        relit=dr.gather(mi.Bool, contents.traits.relit, seen.trait) | seen.mesh,
-        roughness=dr.gather(mi.Float, contents.traits.roughness, seen.trait),
-        specular=dr.select(seen.mesh, 0, dr.gather(mi.Float, contents.traits.specular, seen.trait)),
-        known=known,
-        valid=valid,
-    )
-
-
-def _number(props: mi.Properties, name: str, default: float) -> float:
-    value = props.get(name, default)
-    if type(value) not in (int, float):
-        raise InputError(f"integrator 'splat_proxy': {name!r} must be a number (got {value!r})")
-    return float(value)
-
-
-def _count(props: mi.Properties, name: str, default: int, least: int, most: int) -> int:
-    value = props.get(name, default)
-    if type(value) is not int or not least <= value <= most:
-        raise InputError(f"integrator 'splat_proxy': {name!r} must be from {least} to {most} (got {value!r})")
-    return value
-
-
-def _truth(props: mi.Properties, name: str, default: bool) -> bool:
-    value = props.get(name, default)
-    if type(value) is not bool:
-        raise InputError(f"integrator 'splat_proxy': {name!r} must be true or false (got {value!r})")
-    return value
-
-
-def _text(props: mi.Properties, name: str, default: str) -> str:
-    value = props.get(name, default)
-    if not isinstance(value, str):
-        raise InputError(f"integrator 'splat_proxy': {name!r} must be text (got {value!r})")
-    return value
 
 
 mi.register_integrator("splat_proxy", lambda props: SplatProxyIntegrator(props))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -12,6 +11,7 @@ import trimesh
 
 from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
+from mitsplat.plugins.parameters import Parameters
 from mitsplat.splats import Splats
 
 
@@ -90,8 +90,9 @@ class SplatsShape(mi.Mesh):
         params["faces"] = mi.UInt32([0, 0, 0])
         params.update()
 
-        folder, filename, proxy_file = (_typed(props, name, str, "") for name in ("asset", "filename", "proxy"))
-        units = _typed(props, "units", float, 0.0)
+        given = Parameters(props, "shape 'splats'")
+        folder, filename, proxy_file = (given.text(name, "") for name in ("asset", "filename", "proxy"))
+        units = given.number("units", 0.0)
         if "units" in props and not 0 < units < np.inf:
             raise InputError(f"shape 'splats': 'units' must be finite and > 0 (got {units})")
         asset = None
@@ -113,38 +114,20 @@ class SplatsShape(mi.Mesh):
         self.splats = splats
         self.proxy = proxy
         self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
-        self.instance = _typed(props, "instance", int, 0)
-        if not 0 <= self.instance < 65536:
-            raise InputError(f"shape 'splats': 'instance' must be from 0 to 65535 (got {self.instance})")
-        self.dynamic = _typed(props, "dynamic", bool, self.instance > 0)
+        self.instance = given.whole("instance", 0, 0, 65535)
+        self.dynamic = given.truth("dynamic", self.instance > 0)
         light = asset.capture_light if asset else "uniform" if self.instance else "scene"
-        self.capture_light = _typed(props, "capture_light", str, light)
-        if self.capture_light not in ("uniform", "scene"):
-            raise InputError(
-                f"shape 'splats': 'capture_light' must be 'uniform' or 'scene' (got {self.capture_light!r})"
-            )
-        self.roughness = _typed(props, "roughness", float, float(asset.roughness) if asset else 0.4)
+        self.capture_light = given.choice("capture_light", light, "uniform" if light == "scene" else "scene")
+        self.roughness = given.number("roughness", float(asset.roughness) if asset else 0.4)
         if not 0 < self.roughness <= 1:
             raise InputError(f"shape 'splats': 'roughness' must be in (0, 1] (got {self.roughness})")
-        self.specular = _typed(props, "specular", float, float(asset.specular) if asset and self.instance else 0.0)
+        self.specular = given.number("specular", float(asset.specular) if asset and self.instance else 0.0)
         if not 0 <= self.specular <= 1:
             raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
 
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""
         return f"SplatsShape[count = {len(self.splats)}, instance = {self.instance}, proxy = {self.proxy is not None}]"
-
-
-def _typed(props: mi.Properties, name: str, kind: type, default: Any) -> Any:
-    """A parameter of the stated type: ``props.get`` alone would accept a string for a number."""
-    if name not in props:
-        return default
-    value = props[name]
-    if kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not kind:
-        raise InputError(f"shape 'splats': {name!r} must be a {kind.__name__} (got {value!r})")
-    return value
 
 
 def _matrix(props: mi.Properties) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -14,9 +13,10 @@ from mitsplat.asset import Asset
 from mitsplat.labels.labels import LabelRules, Truth, label_instances
 from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.scene import plan_frame, random_stream
+from mitsplat.scene.scene import plan_frame
+from mitsplat.scene.streams import random_stream
 from tests.conftest import box_asset
-from tests.dataset.test_write import CERTIFICATE
+from tests.synthetic import CERTIFICATE, frame_around
 
 MARGIN = 80
 """Pixels that silhouettes are drawn beyond the image."""
@@ -68,20 +68,5 @@ def render_boxes(scene: Any, index: int, *, layout: Layout) -> Any:
         camera=camera,
         keypoints={number: asset.keypoint_array for number, asset in enumerate(scene.assets)},
     )
-    return SimpleNamespace(
-        index=index,
-        plan=plan,
-        layout=layout,
-        camera=camera,
-        image=image,
-        rgb=image.astype(np.float32) / 255,
-        depth=depth.astype(np.float32),
-        instance=ids,
-        proxy_instance=ids,
-        normal=np.broadcast_to(np.float32([0.48, -0.6, 0.64]), (*shape, 3)) * (ids > 0)[..., None],
-        light=np.ones((*shape, 3), dtype=np.float32),
-        layers={"alpha": np.ones(shape, dtype=np.float32)},
-        labels=labels,
-        draws=plan.draws,
-        seconds={"march": 0.01},
-    )
+    normal = np.broadcast_to(np.float32([0.48, -0.6, 0.64]), (*shape, 3)) * (ids > 0)[..., None]
+    return frame_around(plan, layout, labels, image=image, ids=ids, depth=depth, normal=normal)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import fields, replace
 
 import cv2
 import mitsuba as mi
@@ -88,3 +89,15 @@ def test_colmap_names_the_fisheye() -> None:
     assert camera_model(FISHEYE).split() == (
         ["OPENCV_FISHEYE", "640", "480", "300.0", "290.0", "330.0", "235.0", "0.02", "-0.01", "0.004", "-0.001"]
     )
+
+
+THIN = replace(PINHOLE, aperture_radius=0.002, focus_distance=0.008, near=0.004)
+"""Focused nearer than the nearest depth that cameras have by default."""
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, THIN, replace(PINHOLE, fy=1 / 3, cx=-7.1, distortion=BENT)])
+def test_json_brings_back_every_field(camera: Camera) -> None:
+    back = Camera.from_json(json.loads(json.dumps(camera.to_json())))
+    for field in fields(Camera):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(camera, field.name))
+        assert type(getattr(back, field.name)) is type(getattr(camera, field.name))

@@ -1,4 +1,4 @@
-"""Every notebook in ``examples`` runs from top to bottom; each ends in its own checks."""
+"""Every notebook and script in ``examples`` runs from top to bottom; each ends in its own checks."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
+SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 
 
 def code_of(path: Path) -> list[str]:
@@ -38,3 +39,13 @@ def test_notebook_runs(path: Path) -> None:
         [sys.executable, "-c", "\n\n".join(code_of(path))], cwd=EXAMPLES, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_script_runs(path: Path, tmp_path: Path) -> None:
+    assert "\nassert " in path.read_text()
+    given = [] if path.stem == "read_labels" else [tmp_path]
+    done = subprocess.run([sys.executable, path, *given], cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert any(tmp_path.iterdir()) == bool(given)

@@ -110,3 +110,38 @@ def test_the_design_names_every_module() -> None:
     for module, path in MODULES.items():
         if path.name != "__init__.py":
             assert f"`{module.split('.')[-1]}`" in design, module
+
+
+def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
+    """Lines of imports inside of functions, and whether each says why it is not at the top.
+
+    The reason is a comment on the import, above it or above those right before it; or the module's docstring says that
+    its functions import what they need.
+    """
+    lines, tree = path.read_text().splitlines(), ast.parse(path.read_text())
+    for_all = "inside of their functions" in (ast.get_docstring(tree) or "")
+    inner = {
+        node.lineno: node
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        for node in ast.walk(function)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
+    ends: dict[int, bool] = {}
+    for first, node in sorted(inner.items()):
+        last = node.end_lineno or first
+        text = "\n".join(lines[first - 1 : last])
+        above = lines[first - 2].strip()
+        said = for_all or ends.get(first - 1, False) or above.startswith("# ") or "  # " in text.replace("# noqa", "")
+        ends[last] = said
+        yield first, said
+
+
+def test_imports_inside_of_functions_say_why() -> None:
+    silent = [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in MODULES.values()
+        for line, said in imports_inside(path)
+        if not said
+    ]
+    assert silent == []

@@ -1,13 +1,18 @@
 """Convex pieces, mass and inertia against closed forms."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
 import trimesh
 
+from mitsplat import mesh as mesh_module
 from mitsplat.errors import InputError
 from mitsplat.mesh import contact_points, convex_pieces, mass_properties, prepare_mesh, simplify_solid
 from mitsplat.mesh_distance import Surface, standoff
+
+PARTS = Path(__file__).parents[1] / "scenes/assets"
 
 
 @pytest.fixture(autouse=True)
@@ -195,3 +200,17 @@ def test_scan_is_thinned_before_it_is_split_and_its_pieces_follow_it():
         for piece in pieces
     ]
     assert np.min(outside, axis=0).max() < 3e-4
+
+
+def test_what_is_ragged_is_followed_coarsely(caplog):
+    """In fine pieces it has more than 300, which take minutes."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    factors = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
+    pieces = convex_pieces(trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False))
+    assert 8 < len(pieces) < 64
+    assert "a mesh of 320 faces is ragged" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["hex_bolt", "proximity_sensor", "spur_gear"])
+def test_parts_are_not_ragged(name):
+    assert mesh_module._valleys(trimesh.load_mesh(PARTS / name / "mesh.ply")) < 0.15

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import mitsplat
+from mitsplat.render.layers import ensure_variant
 
 ROOT = Path(__file__).parents[1]
 
@@ -22,6 +24,22 @@ def test_all_is_sorted_and_importable() -> None:
     assert set(mitsplat.__all__) <= set(dir(mitsplat))
     with pytest.raises(AttributeError, match="no_such_name"):
         mitsplat.no_such_name  # noqa: B018
+
+
+def test_the_compatibility_page_names_what_is_public() -> None:
+    page = (ROOT / "docs/compatibility.md").read_text()
+    names = page.partition("### Public names")[2].partition("### Layers")[0]
+    assert re.findall(r"^\| `(\w+)` \|", names, re.MULTILINE) == list(mitsplat.__all__)
+
+
+def test_the_compatibility_page_names_every_layer() -> None:
+    ensure_variant()
+    from mitsplat.plugins.splat_proxy import AOVS
+
+    page = (ROOT / "docs/compatibility.md").read_text()
+    rows = page.partition("### Layers")[2].partition("## How something goes")[0]
+    cells = re.findall(r"^\| (`[^|]*`) \|", rows, re.MULTILINE)
+    assert re.findall(r"`([\w.]+)`", " ".join(cells)) == list(AOVS)
 
 
 def test_import_is_light() -> None:
@@ -44,7 +62,7 @@ def test_constraints_pin_every_dependency() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    needed = [Requirement(line) for line in project["dependencies"] + extras["test"] + extras["dev"]]
+    needed = [Requirement(line) for line in project["dependencies"] + extras["test"] + extras["dev"] + extras["docs"]]
     lines = (line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#"))
     pinned = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
     for requirement in needed:

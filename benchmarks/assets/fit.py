@@ -21,7 +21,7 @@ from mitsplat.capture.capture import Capture
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.fit.trainer import FitSettings, fit_capture
-from mitsplat.fit.training_view import Sight
+from mitsplat.fit.training_view import TrainingView
 
 
 def main() -> None:
@@ -78,8 +78,8 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
 
     torch.manual_seed(settings.seed)
     scale = min(1.0, settings.size / max(capture.photos[0].camera.width, capture.photos[0].camera.height))
-    sights = [Sight(photo, scale, masked=False) for photo in capture.training]
-    held_out = [Sight(photo, scale, masked=False) for photo in capture.held_out]
+    sights = [TrainingView(photo, scale, masked=False) for photo in capture.training]
+    held_out = [TrainingView(photo, scale, masked=False) for photo in capture.held_out]
     centres = np.array([sight.camera.centre for sight in sights])
     extent = 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     rng = np.random.default_rng([settings.seed, 0])
@@ -113,7 +113,7 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
     strategy.check_sanity(params, optimisers)
     state = strategy.initialize_state()
 
-    def tensors(sight: Sight) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def tensors(sight: TrainingView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         view = sight.camera.camera_from_world.copy()
         view[:3, 3] /= extent
         colour = sight.picture.astype(np.float32)
@@ -121,7 +121,7 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
             torch.tensor(v, dtype=torch.float32, device="cuda") for v in (view, sight.camera.intrinsics, colour)
         )
 
-    def render(sight: Sight, degree: int) -> tuple[torch.Tensor, dict[str, object]]:
+    def render(sight: TrainingView, degree: int) -> tuple[torch.Tensor, dict[str, object]]:
         view, intrinsics, _ = data[id(sight)]
         picture, _, info = rasterization(
             params["means"],

@@ -217,7 +217,7 @@ def measure_bin(count: int) -> None:
 def measure_rest(count: int) -> None:
     """Drop ten objects with each of some seeds once, without a second draw; then wait for five seconds more."""
     from mitsplat.physics.drop import drop_of
-    from mitsplat.physics.worlds import _surface_motion, run_to_rest
+    from mitsplat.physics.rest import _surface_motion, run_to_rest
 
     for stepper in STEPPERS:
         drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)

@@ -14,7 +14,8 @@ from benchmarks.record import figure
 from mitsplat.arrays import Float64Array
 from mitsplat.physics import worlds as physics
 from mitsplat.physics.friction import PairFrictionSolver
-from mitsplat.physics.worlds import Body, Collider, World, run_to_rest
+from mitsplat.physics.rest import run_to_rest
+from mitsplat.physics.worlds import Body, Collider, World
 
 WORLDS = 1, 8, 64, 256
 DURATION = 2.5  # simulated, for coming to rest and the second after that [s]

@@ -11,7 +11,6 @@ The manifest and the files that describe all frames are read in step, a frame at
 
 from __future__ import annotations
 
-import hashlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -25,18 +24,22 @@ import numpy as np
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.bop import BopReader
 from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
+from mitsplat.audit.label_studio import ConfigReader, check_task
 from mitsplat.audit.layers import LayersReader, SightReader
 from mitsplat.audit.listed import ColmapReader, LayoutReader, VocReader, YoloReader
 from mitsplat.audit.owned import Owned, check_listed
 from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
 from mitsplat.audit.scene import SceneReader
 from mitsplat.audit.truth import TrueFrame
+from mitsplat.content_hash import file_hash
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import SPLITS, Record
 
 _SHARE = 1e-5
 """Difference of shares that are stored with six decimals."""
 
+
+_CHECKS = {**CHECKS, "label-studio/": check_task}
 
 __all__ = ["POLYGON_AREA", "POLYGON_IOU", "Audit", "audit_dataset"]
 
@@ -88,7 +91,7 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
         violations += check_listed(record, content)
         violations += ((f"manifest.jsonl, frame {frame.index}", text) for text in _check_labels(frame))
         for file in record["files"]:
-            check = next((check for prefix, check in CHECKS.items() if file.startswith(prefix)), None)
+            check = next((check for prefix, check in _CHECKS.items() if file.startswith(prefix)), None)
             if check is not None and file not in damaged:
                 violations += ((file, text) for text in check(frame, root / file))
         violations += check_bop(frame, damaged)
@@ -119,6 +122,7 @@ def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
         "panoptic": lambda: [PanopticReader(root, content, split) for split in SPLITS],
         "poses": lambda: [PosesReader(root, content, split) for split in SPLITS],
         "voc": lambda: [VocReader(root, content)],
+        "label-studio": lambda: [ConfigReader(root, content)],
         "bop": lambda: [BopReader(root, content)],
         "colmap": lambda: [ColmapReader(root)],
     }
@@ -135,9 +139,8 @@ def _check_files(root: Path, record: Record) -> Violations:
         if not (root / file).is_file():
             yield file, "is missing"
             continue
-        with (root / file).open("rb") as stored:
-            if hashlib.file_digest(stored, "sha256").hexdigest() != digest:
-                yield file, "is not what was written: its SHA-256 differs from the manifest's"
+        if file_hash(root / file) != digest:
+            yield file, "is not what was written: its SHA-256 differs from the manifest's"
 
 
 def _check_rest(root: Path) -> Violations:

@@ -345,6 +345,7 @@ class PosesReader:
             expected = {
                 "id": label.id,
                 "class": self._content["classes"][label.kind],
+                "object": label.entry["asset"],
                 "asset": self._content["assets"][label.entry["asset"]],
             }
             if wrong := differing(instance, expected):

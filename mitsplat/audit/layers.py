@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.read_back import Violations
@@ -97,7 +98,7 @@ class LayersReader:
         room = _FLOW_ROUNDED + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
         found = flow.reshape(-1, 2)[known]
         stated = (np.abs(found) < _KNOWN_FLOW).all(axis=1)
-        in_front = ahead[known] > frame.record["camera"].get("near", 0.01) + step
+        in_front = ahead[known] > frame.record["camera"]["near"] + step
         wrong = in_front & (~stated | (np.abs(found - expected).max(axis=1) > room))
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels do not move as depth and cameras say"
@@ -188,8 +189,6 @@ def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] 
 
 def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
     """Channels by name, and what prevents reading them."""
-    import OpenEXR
-
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}, ""

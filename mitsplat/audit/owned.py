@@ -20,7 +20,7 @@ _YOLO = {name: folder for name, folder in YOLO_FOLDERS.items() if folder}
 _ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic", "poses": "poses"}
 _FOLDERS = (
     *("images", "labels", "layers", "annotations", "layouts", *_YOLO),
-    *("panoptic", "voc", "bop", "colmap", "depth", "normals", "instances", "semantic", "flow"),
+    *("panoptic", "voc", "label-studio", "bop", "colmap", "depth", "normals", "instances", "semantic", "flow"),
 )
 """Folders that hold nothing else than a dataset's files."""
 
@@ -38,6 +38,8 @@ def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]
             files |= {f"{folder}images/{split}/{image}": name, f"{folder}labels/{split}/{number}.txt": name}
     if "voc" in formats:
         files |= {f"voc/JPEGImages/{image}": "voc", f"voc/Annotations/{number}.xml": "voc"}
+    if "label-studio" in formats:
+        files[f"label-studio/{split}/{number}.json"] = "label-studio"
     for name in ("depth", "normals", "instances", "semantic", "panoptic"):
         if name in formats:
             files[f"{name}/{split}/{png}"] = name
@@ -84,6 +86,8 @@ class Owned:
         yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in self._formats)
         if "voc" in self._formats:
             yield from ("voc/labelmap.txt", *(f"voc/ImageSets/Main/{split}.txt" for split in SPLITS))
+        if "label-studio" in self._formats:
+            yield "label-studio/config.xml"
         if "bop" in self._formats:
             yield "bop/models/models_info.json"
             yield from (f"bop/models/obj_{number:06d}.ply" for number in range(1, self._assets + 1))

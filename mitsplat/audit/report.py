@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
-from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns, histogram
+from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import Record, write_text
 from mitsplat.formats.coco import image_file
@@ -185,14 +185,14 @@ def _path(shape: Silhouette) -> str:
     )
 
 
-def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, list[float]]:
-    """Counts of pixels by luma in 32 bins, and each image's mean luma."""
-    counts, means = np.zeros(32, dtype=np.int64), []
+def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, Histogram]:
+    """Counts of pixels by luma in 32 bins, and of images by their mean luma."""
+    counts, means = np.zeros(32, dtype=np.int64), Histogram((0, 255))
     for record in records:
         grey = cv2.imread(str(root / image_file(record)), cv2.IMREAD_GRAYSCALE)
         if grey is not None:
             counts += np.histogram(grey, bins=32, range=(0, 256))[0]
-            means.append(float(grey.mean()))
+            means.add(grey.mean())
     return counts, means
 
 
@@ -206,7 +206,7 @@ def _seconds(root: Path) -> dict[str, float]:
     return {stage: round(float(np.median(values)), 4) for stage, values in stages.items()}
 
 
-def _charts(counted: _Statistics, brightness: tuple[np.ndarray, list[float]], seconds: dict[str, float]) -> str:
+def _charts(counted: _Statistics, brightness: tuple[np.ndarray, Histogram], seconds: dict[str, float]) -> str:
     share = counted.shares
     most = max([1, *counted.per_image])
     charts = [
@@ -229,7 +229,7 @@ def _charts(counted: _Statistics, brightness: tuple[np.ndarray, list[float]], se
             [f"{8 * i} to {8 * i + 7}" for i in range(len(brightness[0]))],
             "luma",
         ),
-        histogram("Brightness of images", brightness[1], bounds=(0, 255), axis="mean luma"),
+        brightness[1].draw("Brightness of images", "mean luma"),
         bars("Seconds per frame by stage, median", seconds, unit=" s"),
     ]
     return (

@@ -9,8 +9,6 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float64Array
-
 _WIDTH, _HEIGHT = 420, 190
 _LEFT, _BOTTOM, _TOP = 46, 34, 10
 
@@ -57,19 +55,6 @@ class Histogram:
         return _columns(caption, self._counts, names, ends, axis)
 
 
-def histogram(
-    caption: str, values: npt.ArrayLike, *, bins: int = 20, bounds: tuple[float, float] | None = None, axis: str = ""
-) -> str:
-    """A histogram of values, from the smallest to the largest or within ``bounds``."""
-    data = np.asarray(values, dtype=np.float64).ravel()
-    if bounds is None:
-        bounds = (float(data.min()), float(data.max())) if data.size else (0.0, 1.0)
-    low, high = bounds
-    counted = Histogram((low, high if high > low else low + 1), bins)
-    counted.add(data)
-    return counted.draw(caption, axis)
-
-
 def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names: Sequence[str], axis: str = "") -> str:
     """A histogram that was counted before, with a name for every bin."""
     ends = (
@@ -99,44 +84,34 @@ class HeatMap:
 
     def draw(self, caption: str, axes: str) -> str:
         """The map as a chart."""
-        return _heat_map(caption, self._counts, self._size, axes)
-
-
-def heat_map(
-    caption: str, x: npt.ArrayLike, y: npt.ArrayLike, *, size: tuple[float, float], cells: tuple[int, int], axes: str
-) -> str:
-    """A map of points."""
-    counted = HeatMap(size, cells)
-    counted.add(x, y)
-    return counted.draw(caption, axes)
-
-
-def _heat_map(caption: str, counts: Float64Array, size: tuple[float, float], axes: str) -> str:
-    cells = counts.shape[::-1]
-    most = counts.max() or 1.0
-    width = _WIDTH - _LEFT - 10
-    height = width * size[1] / size[0]
-    dx, dy = width / cells[0], height / cells[1]
-    marks = [f'<rect class="frame" x="{_LEFT}" y="{_TOP}" width="{width}" height="{height:.1f}"/>']
-    for row, column in zip(*np.nonzero(counts), strict=True):
-        share = np.sqrt(counts[row, column] / most)
+        counts, size = self._counts, self._size
+        cells = counts.shape[::-1]
+        most = counts.max() or 1.0
+        width = _WIDTH - _LEFT - 10
+        height = width * size[1] / size[0]
+        dx, dy = width / cells[0], height / cells[1]
+        marks = [f'<rect class="frame" x="{_LEFT}" y="{_TOP}" width="{width}" height="{height:.1f}"/>']
+        for row, column in zip(*np.nonzero(counts), strict=True):
+            share = np.sqrt(counts[row, column] / most)
+            marks.append(
+                f'<rect class="bar" x="{_LEFT + column * dx:.1f}" y="{_TOP + row * dy:.1f}" width="{dx:.1f}" '
+                f'height="{dy:.1f}" fill-opacity="{0.12 + 0.88 * share:.2f}"/>'
+            )
+        base = _TOP + height
+        marks.append(f'<text x="{_LEFT}" y="{base + 14:.1f}">0</text>')
+        marks.append(f'<text x="{_LEFT + width}" y="{base + 14:.1f}" text-anchor="end">{_number(size[0])}</text>')
+        marks.append(f'<text x="{_LEFT - 5}" y="{_TOP + 10}" text-anchor="end">0</text>')
+        marks.append(f'<text x="{_LEFT - 5}" y="{base:.1f}" text-anchor="end">{_number(size[1])}</text>')
         marks.append(
-            f'<rect class="bar" x="{_LEFT + column * dx:.1f}" y="{_TOP + row * dy:.1f}" width="{dx:.1f}" '
-            f'height="{dy:.1f}" fill-opacity="{0.12 + 0.88 * share:.2f}"/>'
+            f'<text x="{_LEFT + width / 2}" y="{base + 28:.1f}" text-anchor="middle">{html.escape(axes)}</text>'
         )
-    base = _TOP + height
-    marks.append(f'<text x="{_LEFT}" y="{base + 14:.1f}">0</text>')
-    marks.append(f'<text x="{_LEFT + width}" y="{base + 14:.1f}" text-anchor="end">{_number(size[0])}</text>')
-    marks.append(f'<text x="{_LEFT - 5}" y="{_TOP + 10}" text-anchor="end">0</text>')
-    marks.append(f'<text x="{_LEFT - 5}" y="{base:.1f}" text-anchor="end">{_number(size[1])}</text>')
-    marks.append(f'<text x="{_LEFT + width / 2}" y="{base + 28:.1f}" text-anchor="middle">{html.escape(axes)}</text>')
-    busiest = np.unravel_index(int(counts.argmax()), counts.shape)
-    numbers = [
-        ("points", _number(counts.sum())),
-        ("cells with a point", f"{np.count_nonzero(counts)} of {counts.size}"),
-        ("busiest cell (column, row)", f"{busiest[1] + 1}, {busiest[0] + 1}: {_number(most)}"),
-    ]
-    return _figure(caption, _svg(caption, base + 34, marks), numbers)
+        busiest = np.unravel_index(int(counts.argmax()), counts.shape)
+        numbers = [
+            ("points", _number(counts.sum())),
+            ("cells with a point", f"{np.count_nonzero(counts)} of {counts.size}"),
+            ("busiest cell (column, row)", f"{busiest[1] + 1}, {busiest[0] + 1}: {_number(most)}"),
+        ]
+        return _figure(caption, _svg(caption, base + 34, marks), numbers)
 
 
 def _columns(

@@ -33,7 +33,7 @@ from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
 from mitsplat.mesh import convex_pieces
 from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.scene import LightSpec
+from mitsplat.scene.spec import LightSpec
 from mitsplat.spherical_harmonics import sh_basis
 from mitsplat.splats import Splats
 from mitsplat.variant import one_at_a_time
@@ -200,8 +200,7 @@ def bake_asset(
         wanted = round(wanted * settings.gaussians / max(len(surfels), 0.2 * settings.gaussians))
     if not len(surfels):
         raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
-    stages("tracing their radiance")
-    colour = _fit_radiance(scene, surfels, settings, rng, stages)
+    colour = _fit_radiance(scene, surfels, settings, rng, stages.step)
     splats = Splats(
         means=surfels.centres.astype(np.float32),
         quats=surfels.quats.astype(np.float32),
@@ -222,7 +221,7 @@ def bake_asset(
             splats,
             pictures,
             refining,
-            progress=lambda step, _: stages("fitting to the pictures", step / settings.fit_steps),
+            observe=lambda step, _: stages("fitting to the pictures", step / settings.fit_steps),
         )
     stages("finding convex pieces")
     proxy = make_proxy(parts, settings.proxy_faces)
@@ -245,10 +244,9 @@ def bake_asset(
     if not settings.verify_views:
         stages.end()
         return BakeResult(asset, float("nan"), float("nan"), surface=surface, warnings=tuple(warnings))
-    stages("comparing with the mesh")
     cameras = cameras or _orbit(surface, settings.verify_views)
     views, whole, on_object = compare_views(
-        scene, splats, cameras, bounces=settings.bounces, seed=settings.seed, progress=stages.part
+        scene, splats, cameras, bounces=settings.bounces, seed=settings.seed, progress=stages.step
     )
     brightness = None
     if isinstance(light, str) and (finish is None or finish.colour is None):
@@ -266,18 +264,17 @@ class _Stages:
     """Tells how far a bake is, of 100."""
 
     def __init__(self, tell: Progress | None) -> None:
-        self._tell, self._stage = tell, next(iter(_STAGES))
+        self._tell = tell
 
     def __call__(self, stage: str, share: float = 0.0) -> None:
-        self._stage = stage
         if self._tell is not None:
             names = list(_STAGES)
             before = sum(_STAGES[name] for name in names[: names.index(stage)])
             self._tell(int(100 * (before + share * _STAGES[stage]) / sum(_STAGES.values())), 100, stage)
 
-    def part(self, share: float) -> None:
-        """So much of the present stage is done."""
-        self(self._stage, share)
+    def step(self, done: int, total: int, stage: str) -> None:
+        """So many steps of a stage are done."""
+        self(stage, done / total)
 
     def end(self) -> None:
         """All is done."""
@@ -357,7 +354,7 @@ def _hits_nearby(
 
 
 def _fit_radiance(
-    scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator, stages: _Stages
+    scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator, progress: Progress
 ) -> Float64Array:
     """Spherical-harmonic coefficients (N, K, 3) of the display-encoded radiance that leaves every surfel."""
     local = _hemisphere(settings.directions)
@@ -367,7 +364,7 @@ def _fit_radiance(
     coefficients = np.empty((len(surfels), terms, 3))
     step = max(1, RAYS_PER_LAUNCH // (settings.directions * settings.samples))
     for start in range(0, len(surfels), step):
-        stages.part(start / len(surfels))
+        progress(start, len(surfels), "tracing their radiance")
         chunk = slice(start, start + step)
         frames, scales = surfels.frames[chunk], surfels.scales[chunk]
         towards = _turned(frames, local, rng)

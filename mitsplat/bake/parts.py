@@ -32,7 +32,7 @@ from mitsplat.file_kinds import refuse_others
 from mitsplat.mesh_normals import corner_normals
 from mitsplat.plugins.device import ray_scene
 from mitsplat.render.emitters import emitter_dict, y_up_to_z_up
-from mitsplat.scene.scene import LightSpec
+from mitsplat.scene.spec import LightSpec
 from mitsplat.variant import ensure_variant
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
@@ -122,7 +122,7 @@ def read_parts(
         linear = path.suffix.lower() in (".glb", ".gltf")
         try:
             mesh = trimesh.load_scene(mesh)
-        except (ValueError, TypeError, KeyError, OSError, NotImplementedError) as error:
+        except (ValueError, TypeError, KeyError, OSError, ImportError, NotImplementedError) as error:
             raise InputError(f"{source}: not a mesh that can be read ({error})") from error
     if not (metres_per_unit > 0 and np.isfinite(metres_per_unit)):
         raise InputError(f"{source}: metres_per_unit must be > 0 (got {metres_per_unit})")

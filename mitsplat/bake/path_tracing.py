@@ -11,6 +11,7 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.plugins.sensors import view_of
 from mitsplat.render.layers import make_sensor
 
 RAYS_PER_LAUNCH = 1 << 21
@@ -65,11 +66,16 @@ def _mean_radiance(
         sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(directions))
     spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
-    radiance, hit = mi.Color3f(dr.select(valid, spectrum, 0.0)), dr.select(valid, mi.Float(1), 0)
+    # A path that meets a sliver may end in no number, a few of ten million in drawings: the mean is of the others.
+    finite = dr.all(dr.isfinite(spectrum))
+    radiance = mi.Color3f(dr.select(valid & finite, spectrum, 0.0))
+    hit, number = (dr.select(which, mi.Float(1), 0) for which in (valid, finite))
     # Together: what is left for later would trace all paths again.
-    dr.eval(radiance, hit)
-    sums = [np.asarray(dr.block_sum(channel, samples), dtype=np.float64) / samples for channel in (*radiance, hit)]
-    return np.stack(sums[:3], axis=1), sums[3]
+    dr.eval(radiance, hit, number)
+    *sums, hits, numbers = (
+        np.asarray(dr.block_sum(channel, samples), dtype=np.float64) for channel in (*radiance, hit, number)
+    )
+    return np.stack(sums, axis=1) / np.maximum(numbers, 1.0)[:, None], hits / samples
 
 
 def render_mesh(
@@ -80,8 +86,6 @@ def render_mesh(
     ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it
     is encoded, because the mean of encoded noise is too dark. Only the background counts encoded, as splats blend.
     """
-    from mitsplat.plugins.splat_proxy import view_of
-
     view, side = view_of(make_sensor(camera)), max(1, round(samples**0.5))
     samples, pixels = side * side, camera.width * camera.height
     across, width = dr.opaque(mi.UInt32, side), dr.opaque(mi.UInt32, camera.width)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,9 @@ from mitsplat.arrays import Float64Array
 from mitsplat.bake.path_tracing import render_mesh
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
-from mitsplat.image_metrics import psnr_of
+from mitsplat.fit.image_metrics import psnr_of
+from mitsplat.progress import Progress
+from mitsplat.render.layers import render_splats
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats
 
@@ -51,14 +53,12 @@ def compare_views(
     *,
     bounces: int,
     seed: int,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> tuple[tuple[BakedView, ...], float, float]:
     """Views of the mesh and the splats, and PSNR [dB] of all together: whole images, and the mesh's pixels alone."""
-    from mitsplat.render.layers import render_splats
-
     views, errors, on_object = [], [], []
     for number, camera in enumerate(cameras):
-        progress(number / len(cameras))
+        progress(number, len(cameras), "comparing with the mesh")
         truth, cover = render_mesh(scene, camera, samples=36, bounces=bounces, seed=seed + number)
         mesh, shown = (np.clip(encode_srgb(rgb), 0, 1) for rgb in (truth, render_splats(splats, camera).rgb))
         error = (shown - mesh) ** 2

@@ -26,6 +26,7 @@ from mitsplat.arrays import Float32Array, Float64Array, Int32Array
 from mitsplat.camera import Camera, Lens
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, file_inside, write_file, write_text
+from mitsplat.format_version import FORMAT_VERSIONS
 from mitsplat.yaml_input import load_yaml
 
 HELD_OUT_EVERY = 8
@@ -40,7 +41,7 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class CameraSpec(_Strict):
+class PhotoCamera(_Strict):
     """A camera's keys: those of :class:`~mitsplat.camera.Camera`."""
 
     width: int
@@ -61,12 +62,13 @@ class PhotoSpec(_Strict):
     name: str = Field(min_length=1)
     file: str = Field(min_length=1)
     mask: str | None = None
-    camera: CameraSpec
+    camera: PhotoCamera
 
 
 class CaptureSpec(_Strict):
     """Keys of ``capture.json``."""
 
+    format_version: int = Field(1, ge=1)
     units: Literal["metre", "unknown"]
     up: Literal["z", "unknown"]
     table: bool = False
@@ -241,6 +243,7 @@ class Capture:
 
             write_file(folder / _POINTS, write_points)
             spec = CaptureSpec(
+                format_version=FORMAT_VERSIONS[CAPTURE_FILE],
                 units=self.units,
                 up=self.up,
                 table=self.table,
@@ -259,10 +262,10 @@ class Capture:
         """Read a capture's folder; images are read only by :meth:`Photo.picture`.
 
         Raises:
-            InputError: If a file is missing or breaks a rule.
+            InputError: If a file is missing, of a newer version or breaks a rule.
         """
         folder = Path(folder)
-        spec = load_yaml(folder / CAPTURE_FILE, CaptureSpec)
+        spec = load_yaml(folder / CAPTURE_FILE, CaptureSpec, newest=FORMAT_VERSIONS[CAPTURE_FILE])
         try:
             with (folder / _POINTS).open("rb") as stored, np.load(stored, allow_pickle=False) as arrays:
                 points, colours = arrays["points"], arrays["colours"]
@@ -279,7 +282,7 @@ class Capture:
         photos = []
         for entry, indices in zip(spec.photos, np.split(seen, starts) if len(counts) else [], strict=True):
             try:
-                camera = Camera(**{**entry.camera.model_dump(), "world_from_camera": entry.camera.world_from_camera})
+                camera = Camera(**entry.camera.model_dump())
             except ValueError as error:
                 raise InputError(f"{folder / CAPTURE_FILE}: {entry.name}: {error}") from error
             file = _named_file(folder, entry.file)
@@ -324,8 +327,8 @@ def _photo_spec(photo: Photo, folder: Path) -> PhotoSpec:
         name=photo.name,
         file=photo.file.relative_to(folder).as_posix(),
         mask=None if photo.mask is None else photo.mask.relative_to(folder).as_posix(),
-        camera=CameraSpec(
-            **{key: getattr(camera, key) for key in CameraSpec.model_fields if key != "world_from_camera"},
+        camera=PhotoCamera(
+            **{key: getattr(camera, key) for key in PhotoCamera.model_fields if key != "world_from_camera"},
             world_from_camera=tuple(map(tuple, camera.world_from_camera.tolist())),
         ),
     )

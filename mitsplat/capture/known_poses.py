@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsplat.camera import Camera
 from mitsplat.capture.photos import Prepared
-from mitsplat.capture.structure_from_motion import Model, find_points, read_model
+from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_model
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 
@@ -51,7 +51,7 @@ class _Transforms(_Lens):
     frames: list[_Frame] = Field(min_length=1)
 
 
-def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> Model:
+def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> SparseModel:
     """The cameras of photographs from a file that has them, keyed by the copies' file names.
 
     A model without points gets some from the photographs; its cameras stay as they are.
@@ -82,7 +82,7 @@ def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress:
     return replace(model, cameras=cameras, seen={file: model.seen[name] for name, file in names.items()})
 
 
-def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> Model:
+def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
     """Cameras of a ``transforms.json``, by its file paths."""
     try:
         content = _Transforms.model_validate_json(path.read_bytes())
@@ -111,7 +111,7 @@ def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> Model:
             raise InputError(f"{path}: frames[{number}]: {error}") from error
     empty = np.zeros((0, 3))
     nothing = {name: np.zeros(0, dtype=np.int32) for name in cameras}
-    return Model(cameras, empty, empty.astype(np.uint8), nothing)
+    return SparseModel(cameras, empty, empty.astype(np.uint8), nothing)
 
 
 def _match_names(content: _Transforms, photos: Mapping[str, Prepared]) -> dict[str, str]:

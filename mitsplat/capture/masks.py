@@ -137,7 +137,7 @@ def model_masks(model: Path) -> MaskMaker:
     if not model.is_file():
         raise InputError(f"{model}: no such file")
     try:
-        import rembg
+        import rembg  # optional: the extra [masks]
     except ImportError as error:
         raise MissingResourceError(f"masks by a model need rembg: pip install 'mitsplat[masks]' ({error})") from error
     try:

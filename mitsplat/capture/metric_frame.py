@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
+from skimage.transform import SimilarityTransform
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
-from mitsplat.capture.structure_from_motion import Model
+from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.capture.targets import Board, find_tags
 from mitsplat.errors import InputError
 
@@ -46,7 +47,7 @@ _TILT = np.cos(np.radians(30))
 
 
 @dataclass(frozen=True, eq=False)
-class Anchor:
+class MetricFrame:
     """Where a reconstruction is put.
 
     Attributes:
@@ -72,15 +73,15 @@ class Anchor:
     board: Float64Array | None = None
 
 
-def find_anchor(
-    model: Model,
+def find_metric_frame(
+    model: SparseModel,
     images: Mapping[str, Path],
     *,
     board: Board = DEFAULT_BOARD,
     tag: float | None = None,
     scale_from: tuple[str, str, float] | None = None,
     centred: bool = True,
-) -> Anchor:
+) -> MetricFrame:
     """Find scale and gravity by the best evidence there is.
 
     A ChArUco board decides both; so do AprilTags of known size; then ``scale_from`` the scale and the largest plane
@@ -163,7 +164,7 @@ def find_anchor(
     if board_pose is not None:
         board_pose = matrix @ board_pose
         board_pose[:3, :3] /= factor
-    return Anchor(
+    return MetricFrame(
         matrix=matrix,
         units="metre" if scale else "unknown",
         up="unknown" if plane is None else "z",
@@ -176,7 +177,7 @@ def find_anchor(
     )
 
 
-def spot(model: Model, name: str) -> Float64Array:
+def spot(model: SparseModel, name: str) -> Float64Array:
     """A place in the model, shape (3,): "photo" is its camera, "photo:x,y" the point that it sees at that pixel.
 
     Raises:
@@ -238,18 +239,11 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
 
 def fit_similarity(source: Float64Array, target: Float64Array) -> tuple[Float64Array, Float64Array]:
     """The similarity (4, 4) that takes points (N, 3) closest to others, and the residuals (N, 3) (Umeyama 1991)."""
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    centred = source - mean_source
-    u, spread, vt = np.linalg.svd((target - mean_target).T @ centred)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = float(spread @ signs / (centred**2).sum())
-    matrix = np.eye(4)
-    matrix[:3, :3] = scale * (u * signs) @ vt
-    matrix[:3, 3] = mean_target - matrix[:3, :3] @ mean_source
+    matrix = np.asarray(SimilarityTransform.from_estimate(source, target).params, dtype=np.float64)
     return matrix, source @ matrix[:3, :3].T + matrix[:3, 3] - target
 
 
-def find_table(model: Model, *, trials: int = 30000, seed: int = 0) -> tuple[Float64Array, Float64Array] | None:
+def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tuple[Float64Array, Float64Array] | None:
     """Normal towards the cameras and a point of the plane that things stand on, or None.
 
     RANSAC (Fischler and Bolles 1981) over the points: the plane with the most of them, at least 2 %, that has all but a
@@ -293,7 +287,7 @@ def find_table(model: Model, *, trials: int = 30000, seed: int = 0) -> tuple[Flo
     return normal, point
 
 
-def vertical_from_cameras(model: Model) -> Float64Array | None:
+def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
     """Up, shape (3,), if photographs from several sides, upright or on their side but held level, suggest it.
 
     It is the direction to which a side of every image is most nearly orthogonal, and from where the cameras look.
@@ -326,13 +320,13 @@ def meeting_point(origins: Float64Array, directions: Float64Array) -> Float64Arr
     return np.asarray(np.linalg.solve(whole, right))
 
 
-def _rays(model: Model) -> tuple[Float64Array, Float64Array]:
+def _rays(model: SparseModel) -> tuple[Float64Array, Float64Array]:
     """Centres and viewing directions of the cameras, (N, 3) each."""
     poses = np.array([camera.world_from_camera for camera in model.cameras.values()])
     return poses[:, :3, 3], poses[:, :3, 2]
 
 
-def _well_seen(model: Model) -> npt.NDArray[np.intp]:
+def _well_seen(model: SparseModel) -> npt.NDArray[np.intp]:
     """Indices of points that at least three images observe; all, where nothing is known of that."""
     counts = np.zeros(len(model.points), dtype=np.int64)
     for indices in model.seen.values():
@@ -350,7 +344,7 @@ def _upright(normal: Float64Array, heading: Float64Array) -> Float64Array:
     return np.stack([x, np.cross(normal, x), normal])
 
 
-def _find_targets(model: Model, images: Mapping[str, Path], board: Board, *, tags: bool) -> tuple[_Views, _Views]:
+def _find_targets(model: SparseModel, images: Mapping[str, Path], board: Board, *, tags: bool) -> tuple[_Views, _Views]:
     """Where images see the board's corners, (2,) by index and image, and AprilTags, (4, 2) by id and image."""
     corner_views: _Views = {}
     tag_views: _Views = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -17,11 +16,12 @@ from mitsplat.capture.board_mask import bare_squares
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
-from mitsplat.capture.metric_frame import DEFAULT_BOARD, Anchor, find_anchor
+from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.overview import capture_sheet
 from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
-from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, Model, find_cameras
+from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.targets import Board
+from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.progress import Progress
@@ -166,7 +166,7 @@ def capture_photos(
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
     by_file = {photo.file.name: photo for photo in prepared}
-    model, anchor, faults = _find_model(photos, by_file, settings, work, progress)
+    model, frame, faults = _find_model(photos, by_file, settings, work, progress)
     rejected |= {by_file[file].name: fault for file, fault in faults.items()}
     capture = Capture(
         photos=tuple(
@@ -175,18 +175,18 @@ def capture_photos(
         ),
         points=model.points,
         colours=model.colours,
-        units=anchor.units,
-        up=anchor.up,
+        units=frame.units,
+        up=frame.up,
         rejected=rejected,
-        scale_error=anchor.scale_error,
-    ).transformed(anchor.matrix)
+        scale_error=frame.scale_error,
+    ).transformed(frame.matrix)
     # What is near depends on what the units are; poses carry none.
     near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
-    capture = replace(capture, photos=near, table=anchor.table)
+    capture = replace(capture, photos=near, table=frame.table)
     if settings.undistorted:
         capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
     if settings.kind == "object":
-        capture = _masked(capture, anchor, settings, prepared, out, progress)
+        capture = _masked(capture, frame, settings, prepared, out, progress)
         if len(capture.photos) < MIN_PHOTOS:
             name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
             raise InputError(
@@ -202,9 +202,9 @@ def capture_photos(
     doubtful = {
         by_file[file].name: share
         for file, share in model.agreement.items()
-        if share < SURE_AGREEMENT and file not in anchor.confirmed and by_file[file].name in kept
+        if share < SURE_AGREEMENT and file not in frame.confirmed and by_file[file].name in kept
     }
-    result = CaptureResult(capture, len(files), anchor.source, model.reprojection_error, doubtful)
+    result = CaptureResult(capture, len(files), frame.source, model.reprojection_error, doubtful)
     record = {key: getattr(result, key) for key in _RECORDED}
     write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
     return result
@@ -222,17 +222,12 @@ def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
     """What decides a capture, in JSON."""
-
-    def digest(path: Path) -> str:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
     given = [path for path in (settings.poses, settings.masks, settings.mask_model) if path is not None]
     others = [path for place in given for path in (sorted(place.rglob("*")) if place.is_dir() else [place])]
     return {
-        "photos": {path.relative_to(photos).as_posix(): digest(path) for path in files},
+        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},
         "settings": json.loads(json.dumps(asdict(settings), default=str)),
-        "files": {str(path): digest(path) for path in others if path.is_file()},
+        "files": {str(path): file_hash(path) for path in others if path.is_file()},
     }
 
 
@@ -264,7 +259,7 @@ def _forget_other_photos(out: Path, inputs: dict[str, object], settings: Capture
 
 def _find_model(
     photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
-) -> tuple[Model, Anchor, dict[str, str]]:
+) -> tuple[SparseModel, MetricFrame, dict[str, str]]:
     """Cameras that neither each other nor a board contradicts, where they are put, and why other files have none."""
     faults: dict[str, str] = {}
     if settings.poses is not None:
@@ -272,24 +267,26 @@ def _find_model(
     else:
         model, faults = _without_faults(find_cameras(list(by_file.values()), work, progress))
     _demand_cameras(photos, model, by_file, faults)
-    anchor = _anchored(model, by_file, settings)
-    while anchor.wrong:
+    frame = _metric_frame(model, by_file, settings)
+    while frame.wrong:
         faults |= {
             file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
-            for file, error in anchor.wrong.items()
+            for file, error in frame.wrong.items()
         }
-        model, further = _without_faults(model.without(anchor.wrong), least=0 if settings.poses else MIN_POINTS)
+        model, further = _without_faults(model.without(frame.wrong), least=0 if settings.poses else MIN_POINTS)
         faults |= further
         _demand_cameras(photos, model, by_file, faults)
-        anchor = _anchored(model, by_file, settings)
+        frame = _metric_frame(model, by_file, settings)
     absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
     elsewhere = "it only fits a smaller group of photos, as of another object or side"
     for file in by_file.keys() - model.cameras.keys() - faults.keys():
         faults[file] = elsewhere if file in model.elsewhere else absent
-    return model, anchor, faults
+    return model, frame, faults
 
 
-def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared], faults: Mapping[str, str]) -> None:
+def _demand_cameras(
+    photos: Path, model: SparseModel, by_file: Mapping[str, Prepared], faults: Mapping[str, str]
+) -> None:
     """Refuse too few cameras."""
     if len(model.cameras) < MIN_PHOTOS:
         reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
@@ -300,7 +297,7 @@ def _demand_cameras(photos: Path, model: Model, by_file: Mapping[str, Prepared],
         )
 
 
-def _without_faults(model: Model, least: int = MIN_POINTS) -> tuple[Model, dict[str, str]]:
+def _without_faults(model: SparseModel, least: int = MIN_POINTS) -> tuple[SparseModel, dict[str, str]]:
     """The model without cameras that contradict the others or observe fewer points, and why each is left out."""
     shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
     wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
@@ -313,10 +310,10 @@ def _without_faults(model: Model, least: int = MIN_POINTS) -> tuple[Model, dict[
     }
 
 
-def _anchored(model: Model, by_file: dict[str, Prepared], settings: CaptureSettings) -> Anchor:
+def _metric_frame(model: SparseModel, by_file: dict[str, Prepared], settings: CaptureSettings) -> MetricFrame:
     if settings.metric:
-        return Anchor(np.eye(4), "metre", "z", table=True, source="the poses given")
-    return find_anchor(
+        return MetricFrame(np.eye(4), "metre", "z", table=True, source="the poses given")
+    return find_metric_frame(
         model,
         {file: by_file[file].file for file in model.cameras},
         board=settings.board,
@@ -342,7 +339,7 @@ def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepare
 
 def _masked(
     capture: Capture,
-    anchor: Anchor,
+    frame: MetricFrame,
     settings: CaptureSettings,
     prepared: Sequence[Prepared],
     out: Path,
@@ -354,13 +351,13 @@ def _masked(
         return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
     if settings.mask_model is not None:
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
-    if not anchor.table:
+    if not frame.table:
         raise InputError(
             "no table was found under the object to cut it out by: give masks (--masks or --mask-model), put it on "
             "something with texture, or capture it as an environment (--kind environment)"
         )
     points = object_points(capture)
-    bare = None if anchor.board is None else partial(bare_squares, settings.board, anchor.board)
+    bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
     above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
     masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
     if len(masked.photos) < MIN_PHOTOS:

@@ -51,7 +51,7 @@ _MODELS: Mapping[str, tuple[int, ...]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SparseModel:
     """What structure from motion found; its scale and frame are arbitrary.
 
     Attributes:
@@ -72,7 +72,7 @@ class Model:
     reprojection_error: float = float("nan")
     agreement: Mapping[str, float] = field(default_factory=dict)
 
-    def without_weak(self, min_points: int = MIN_POINTS) -> tuple[Model, dict[str, int]]:
+    def without_weak(self, min_points: int = MIN_POINTS) -> tuple[SparseModel, dict[str, int]]:
         """The model without images that observe fewer points, and how many those observe.
 
         Points that fewer than two images are left to see go too, which can weaken further images.
@@ -84,7 +84,7 @@ class Model:
         rest, weaker = self.without(weak).without_weak(min_points)
         return rest, weak | weaker
 
-    def without(self, names: Collection[str]) -> Model:
+    def without(self, names: Collection[str]) -> SparseModel:
         """The model without some images, and without the points that fewer than two others see."""
         kept = [name for name in self.cameras if name not in names]
         observers = np.zeros(len(self.points), dtype=np.int64)
@@ -92,7 +92,7 @@ class Model:
             observers[self.seen[name]] += 1
         stays = observers >= 2
         place = np.cumsum(stays) - 1
-        return Model(
+        return SparseModel(
             {name: self.cameras[name] for name in kept},
             self.points[stays],
             self.colours[stays],
@@ -103,7 +103,7 @@ class Model:
         )
 
 
-def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> Model:
+def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> SparseModel:
     """Cameras of photographs and the points they share. What an interrupted run had found of it is used.
 
     Raises:
@@ -115,7 +115,7 @@ def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | 
 
 def find_points(
     photos: Sequence[Prepared], cameras: Mapping[str, Camera], folder: Path, progress: Progress | None = None
-) -> Model:
+) -> SparseModel:
     """Points that photographs with known cameras share; the cameras stay as they are.
 
     Raises:
@@ -137,10 +137,10 @@ def find_points(
     job = _job(photos) | {"groups": [[photo.file.name] for photo in photos], "camera_model": "FULL_OPENCV"}
     model = _read_arrays(_run({"task": "triangulate", "cameras": known, **job}, folder, progress), photos)
     seen = {name: model.seen.get(name, np.zeros(0, dtype=np.int32)) for name in cameras}
-    return Model(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
+    return SparseModel(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
 
 
-def read_model(source: Path, folder: Path) -> Model:
+def read_model(source: Path, folder: Path) -> SparseModel:
     """A COLMAP model, ``cameras``, ``images`` and ``points3D`` as ``.bin`` or ``.txt``.
 
     Args:
@@ -277,7 +277,7 @@ def _rows(database: Path, table: str) -> int:
         return 0
 
 
-def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepared]) -> Model:
+def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepared]) -> SparseModel:
     """The child's result.
 
     Raises:
@@ -296,7 +296,7 @@ def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepar
         )
     }
     seen = np.split(arrays["seen"], np.cumsum(arrays["seen_counts"])[:-1])
-    return Model(
+    return SparseModel(
         cameras,
         arrays["points"],
         arrays["colours"],

@@ -124,7 +124,7 @@ def _cache() -> Finding:
 def _warp() -> Finding:
     remedy = "pip install warp-lang"
     try:
-        import warp
+        import warp  # whether it can be imported is the question
 
         with quiet_warp():
             devices = ", ".join(str(device) for device in warp.get_devices())

@@ -1,4 +1,7 @@
-"""Commands that make assets: of meshes, and of photographs."""
+"""Commands that make assets: of meshes, and of photographs.
+
+Commands import what they need inside of their functions, so that the start of every other one stays short.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.capture.targets import Board
-    from mitsplat.reconstruct.pipeline import Finished
+    from mitsplat.reconstruct.pipeline import AssetResult
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -87,9 +90,8 @@ def bake(
 
     if out.exists() and not out.is_dir():
         raise InputError(f"--out must be a folder (got the file {out})")
-    for option, value in (("--units", units), ("--density", density), ("--friction", friction)):
-        if not 0 < value < math.inf and not (value == 0 and option == "--friction"):
-            raise InputError(f"{option} must be finite and > 0 (got {value})")
+    if not 0 < units < math.inf:
+        raise InputError(f"--units must be finite and > 0 (got {units})")
     if seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")
     settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
@@ -406,7 +408,7 @@ def _board(squares: str, square: float) -> Board:
     return Board(int(columns), int(rows), square)
 
 
-def _tell_asset(done: Finished) -> None:
+def _tell_asset(done: AssetResult) -> None:
     """What came of an asset, and status 4 where a threshold is missed."""
     found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
     closed = "watertight" if found.watertight else "open"

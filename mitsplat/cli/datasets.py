@@ -1,4 +1,7 @@
-"""Commands on scenes and datasets."""
+"""Commands on scenes and datasets.
+
+Commands import what they need inside of their functions, so that the start of every other one stays short.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +107,9 @@ def render(
 
             refuse(loaded, run_faults(loaded))
             with progress_bars() as progress:
-                best = choose_preset(scene, tolerance, overrides=overrides, allow_outside=allow_outside, note=progress)
+                best = choose_preset(
+                    scene, tolerance, overrides=overrides, allow_outside=allow_outside, progress=progress
+                )
             typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
             loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
         with progress_bars() as progress:
@@ -180,7 +185,7 @@ def chart(
     check_tolerance(tolerance)
     with progress_bar() as progress:
         rows = measure_steps(
-            scene, frames=frames, overrides=_overrides(size=size), allow_outside=allow_outside, note=progress
+            scene, frames=frames, overrides=_overrides(size=size), allow_outside=allow_outside, progress=progress
         )
     best = cheapest(rows, tolerance)
     table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "SSIM", "mask IoU", "peak [GiB]")
@@ -294,7 +299,8 @@ def settle(
     with Console(stderr=True).status("settling") as status:
         found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
         settled = sorted(found, key=lambda layout: layout.index)
-    Console().print(certificate_table(settled))
+    # In 80 columns, as where output goes to a file, its headings would be cut to a letter or two.
+    Console(width=max(Console().width, 120)).print(certificate_table(settled))
     if preview:
         pictures = write_preview(loaded, settled[0], out)
         typer.echo(f"drop: {out} ({pictures} pictures)")

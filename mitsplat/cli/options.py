@@ -60,6 +60,7 @@ def command_log(json_log: bool, command: str) -> Iterator[Callable[[], AbstractC
 @contextmanager
 def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
     """A bar on stderr with speed and the time left."""
+    # Not at the top: half of the commands show no bar, and `--help` none.
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -20,7 +20,9 @@ from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.dataset.manifest import Manifest, cut_torn_line
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, storage_errors, write_file, write_text
-from mitsplat.formats.registry import Catalogue, CollectionWriter
+from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
+from mitsplat.formats.registry import TABLE, Catalogue, CollectionWriter
+from mitsplat.version import __version__
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
@@ -35,10 +37,8 @@ LOCK = ".lock"
 _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
 """Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
-    *("images", "labels", "layers", "annotations", "layouts", "scene"),
-    *("yolo-detect", "yolo-obb", "yolo-pose", "panoptic", "voc", "bop", "colmap"),
-    *("depth", "normals", "instances", "semantic", "flow", "report.html"),
-    *("data.yaml", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
+    *(entry for format in TABLE.values() for entry in format.entries),
+    *("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
 )
 
 
@@ -204,6 +204,7 @@ def missing_file(out: Path, record: Record) -> Path | None:
 
 def _check_own(out: Path) -> None:
     """Refuse a folder that holds something other than a dataset of mitsplat, which must not be mixed up or removed."""
+    present: Any = None
     try:
         present = json.loads((out / CONTENT).read_bytes())
         own = isinstance(present, dict) and "mitsplat" in present
@@ -213,6 +214,7 @@ def _check_own(out: Path) -> None:
         raise InputError(f"{out / CONTENT} cannot be read ({error})") from error
     if not own:
         raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds other files)")
+    check_format_version(present, FORMAT_VERSIONS[CONTENT], out / CONTENT)
 
 
 def _check_resumable(out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool) -> None:
@@ -221,7 +223,7 @@ def _check_resumable(out: Path, content: dict[str, Any], shard: dict[str, int] |
         return
     if not resume:
         raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
-    present = json.loads((out / CONTENT).read_bytes())
+    present = {FORMAT_VERSION: 1, **json.loads((out / CONTENT).read_bytes())}
     if difference := first_difference({**present, "libraries": None}, {**content, "libraries": None}):
         key, before, now = difference
         raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
@@ -282,10 +284,9 @@ def _remove_partial(out: Path) -> None:
 
 def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
     """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
-    from mitsplat.version import __version__
-
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
+        FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
         "mitsplat": __version__,
         "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
         "classes": list(scene.class_names),

@@ -19,15 +19,15 @@ from mitsplat.errors import PartialResultError
 from mitsplat.files import Record, link_file, storage_errors, write_file, write_text
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import Scene, layout_of
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame
-    from mitsplat.scene.layout import Layout
-    from mitsplat.scene.scene import Scene
 
 Render = Callable[..., "Frame"]
 """As :func:`mitsplat.frames.frame.render_frame`."""
-Settle = Callable[..., "Layout"]
+Settle = Callable[..., Layout]
 """As :func:`mitsplat.physics.settle.settle_layout`."""
 
 
@@ -44,8 +44,6 @@ class FrameMaker:
 
     def __call__(self, index: int, note: Note, /) -> tuple[Record, dict[str, float]]:
         """Make frame ``index``; its record and the seconds of its stages."""
-        from mitsplat.scene.scene import layout_of
-
         start = time.perf_counter()
         layout = self._layout(layout_of(self.scene, index), note)
         settled = time.perf_counter()
@@ -84,8 +82,6 @@ class FrameMaker:
         It is always read back, so that a resumed run works with the very same numbers, and stays the same object from
         view to view, by which the renderer knows that nothing moved.
         """
-        from mitsplat.scene.layout import Layout
-
         stored = json.loads(text)
         if self._kept is None or self._kept.index != stored["index"]:
             self._kept = Layout.from_json(stored)

@@ -5,14 +5,13 @@ Names are the users' to give twice, and one asset differs from entry to entry by
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import trimesh
 
+from mitsplat.content_hash import ContentHash, file_hash
 from mitsplat.splats import Splats
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
         found[f"shapes[{i}]"] = described.value(mesh)
     for i, light in enumerate(scene.spec.lights):
         if image := getattr(light, "image", None):
-            found[f"lights[{i}].image"] = hashlib.sha256(scene.images[image].read_bytes()).hexdigest()
+            found[f"lights[{i}].image"] = file_hash(scene.images[image])
     return found
 
 
@@ -65,8 +64,7 @@ class _Describer:
 
 
 def _hash(*arrays: Any) -> str:
-    digest = hashlib.sha256()
+    digest = ContentHash()
     for array in arrays:
-        digest.update(f"{array.dtype} {np.shape(array)}".encode())
-        digest.update(np.ascontiguousarray(array).data)
+        digest.add_array(array)
     return digest.hexdigest()

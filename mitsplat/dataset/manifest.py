@@ -5,7 +5,6 @@ Every line of a manifest ends in a checksum of the rest of it, ``"check"``: the 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -14,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 from mitsplat.files import Record, write_file
 
@@ -199,7 +199,7 @@ def append_line(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def _checksum(text: bytes) -> str:
-    return hashlib.sha256(text).hexdigest()[:16]
+    return ContentHash(text).hexdigest()[:16]
 
 
 def _append(path: Path, line: bytes) -> int:

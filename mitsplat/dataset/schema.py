@@ -21,7 +21,8 @@ from mitsplat.camera import Camera, Lens
 from mitsplat.dataset.manifest import parse_line
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from mitsplat.scene.spec import CameraSpec, Labelling, Output
+from mitsplat.format_version import FORMAT_VERSIONS, check_format_version
+from mitsplat.scene.spec import CameraSpec, LabelRules, Output
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]
@@ -42,7 +43,7 @@ class _Scene(_Stored):
     name: str
     seed: Count
     camera: CameraSpec
-    labels: Labelling
+    labels: LabelRules
     output: Output
 
 
@@ -63,6 +64,7 @@ class _Camera(_Stored):
     lens: Lens
     aperture_radius: Annotated[float, Field(ge=0)]
     focus_distance: Annotated[float, Field(gt=0)]
+    near: Annotated[float, Field(gt=0)]
     world_from_camera: Pose
 
 
@@ -118,20 +120,23 @@ def read_content(root: Path) -> dict[str, Any]:
     """What decides a dataset's bytes, ``dataset.json``.
 
     Raises:
-        InputError: If the folder is no dataset of mitsplat, or one of a version before labels were audited.
+        InputError: If the folder is no dataset of mitsplat, one of a version before labels were audited, or of a newer
+            version.
     """
     try:
         data = (root / "dataset.json").read_bytes()
         content: dict[str, Any] = json.loads(data)
-        checked = _Content.model_validate_json(data)
-    except ValidationError as error:
-        reason = f"dataset.json: {_first(error)}"
-        raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
     except OSError as error:
         reason = f"dataset.json: {error.strerror}" if root.is_dir() else "no such folder"
         raise InputError(f"{root} must be a dataset of mitsplat ({reason})") from error
     except ValueError as error:
         raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
+    check_format_version(content, FORMAT_VERSIONS["dataset.json"], root / "dataset.json")
+    try:
+        checked = _Content.model_validate_json(data)
+    except ValidationError as error:
+        reason = f"dataset.json: {_first(error)}"
+        raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
     if len(content["keypoints"]) != len(content["classes"]):
         raise InputError(
             f"{root / 'dataset.json'}: keypoints must be named for every class "
@@ -207,10 +212,7 @@ def _check_record(record: Record, content: dict[str, Any]) -> None:
     if not any(file.startswith("images/") for file in record["files"]):
         raise ValueError("files must list the frame's image")
     camera = record["camera"]
-    lens = {key: camera[key] for key in ("lens", "aperture_radius", "focus_distance")}
-    ((fx, _, cx), (_, fy, cy), _) = camera["intrinsics"]
-    pose, distortion = np.array(camera["world_from_camera"]), tuple(camera["distortion"])
-    Camera(camera["width"], camera["height"], fx, fy, cx, cy, pose, distortion, **lens)  # refuses what is none
+    Camera.from_json(camera)  # refuses what is none
     if record["labels"]["size"] != [camera["width"], camera["height"]]:
         raise ValueError(f"labels.size must be the camera's (got {record['labels']['size']})")
     if record.get("environment", ()) is None:

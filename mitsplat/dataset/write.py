@@ -27,22 +27,22 @@ from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mitsplat.dataset.folder import RUNS, SHEET, TIMINGS, Shard, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle
 from mitsplat.dataset.manifest import append_line
+from mitsplat.dataset.prospects import refuse, run_faults
 from mitsplat.engine.pool import run_frames
+from mitsplat.engine.ray import Cluster, run_on_ray
 from mitsplat.engine.resources import TYPICAL
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, storage_errors
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
+from mitsplat.frames.frame import render_frame
+from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note, Progress
-
-if TYPE_CHECKING:
-    from mitsplat.engine.ray import Cluster
-    from mitsplat.scene.scene import Scene
+from mitsplat.scene.scene import Scene, layout_of
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,6 @@ def write_dataset(
         MissingResourceError: If the disk is full.
         PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
     """
-    from mitsplat.dataset.prospects import refuse, run_faults
-    from mitsplat.scene.scene import layout_of
-
     out = Path(out)
     count = scene.num_frames if frames is None else frames
     if not 1 <= count <= scene.num_frames:
@@ -145,7 +142,7 @@ def write_dataset(
         if layouts:
             command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
             append_line(out / RUNS, {"command": command, "python": platform.python_version(), "workers": workers})
-        make = FrameMaker(scene, catalogue, out, render or _default_render(), settle or _default_settle())
+        make = FrameMaker(scene, catalogue, out, render or render_frame, settle or settle_layout)
         with closing(_results(make, layouts, workers, cluster, note)) as results:
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
@@ -165,24 +162,10 @@ def _results(
         with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory)) as made:
             yield from made
         return
-    from mitsplat.engine.ray import run_on_ray
-
     with closing(run_on_ray(RemoteFrames(make), layouts, cluster, workers=workers, note=note)) as parcels:
         for parcel in parcels:
             with storage_errors(make.out):
                 yield parcel.unpack(make.out), parcel.seconds
-
-
-def _default_render() -> Render:
-    from mitsplat.frames.frame import render_frame
-
-    return render_frame
-
-
-def _default_settle() -> Settle:
-    from mitsplat.physics.settle import settle_layout
-
-    return settle_layout
 
 
 @dataclass

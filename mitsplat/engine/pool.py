@@ -61,7 +61,7 @@ class LostWorkersError(PartialResultError):
 
 
 @dataclass(frozen=True)
-class Told:
+class Status:
     """What a worker is doing."""
 
     text: str
@@ -111,16 +111,16 @@ class Lost:
     how: str
 
 
-Answer = Told | Finished[Result] | Failure | Lost
+Answer = Status | Finished[Result] | Failure | Lost
 
 
 class Pool(Protocol[Result]):
     """Workers, known by their numbers, each of which makes one frame at a time."""
 
-    def hire(self) -> int:
+    def start(self) -> int:
         """Start a worker."""
 
-    def dismiss(self, worker: int) -> None:
+    def stop(self, worker: int) -> None:
         """Stop a worker."""
 
     def give(self, worker: int, frame: int, layout: int) -> None:
@@ -198,31 +198,31 @@ def run_pool(
     one is replaced only if it was the last, because memory is what it most likely died of, or where machines join.
 
     Args:
-        pool: Hires and hears the workers.
+        pool: Starts and hears the workers.
         layouts: The frames to make, by layout.
-        most: Workers to hire, at most one per frame.
+        most: Workers to start, at most one per frame.
         note: Hears what is being done.
-        grow: Begin with one worker, and hire the next only when the last one made the run faster.
+        grow: Begin with one worker, and start the next only when the last one made the run faster.
 
     Raises:
         InputError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
     plan = _Plan(layouts)
     most = min(most, plan.left)
-    staff = _Staff(most)
+    growth = _Growth(most)
     losses: Counter[int] = Counter()
     at_work: dict[int, int] = {}
 
-    def employ(worker: int) -> None:
+    def assign(worker: int) -> None:
         if (task := plan.take(worker)) is not None:
             at_work[worker] = task[1]
             pool.give(worker, task[1], task[0])
 
     for _ in range(min(1, most) if grow else most):
-        employ(pool.hire())
+        assign(pool.start())
     while at_work:
         for worker, answer in pool.wait():
-            if isinstance(answer, Told):
+            if isinstance(answer, Status):
                 note(answer.text)
                 continue
             if worker not in at_work:
@@ -241,25 +241,25 @@ def run_pool(
                 note(f"the process making frame {frame} {answer.how}: it is made again")
                 grow = False
                 if not at_work:
-                    employ(pool.hire())
+                    assign(pool.start())
                 continue
             if grow:
-                match staff.judge(worker, len(at_work) + 1, time.monotonic()):
-                    case "hire" if plan.left:
-                        employ(pool.hire())
-                    case "dismiss":
+                match growth.judge(worker, len(at_work) + 1, time.monotonic()):
+                    case "start" if plan.left:
+                        assign(pool.start())
+                    case "stop":
                         grow = False
                         plan.leave(worker)
-                        pool.dismiss(worker)
+                        pool.stop(worker)
                         yield answer.result
                         continue
                     case "stay":
                         grow = False
-            employ(worker)
+            assign(worker)
             yield answer.result
         for _ in range(pool.openings()):
             if plan.left:
-                employ(pool.hire())
+                assign(pool.start())
 
 
 class _Plan:
@@ -341,7 +341,7 @@ class _Plan:
                 return layout
 
 
-class _Staff:
+class _Growth:
     """Whether another worker pays, by the frames finished per second with so many and with one fewer."""
 
     def __init__(self, most: int) -> None:
@@ -353,7 +353,7 @@ class _Staff:
         self._since = 0.0
 
     def judge(self, worker: int, count: int, now: float) -> str:
-        """What follows from a frame that one of ``count`` workers finished: hire, dismiss, stay or "" for nothing yet.
+        """What follows from a frame that one of ``count`` workers finished: start, stop, stay or "" for nothing yet.
 
         The first frame of each is not counted: it waits for imports, compilation and a layout.
         """
@@ -369,9 +369,9 @@ class _Staff:
             return ""
         speed = self._finished / (now - self._since)
         if speed < WORTHWHILE * self._speed:
-            return "dismiss"
+            return "stop"
         self._speed = speed
-        return "hire" if count < self._most else "stay"
+        return "start" if count < self._most else "stay"
 
 
 class _Processes(Generic[Result]):
@@ -381,11 +381,11 @@ class _Processes(Generic[Result]):
         self._make = SharedArrays(make)
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: dict[int, tuple[BaseProcess, Connection]] = {}
-        self._hired = 0
+        self._count = 0
 
-    def hire(self) -> int:
+    def start(self) -> int:
         pipe, far_end = self._spawn.Pipe()
-        worker, self._hired = self._hired, self._hired + 1
+        worker, self._count = self._count, self._count + 1
         process = self._spawn.Process(target=_work, args=(far_end, self._make), name=f"mitsplat-{worker}", daemon=True)
         resource_tracker.ensure_running()  # starting it with the first worker would unblock what is blocked here
         # Ctrl-C goes to all processes of a terminal, but is for this one only: workers inherit what is blocked.
@@ -398,7 +398,7 @@ class _Processes(Generic[Result]):
         self._workers[worker] = process, pipe
         return worker
 
-    def dismiss(self, worker: int) -> None:
+    def stop(self, worker: int) -> None:
         process, pipe = self._workers.pop(worker)
         process.terminate()
         process.join()
@@ -419,7 +419,7 @@ class _Processes(Generic[Result]):
                 process.join()
                 code = process.exitcode or 0
                 how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-                self.dismiss(worker)
+                self.stop(worker)
                 yield worker, Lost(how)
 
     def openings(self) -> int:
@@ -429,7 +429,7 @@ class _Processes(Generic[Result]):
         for process, _ in self._workers.values():
             process.terminate()
         for worker in list(self._workers):
-            self.dismiss(worker)
+            self.stop(worker)
         self._make.close()
 
 
@@ -440,7 +440,7 @@ def _work(pipe: Connection, make: MakeFrame[Result]) -> None:
         while True:
             index = pipe.recv()
             try:
-                pipe.send(Finished(make(index, lambda text: pipe.send(Told(text)))))
+                pipe.send(Finished(make(index, lambda text: pipe.send(Status(text)))))
             except Exception as error:  # noqa: BLE001 - the parent raises it
                 pipe.send(Failure.of(error))
 

@@ -117,7 +117,7 @@ class _Actors(Generic[Result]):
 
     def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
         try:
-            import ray
+            import ray  # optional: the extra [cluster]
         except ImportError:
             raise MissingResourceError("the engine ray needs Ray: pip install 'mitsplat[cluster]'") from None
         self._ray = ray
@@ -149,7 +149,7 @@ class _Actors(Generic[Result]):
         self._stored = ray.put(job)
         self._answers: dict[Any, tuple[int, int, int]] = {}
         self._layouts: OrderedDict[int, tuple[Any, int | None]] = OrderedDict()
-        self._hired = 0
+        self._count = 0
 
     def _room(self) -> dict[str, int]:
         """Workers that fit on each node."""
@@ -176,12 +176,12 @@ class _Actors(Generic[Result]):
         joined = sum(count for node, count in room.items() if node not in known)
         return max(0, min(joined, self._most - len(self._actors)))
 
-    def hire(self) -> int:
-        worker, self._hired = self._hired, self._hired + 1
+    def start(self) -> int:
+        worker, self._count = self._count, self._count + 1
         self._actors[worker] = self._actor.remote([self._stored], self._gpu)
         return worker
 
-    def dismiss(self, worker: int) -> None:
+    def stop(self, worker: int) -> None:
         self._ray.kill(self._actors.pop(worker))
 
     def give(self, worker: int, frame: int, layout: int) -> None:
@@ -207,12 +207,12 @@ class _Actors(Generic[Result]):
                 if settler not in (None, worker):
                     self.give(worker, frame, layout)  # what was lost may be the worker that settled the layout
                     continue
-                self.dismiss(worker)
+                self.stop(worker)
                 yield worker, Lost(f"was lost ({str(error).strip().splitlines()[0]})")
 
     def close(self) -> None:
         for worker in list(self._actors):
-            self.dismiss(worker)
+            self.stop(worker)
         if self._started:
             self._ray.shutdown()
 
@@ -221,12 +221,12 @@ class _Actor:
     """A worker on the cluster."""
 
     def __init__(self, stored: list[Any], gpu: bool) -> None:
-        import ray
+        import ray  # optional: the extra [cluster]
 
-        import mitsplat  # before Mitsuba
+        import mitsplat  # before Mitsuba, as it says which LLVM to load
 
         if gpu:
-            import mitsuba as mi
+            import mitsuba as mi  # after mitsplat
 
             mi.set_variant("cuda_ad_rgb")
         self._version = mitsplat.__version__

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.capture.capture import Photo, stored_name
+from mitsplat.content_hash import ContentHash, file_hash
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthKind, DepthMaps
@@ -53,12 +53,11 @@ def model_maps(
     """
     if not model.is_file():
         raise InputError(f"{model}: no such file")
-    with model.open("rb") as opened:
-        weights = __version__.encode() + hashlib.file_digest(opened, "sha256").digest()
+    weights = __version__.encode() + bytes.fromhex(file_hash(model))
     files: dict[str, Path] = {}
     network = None
     for done, photo in enumerate(photos, start=1):
-        key = hashlib.sha256(weights + photo.file.read_bytes()).hexdigest()[:16]
+        key = ContentHash(weights, photo.file.read_bytes()).hexdigest()[:16]
         file = folder / f"{key}_{stored_name(photo.name, '.npy')}"
         if not file.exists():
             network = network or DepthNetwork(open_session(model), model)
@@ -77,7 +76,7 @@ def open_session(model: Path) -> Any:
         MissingResourceError: If onnxruntime is not installed.
     """
     try:
-        import onnxruntime
+        import onnxruntime  # optional: the extra [depth]
     except ImportError as error:
         raise MissingResourceError(
             f"depths by a model need onnxruntime: pip install 'mitsplat[depth]' ({error})"

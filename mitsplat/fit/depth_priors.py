@@ -15,6 +15,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import OpenEXR
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
@@ -103,8 +104,6 @@ def read_map(path: Path) -> Float32Array:
 
 def _read_exr(path: Path) -> Float32Array:
     """The only channel of an OpenEXR file, or the one that is named Z."""
-    import OpenEXR
-
     if not path.is_file():
         raise FileNotFoundError(path)
     with OpenEXR.File(str(path), separate_channels=True) as file:

@@ -21,7 +21,10 @@ import numpy.typing as npt
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.fit.training_view import HeldOut
+from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 from mitsplat.splats import Splats
+
+FIT_FILE = "fit.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +69,22 @@ def _mean_psnr(photos: Sequence[HeldOut]) -> float:
     return float(np.mean([photo.psnr for photo in photos]))
 
 
+def read_record(path: Path) -> Any:
+    """What ``fit.json`` says, of a version that is known; its keys are still to be checked.
+
+    Raises:
+        InputError: If it is missing, no JSON, or of a newer version.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file: has the fit finished?") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not the record of a fit ({error})") from error
+    check_format_version(record, FORMAT_VERSIONS[FIT_FILE], path)
+    return record
+
+
 @dataclass(frozen=True)
 class FitFolder:
     """Where a fit of some inputs is kept.
@@ -92,7 +111,7 @@ class FitFolder:
         Raises:
             InputError: If the folder holds such a fit otherwise.
         """
-        path = self.path / "fit.json"
+        path = self.path / FIT_FILE
         if not path.exists():
             return None
         try:
@@ -105,8 +124,8 @@ class FitFolder:
         return result
 
     def _read(self, path: Path) -> FitResult:
+        record = read_record(path)
         try:
-            record = json.loads(path.read_text(encoding="utf-8"))
             held_out, validation = (
                 tuple(HeldOut(**photo) for photo in record[name]) for name in ("held_out", "validation")
             )
@@ -114,7 +133,7 @@ class FitFolder:
             warnings = tuple(record["warnings"])
         except KeyError as error:
             raise InputError(f"{path}: not the record of a fit by this version (it lacks {error})") from error
-        except (OSError, ValueError, TypeError) as error:
+        except (ValueError, TypeError) as error:
             raise InputError(f"{path}: not the record of a fit ({error})") from error
         if found != self.inputs:
             raise InputError(f"{path}: belongs to a fit of other photos or settings, or by another version")
@@ -151,7 +170,7 @@ class FitFolder:
 
     def begin(self, *, goes_on: bool) -> None:
         """Remove what another fit left, its record first; the checkpoint stays if the fit goes on from it."""
-        (self.path / "fit.json").unlink(missing_ok=True)
+        (self.path / FIT_FILE).unlink(missing_ok=True)
         if not goes_on:
             (self.path / "checkpoint.npz").unlink(missing_ok=True)
         (self.path / "splats.ply").unlink(missing_ok=True)
@@ -173,7 +192,8 @@ class FitFolder:
         """Write the finished fit, and beside its own figures in the record what else is ``known`` of it."""
         result.splats.save(self.path / "splats.ply")
         names = ("inputs", "iterations", "seconds", "psnr", "ssim", "validation_psnr", "warnings")
-        record = {name: getattr(result, name) for name in names} | {"gaussians": len(result.splats)} | dict(known)
+        record = {FORMAT_VERSION: FORMAT_VERSIONS[FIT_FILE]} | {name: getattr(result, name) for name in names}
+        record |= {"gaussians": len(result.splats)} | dict(known)
         record |= {name: [asdict(p) for p in getattr(result, name)] for name in ("held_out", "validation")}
-        write_text(self.path / "fit.json", json.dumps(record, indent=1) + "\n")
+        write_text(self.path / FIT_FILE, json.dumps(record, indent=1) + "\n")
         (self.path / "checkpoint.npz").unlink(missing_ok=True)

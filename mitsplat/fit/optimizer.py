@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray
+from mitsplat.plugins.backward import pack_cloud
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.gaussian import Cloud
 from mitsplat.splats import Splats
@@ -90,7 +91,7 @@ class Adam:
         dr.eval(self.values, self.first, self.second)
 
 
-class Model(Adam):
+class GaussianModel(Adam):
     """Gaussians in terms of unconstrained parameters.
 
     Means and logarithms of scales are in ``unit``, opacities are logits; quaternions are xyzw and of any length. The SH
@@ -137,8 +138,6 @@ class Model(Adam):
 
     def cloud(self) -> Cloud:
         """The Gaussians as the renderer takes them."""
-        from mitsplat.plugins.backward import pack_cloud
-
         return pack_cloud(*self.activated(), self.bands)
 
     def sh_rates(self, rate: float, rest_rate: float) -> Any:

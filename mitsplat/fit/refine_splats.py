@@ -11,8 +11,10 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
-from mitsplat.fit.optimizer import Model
-from mitsplat.image_metrics import psnr_of
+from mitsplat.fit.image_metrics import psnr_of
+from mitsplat.fit.optimizer import GaussianModel
+from mitsplat.plugins.backward import render_differentiable
+from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant, make_sensor
 from mitsplat.splats import Splats
@@ -68,7 +70,7 @@ def refine_splats(
     pictures: Sequence[Picture],
     settings: RefineSettings = RefineSettings(),
     *,
-    progress: Callable[[int, float], None] | None = None,
+    observe: Callable[[int, float], None] | None = None,
 ) -> Splats:
     """Splats that look more like the pictures, by Adam on the mean squared error of encoded colours.
 
@@ -79,7 +81,7 @@ def refine_splats(
         splats: Where to start.
         pictures: What to come close to.
         settings: Steps and rates.
-        progress: Told after every step its number and its PSNR [dB].
+        observe: Told after every step its number and its PSNR [dB].
 
     Raises:
         ValueError: If there are no pictures, or no splats.
@@ -87,10 +89,7 @@ def refine_splats(
     if not pictures or not len(splats):
         raise ValueError(f"refining needs pictures and splats (got {len(pictures)} and {len(splats)})")
     ensure_variant()
-    from mitsplat.plugins.backward import render_differentiable
-    from mitsplat.plugins.splat_proxy import view_of
-
-    model = Model(splats, float(np.mean(splats.scales)))
+    model = GaussianModel(splats, float(np.mean(splats.scales)))
     views = [view_of(make_sensor(picture.camera)) for picture in pictures]
     targets = [
         ([mi.Float(np.ravel(p.rgb[..., c]).astype(np.float32)) for c in range(3)], mi.Float(np.ravel(p.alpha)))
@@ -112,6 +111,6 @@ def refine_splats(
         decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
         rates = {name: getattr(settings, f"rate_{name}") * decay for name in model.values}
         model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * settings.rest_rate)})
-        if progress is not None:
-            progress(step, psnr_of(float(loss.numpy()[0]) / 3))
+        if observe is not None:
+            observe(step, psnr_of(float(loss.numpy()[0]) / 3))
     return model.splats()

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
-from mitsplat.fit.optimizer import Model
+from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.strategy_mcmc import DEAD
 from mitsplat.plugins.device import wrapped
 
@@ -57,14 +57,14 @@ class Classic:
         self._pull: Any = mi.Float(0)
         self._photos: Any = mi.Float(0)
 
-    def look(self, model: Model, camera: Camera) -> None:
+    def look(self, model: GaussianModel, camera: Camera) -> None:
         """Add the gradients of a photo to those since the last change."""
         pull, seen = image_gradient(model, camera)
         self._pull += dr.select(seen, pull, 0)
         self._photos += dr.select(seen, mi.Float(1), 0)
         dr.eval(self._pull, self._photos)
 
-    def refine(self, model: Model, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
+    def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
         """Clone, split and remove now and then, and reset opacities more rarely."""
         if not (_REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0):
             return
@@ -86,7 +86,7 @@ class Classic:
         self._reset_step, self._reset_fraction = int(state["reset"][0]), float(state["reset"][1])
 
 
-def image_gradient(model: Model, camera: Camera) -> tuple[Any, Any]:
+def image_gradient(model: GaussianModel, camera: Camera) -> tuple[Any, Any]:
     """How strongly the loss pulls at the places of Gaussians in an image, and which of them are in it, on the device.
 
     A mean m that moves by dX along the camera's x axis at depth z moves in the image by fx dX / z pixels. So the
@@ -128,7 +128,7 @@ def image_gradient(model: Model, camera: Camera) -> tuple[Any, Any]:
 
 
 def control_density(
-    model: Model, pull: Float64Array, most: int, rng: np.random.Generator, *, remove_large: bool
+    model: GaussianModel, pull: Float64Array, most: int, rng: np.random.Generator, *, remove_large: bool
 ) -> None:
     """Clone or split Gaussians whose mean gradient in the image is large, and remove those that show nothing.
 
@@ -166,7 +166,7 @@ def control_density(
     dr.eval(model.values)
 
 
-def lower_opacities(model: Model) -> None:
+def lower_opacities(model: GaussianModel) -> None:
     """Make no Gaussian more opaque than twice the opacity at which it is removed; opacities lose Adam's moments."""
     most = dr.opaque(mi.Float, float(np.log(_RESET_TO / (1 - _RESET_TO))))
     model.values["opacities"] = dr.minimum(dr.detach(model.values["opacities"]), most)

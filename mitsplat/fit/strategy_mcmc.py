@@ -20,7 +20,7 @@ from scipy.special import comb
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
-from mitsplat.fit.optimizer import Model
+from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.gaussian import rotation_axes
 from mitsplat.spherical_harmonics import SH_C0
@@ -50,10 +50,10 @@ class Densification(Protocol):
 
     scale_weight: float
 
-    def look(self, model: Model, camera: Camera) -> None:
+    def look(self, model: GaussianModel, camera: Camera) -> None:
         """Note what the gradients of a photo by this camera say, before they are used up."""
 
-    def refine(self, model: Model, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
+    def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
         """Change the Gaussians after a step.
 
         Args:
@@ -86,10 +86,10 @@ class Mcmc:
     def __init__(self, most: int, start: int, every: int, seed: int) -> None:
         self._most, self._start, self._every, self._seed = most, start, every, seed
 
-    def look(self, model: Model, camera: Camera) -> None:
+    def look(self, model: GaussianModel, camera: Camera) -> None:
         """Nothing: opacity alone decides."""
 
-    def refine(self, model: Model, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
+    def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
         """Move dead Gaussians and add new ones now and then, and always jitter."""
         if _REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0:
             relocate(model, rng)
@@ -136,7 +136,7 @@ def seed_splats(
     )
 
 
-def relocate(model: Model, rng: np.random.Generator) -> int:
+def relocate(model: GaussianModel, rng: np.random.Generator) -> int:
     """Put dead Gaussians where others are opaque; their number."""
     opacities = np.array(dr.detach(model.activated()[3]), dtype=np.float64)
     dead = opacities <= DEAD
@@ -148,7 +148,7 @@ def relocate(model: Model, rng: np.random.Generator) -> int:
     return int(dead.sum())
 
 
-def grow(model: Model, count: int, rng: np.random.Generator) -> None:
+def grow(model: GaussianModel, count: int, rng: np.random.Generator) -> None:
     """Add Gaussians, up to so many in all, where there is opacity."""
     opacities = np.array(dr.detach(model.activated()[3]), dtype=np.float64)
     missing = count - len(opacities)
@@ -156,7 +156,7 @@ def grow(model: Model, count: int, rng: np.random.Generator) -> None:
         _share_out(model, np.r_[np.arange(len(opacities)), _draw(opacities, missing, rng)], opacities)
 
 
-def jitter(model: Model, rate: float, seed: Sequence[int]) -> None:
+def jitter(model: GaussianModel, rate: float, seed: Sequence[int]) -> None:
     """Move Gaussians at random within their own shape, the less the more opaque they are (eq. 8 of the paper).
 
     Args:
@@ -190,7 +190,7 @@ def _draw(weights: Float64Array, count: int, rng: np.random.Generator) -> npt.ND
     return rng.choice(len(weights), count, p=weights / weights.sum())
 
 
-def _share_out(model: Model, rows: npt.NDArray[np.intp], opacities: Float64Array) -> None:
+def _share_out(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: Float64Array) -> None:
     """Replace the Gaussians by these rows of them; rows that occur more than once share opacity and size."""
     copies = np.bincount(rows, minlength=len(opacities))
     several = copies > 1

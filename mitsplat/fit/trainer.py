@@ -6,7 +6,6 @@ see :mod:`mitsplat.fit.folder`.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,16 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import add_content
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps
 from mitsplat.fit.folder import FitFolder, FitResult
+from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
-from mitsplat.fit.optimizer import Adam, Model
+from mitsplat.fit.optimizer import Adam, GaussianModel
 from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
-from mitsplat.fit.training_view import HeldOut, Sight
-from mitsplat.image_metrics import psnr_of
+from mitsplat.fit.training_view import HeldOut, TrainingView
+from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
+from mitsplat.plugins.photometric import photometric_loss
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant
 from mitsplat.version import __version__
@@ -196,7 +197,7 @@ def fit_capture(
     fit = _Fit(capture, training, validation, settings, maps)
     if state is not None:
         fit.restore(state)
-    held = [_sight(photo, settings) for photo in held_out]
+    held = [_training_view(photo, settings) for photo in held_out]
     folder.begin(goes_on=state is not None)
     saved = time.monotonic()
     while fit.fraction < 1:
@@ -236,8 +237,8 @@ class _Fit:
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        self.photos = [_sight(photo, settings, maps.get(photo.name)) for photo in training]
-        self.validation = [_sight(photo, settings) for photo in validation]
+        self.photos = [_training_view(photo, settings, maps.get(photo.name)) for photo in training]
+        self.validation = [_training_view(photo, settings) for photo in validation]
         centres = np.array([photo.camera.centre for photo in training])
         self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
         rng = np.random.default_rng([settings.seed, 0])
@@ -247,7 +248,7 @@ class _Fit:
         seen = [photo.seen for photo in training]
         points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
         self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
-        self.model = Model(seed_splats(points, colours, settings.sh_degree), self.extent)
+        self.model = GaussianModel(seed_splats(points, colours, settings.sh_degree), self.extent)
         self.densification = _densification(settings, self.model.count)
         self.scale_weight = self.densification.scale_weight if settings.scale_weight is None else settings.scale_weight
         self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
@@ -296,19 +297,16 @@ class _Fit:
         self.densification.refine(self.model, self.steps, fraction, rate, rng)
         self.errors.append(error)
 
-    def _depth_weight(self, sight: Sight, fraction: float) -> float:
+    def _depth_weight(self, sight: TrainingView, fraction: float) -> float:
         """Weight of the depths of a photo in this step."""
         if self.steps % _DEPTH_EVERY:
             return 0.0
         return self.settings.depth_weight * (1 if sight.inverse_depth is None else _MAPS_FALL_TO**fraction)
 
     def _loss(
-        self, sight: Sight, number: int, quality: Quality, fraction: float, rng: np.random.Generator
+        self, sight: TrainingView, number: int, quality: Quality, fraction: float, rng: np.random.Generator
     ) -> tuple[Any, Any]:
         """The loss, and the mean squared error alone."""
-        from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
-        from mitsplat.plugins.photometric import photometric_loss
-
         s = self.settings
         loss = mi.Float(0)
         weight = self._depth_weight(sight, fraction)
@@ -351,7 +349,7 @@ class _Fit:
         validated = None if np.isnan(self.validated) else self.validated
         return FitProgress(self.steps, fraction, psnr_of(error), validated, self.model.count)
 
-    def check(self, photos: Sequence[Sight], folder: Path | None) -> tuple[HeldOut, ...]:
+    def check(self, photos: Sequence[TrainingView], folder: Path | None) -> tuple[HeldOut, ...]:
         """Photos that are not fitted, with a picture of each in the folder."""
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
         found = []
@@ -430,24 +428,24 @@ def _set_aside(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Ph
     return tuple(photo for photo in training if photo not in validation), validation
 
 
-def _sight(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None) -> Sight:
+def _training_view(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None) -> TrainingView:
     scale = min(1.0, settings.size / max(photo.camera.width, photo.camera.height))
-    return Sight(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth)
+    return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth)
 
 
 def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
     """SHA-256 of everything that decides a fit."""
-    digest = hashlib.sha256(json.dumps([__version__, asdict(settings)], sort_keys=True).encode())
+    digest = ContentHash()
+    digest.add_json([__version__, asdict(settings)])
     for photo in capture.photos:
         camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
-        digest.update(json.dumps([photo.name, camera]).encode())
-        digest.update(np.ascontiguousarray(photo.seen).tobytes())
+        digest.add(json.dumps([photo.name, camera]), np.ascontiguousarray(photo.seen).tobytes())
         for file in (photo.file, photo.mask):
-            digest.update(b"-" if file is None else file.read_bytes())
-    digest.update(capture.points.tobytes() + capture.colours.tobytes())
+            digest.add(b"-" if file is None else file.read_bytes())
+    digest.add(capture.points.tobytes(), capture.colours.tobytes())
     if depths is not None:
-        digest.update(depths.kind.encode())
+        digest.add(depths.kind)
         for name, file in sorted(depths.files.items()):
-            digest.update(name.encode())
-            add_content(digest, file)
+            digest.add(name)
+            digest.add_file(file)
     return digest.hexdigest()

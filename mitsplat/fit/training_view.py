@@ -17,9 +17,11 @@ from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
 from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
-from mitsplat.fit.optimizer import Model
-from mitsplat.image_metrics import psnr, ssim
+from mitsplat.fit.image_metrics import psnr, ssim
+from mitsplat.fit.optimizer import GaussianModel
+from mitsplat.plugins.backward import render_differentiable
 from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
 from mitsplat.render.layers import make_sensor
 
@@ -45,7 +47,7 @@ class HeldOut:
     psnr_corrected: float
 
 
-class Sight:
+class TrainingView:
     """A photo at one size.
 
     Args:
@@ -74,15 +76,13 @@ class Sight:
         self._depths: tuple[Any, Any] | None = None
 
     @cached_property
-    def half(self) -> Sight:
+    def half(self) -> TrainingView:
         """The same photo at half the size."""
-        return Sight(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
+        return TrainingView(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
 
     @cached_property
     def view(self) -> Any:
         """The camera as the renderer takes it."""
-        from mitsplat.plugins.splat_proxy import view_of
-
         return view_of(make_sensor(self.camera))
 
     @property
@@ -128,10 +128,8 @@ class Sight:
             self._depths = wrapped(mi.UInt32, number), wrapped(mi.Float, inverse)
         return self._depths
 
-    def render(self, model: Model, quality: Quality) -> tuple[Float32Array, Float32Array]:
+    def render(self, model: GaussianModel, quality: Quality) -> tuple[Float32Array, Float32Array]:
         """Display-encoded colour times alpha, (H, W, 3), and alpha, (H, W), as the splats look from here."""
-        from mitsplat.plugins.backward import render_differentiable
-
         rgb, alpha = render_differentiable(model.cloud(), self.view, quality)
         shape = self.camera.height, self.camera.width
         return np.stack([np.array(c).reshape(shape) for c in rgb], axis=-1), np.array(alpha).reshape(shape)

@@ -26,7 +26,7 @@ from scipy.spatial.distance import pdist
 
 from mitsplat.camera import Camera
 from mitsplat.files import GrowingFile, Record, write_file, write_text
-from mitsplat.formats.coco import camera_of
+from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.json_stream import EntriesFile
 from mitsplat.labels.labels import Labels
@@ -41,6 +41,15 @@ def scene_folder(record: Record) -> str:
     return f"bop/{record['split']}/{record['layout']:06d}"
 
 
+def write(files: FrameFiles) -> None:
+    """Write a frame's pictures, and its own under a second name."""
+    scene = scene_folder(files.record)
+    files.add_image(f"{scene}/rgb/{files.image_name}")
+    files.add_png(f"{scene}/depth/{files.number}.png", files.depth)
+    for folder, position, data in mask_pictures(files.frame.labels):
+        files.add_bytes(f"{scene}/{folder}/{files.number}_{position:06d}.png", data)
+
+
 def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
     """(folder, position of the instance, PNG of 0 and 255) of every mask of a frame."""
     size = labels.width, labels.height
@@ -50,14 +59,14 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
 
 
 class ScenesWriter:
-    """Writes the annotations of all scenes: frames come by layout.
+    """Writes the annotations of all scenes, and the models: frames come by layout.
 
     Files of scenes are put on disk side by side, as many as :data:`_TOGETHER`: a million images have 300,000, and
     waiting for one after the other would take longer than all the rest.
     """
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, root: Path, catalogue: Catalogue) -> None:
+        self._root, self._meshes = root, catalogue.meshes
         self._folder, self._layout = "", -1
         self._files: dict[str, EntriesFile] = {}
         self._ended: list[GrowingFile] = []
@@ -75,7 +84,7 @@ class ScenesWriter:
             self._files = {
                 part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
             }
-        index, camera = str(record["index"]), camera_of(record)
+        index, camera = str(record["index"]), Camera.from_json(record["camera"])
         self._files["camera"].append(index, camera_entry(record, camera))
         self._files["gt"].append(index, pose_entries(record, camera))
         self._files["gt_info"].append(index, info_entries(record))
@@ -92,9 +101,10 @@ class ScenesWriter:
         self._ended = []
 
     def keep(self) -> None:
-        """Give the files of the last scenes their names."""
+        """Give the files of the last scenes their names, and write the models."""
         self._end_scene()
         self._name_ended()
+        write_models(self._root, self._meshes)
 
     def discard(self) -> None:
         """Remove what was not kept."""

@@ -8,20 +8,22 @@
     Every pixel's segment, id = R + 256 G + 256² B; the environment is a segment of stuff, and what belongs to an
     instance without a label is void (id 0).
 ``annotations/poses_<split>.json``
-    Cameras, and the rigid transforms of the instances, in metres.
+    Cameras, and the rigid transforms of the instances, in metres. ``object`` is the position of an instance's entry
+    among the scene's ``objects``, from 0: names of assets may be given twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
-from mitsplat.files import Record
+from mitsplat.files import SPLITS, Record
+from mitsplat.formats.format import Catalogue, Describer, FrameFiles
 from mitsplat.json_stream import ListsFile
 from mitsplat.labels.labels import UNLABELLED, Labels
 
@@ -80,7 +82,7 @@ def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
 
 def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
     """Camera and 6-DoF poses of a frame."""
-    camera_from_world = camera_of(record).camera_from_world
+    camera_from_world = Camera.from_json(record["camera"]).camera_from_world
     return {
         **_image(record),
         "camera": record["camera"],
@@ -88,6 +90,7 @@ def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
             {
                 "id": label["id"],
                 "class": label["class"],
+                "object": label["asset"],
                 "asset": assets[label["asset"]],
                 "camera_from_object": (camera_from_world @ np.array(label["world_from_object"])).tolist(),
                 "world_from_object": label["world_from_object"],
@@ -143,6 +146,54 @@ class PosesWriter:
         self.file.append("frames", pose_entry(record, self._assets))
 
 
+class _OfSplit(Protocol):
+    file: ListsFile
+
+    def add(self, record: Record) -> None: ...
+
+
+class _OfSplits:
+    """A file of annotations for each split."""
+
+    def __init__(self, root: Path, name: str, make: Callable[[Path], _OfSplit]) -> None:
+        self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in SPLITS}
+
+    def add(self, record: Record) -> None:
+        self._writers[record["split"]].add(record)
+
+    def keep(self) -> None:
+        for writer in self._writers.values():
+            writer.file.keep()
+
+    def discard(self) -> None:
+        for writer in self._writers.values():
+            writer.file.discard()
+
+
+def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> Describer:
+    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``."""
+    names = catalogue.class_names, catalogue.keypoint_names
+    return _OfSplits(
+        root, "amodal" if amodal else "instances", lambda path: InstancesWriter(path, *names, amodal=amodal)
+    )
+
+
+def describe_panoptic(root: Path, catalogue: Catalogue) -> Describer:
+    """Writes ``panoptic_<split>.json``."""
+    return _OfSplits(root, "panoptic", lambda path: PanopticWriter(path, catalogue.class_names))
+
+
+def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
+    """Writes ``poses_<split>.json``."""
+    return _OfSplits(root, "poses", lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets))
+
+
+def write_panoptic(files: FrameFiles) -> None:
+    """Write a frame's picture of segments."""
+    picture = panoptic_image(files.labelled, files.ids, files.record.get("environment"))
+    files.add_png(f"panoptic/{files.name}.png", picture)
+
+
 def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> dict[str, Any] | None:
     """The segment of the pixels where an id map holds 0: its id, area and box; None if there are none."""
     ys, xs = np.nonzero(ids == 0)
@@ -161,15 +212,6 @@ def panoptic_image(
     if environment is not None:
         segments[ids == 0] = environment["id"]
     return np.stack([segments & 255, segments >> 8 & 255, segments >> 16], axis=-1).astype(np.uint8)
-
-
-def camera_of(record: Record) -> Camera:
-    """The camera that a record states."""
-    stored = record["camera"]
-    ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
-    pose, distortion = np.array(stored["world_from_camera"]), tuple(stored["distortion"])
-    lens = {key: stored[key] for key in ("lens", "aperture_radius", "focus_distance")}
-    return Camera(stored["width"], stored["height"], fx, fy, cx, cy, pose, distortion, **lens)
 
 
 def image_file(record: Record) -> str:

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
 from mitsplat.files import GrowingFile, Record
-from mitsplat.formats.coco import camera_of, image_file
+from mitsplat.formats.coco import image_file
+from mitsplat.formats.format import Catalogue
 
 
 class ModelWriter:
     """Writes the three files."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, catalogue: Catalogue) -> None:
         self._cameras, self._images, self._points = (
             GrowingFile(root / f"colmap/{name}.txt") for name in ("cameras", "images", "points3D")
         )
@@ -26,7 +27,7 @@ class ModelWriter:
 
     def add(self, record: Record) -> None:
         """Describe a frame."""
-        camera = camera_of(record)
+        camera = Camera.from_json(record["camera"])
         model = camera_model(camera)
         if model not in self._models:
             self._models[model] = len(self._models) + 1

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
@@ -20,6 +21,7 @@ from mitsplat.labels.labels import Labels
 from mitsplat.masks import Box
 
 if TYPE_CHECKING:
+    from mitsplat.formats.format import FrameFiles
     from mitsplat.frames.frame import Frame
 
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
@@ -29,16 +31,47 @@ UNKNOWN_FLOW = 1e10
 """Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
 
 
-def write_exr(path: Path, frame: Frame) -> None:
-    """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
-    import OpenEXR
+def write_instances(files: FrameFiles) -> None:
+    """Write the ids of a frame's labelled instances."""
+    files.add_png(f"instances/{files.name}.png", files.labelled)
 
-    fixed = ("depth", "instance", "proxy_instance", "normal", "light")
-    layers = {**{name: getattr(frame, name) for name in fixed}, **frame.layers}
+
+def write_semantic(files: FrameFiles) -> None:
+    """Write a frame's classes."""
+    picture = semantic_picture(files.frame.labels, files.ids, files.catalogue.class_names)
+    files.add_png(f"semantic/{files.name}.png", picture)
+
+
+def write_depth(files: FrameFiles) -> None:
+    """Write a frame's depth."""
+    files.add_png(f"depth/{files.name}.png", files.depth)
+
+
+def write_normals(files: FrameFiles) -> None:
+    """Write a frame's normals."""
+    files.add_png(f"normals/{files.name}.png", normal_picture(files.frame.normal))
+
+
+def write_flow(files: FrameFiles) -> None:
+    """Write the flow to the next view of the frame's layout, if there is one."""
+    frame = files.frame
+    if frame.plan.next_camera is not None:
+        flow = optical_flow(frame.depth, frame.camera, frame.plan.next_camera)
+        files.add_bytes(f"flow/{files.name}.flo", encode_flow(flow))
+
+
+def write_exr(files: FrameFiles) -> None:
+    """Write the layers of a frame."""
+    files.add(f"layers/{files.name}.exr", lambda path: save_exr(path, files.frame))
+
+
+def save_exr(path: Path, frame: Frame) -> None:
+    """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
     names = {"depth": "Z", "alpha": "A"}
     axes = {"normal": "XYZ"}
     channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}
-    for layer, values in layers.items():
+    for layer in ("depth", "instance", "proxy_instance", "normal", "light", "alpha", "captured", "highlight"):
+        values = getattr(frame.layers, layer)
         if values.ndim == 2:
             channels[names.get(layer, layer)] = values
         else:
@@ -175,8 +208,8 @@ def optical_flow(depth: npt.NDArray[np.floating[Any]], camera: Camera, following
     return flow.reshape(height, width, 2).astype(np.float32)
 
 
-def write_flow(path: Path, flow: Float32Array) -> None:
-    """Write optical flow (H, W, 2) as Middlebury's ``.flo``: a tag, width, height, then pairs of floats."""
+def encode_flow(flow: Float32Array) -> bytes:
+    """Optical flow (H, W, 2) as Middlebury's ``.flo``: a tag, width, height, then pairs of floats."""
     height, width = flow.shape[:2]
     header = b"PIEH" + np.array([width, height], dtype="<i4").tobytes()
-    path.write_bytes(header + np.ascontiguousarray(flow, dtype="<f4").tobytes())
+    return header + np.ascontiguousarray(flow, dtype="<f4").tobytes()

@@ -12,15 +12,21 @@ in that box is hidden. Both are exact here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
 from mitsplat.files import SPLITS, GrowingFile, Record
+from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.labels.labels import InstanceLabel, Labels
 
 TRUNCATED, OCCLUDED = 0.15, 0.05
 """Shares of an object above which its flags are set."""
+
+
+def write(files: FrameFiles) -> None:
+    """Write a frame's XML file, and its picture under a second name."""
+    files.add_image(f"voc/JPEGImages/{files.image_name}")
+    files.add_bytes(f"voc/Annotations/{files.number}.xml", annotation(files.frame.labels, files.image_name).encode())
 
 
 def annotation(labels: Labels, image: str) -> str:
@@ -58,11 +64,11 @@ def flags(label: InstanceLabel) -> tuple[bool, bool]:
 class SetsWriter:
     """Writes which images belong to which split, and what classes there are."""
 
-    def __init__(self, root: Path, class_names: Iterable[str]) -> None:
+    def __init__(self, root: Path, catalogue: Catalogue) -> None:
         self._files = {split: GrowingFile(root / f"voc/ImageSets/Main/{split}.txt") for split in SPLITS}
         self._classes = GrowingFile(root / "voc/labelmap.txt")
-        lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in ("background", *class_names))]
-        self._classes.write("".join(lines))
+        names = ("background", *catalogue.class_names)
+        self._classes.write("".join(["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in names)]))
 
     def add(self, record: Record) -> None:
         """Describe a frame."""

@@ -18,12 +18,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.files import SPLITS
+from mitsplat.files import SPLITS, Record, write_text
+from mitsplat.formats.format import Catalogue, Format, FrameFiles
 from mitsplat.labels.labels import UNLABELLED, InstanceLabel, Labels
 
 
@@ -33,6 +36,40 @@ class Task:
 
     folder: str
     numbers: Callable[[InstanceLabel], Float64Array]
+
+
+def format_of(task: str) -> Format:
+    """The format of a task."""
+    entries = (TASKS[task].folder.rstrip("/"),) if TASKS[task].folder else ("labels", "data.yaml")
+    return Format(entries, partial(write, task=task), partial(DataYaml, task=task))
+
+
+def write(files: FrameFiles, task: str) -> None:
+    """Write a frame's label file; tasks but the first get the picture under a second name."""
+    folder, text = TASKS[task].folder, yolo_lines(files.frame.labels, task, files.catalogue.num_keypoints)
+    if folder:
+        files.add_image(folder + files.image)
+    files.add_bytes(f"{folder}labels/{files.name}.txt", text.encode())
+
+
+class DataYaml:
+    """Writes ``data.yaml`` of a task."""
+
+    def __init__(self, root: Path, catalogue: Catalogue, task: str) -> None:
+        self._path, self._class_names = root / TASKS[task].folder / "data.yaml", catalogue.class_names
+        self._keypoint_names = catalogue.keypoint_names if task == "yolo-pose" else None
+        self._splits: set[str] = set()
+
+    def add(self, record: Record) -> None:
+        """Remember the frame's split."""
+        self._splits.add(record["split"])
+
+    def keep(self) -> None:
+        """Write the file."""
+        write_text(self._path, data_yaml(self._class_names, self._splits, self._keypoint_names))
+
+    def discard(self) -> None:
+        """There is nothing that was not kept."""
 
 
 def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> str:

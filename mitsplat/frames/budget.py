@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mitsplat.camera import Camera
 from mitsplat.engine.resources import WorkerMemory
+from mitsplat.plugins.tiles import PAIRS_MAX
 from mitsplat.quality import resolve_quality
-
-if TYPE_CHECKING:
-    from mitsplat.camera import Camera
-    from mitsplat.scene.scene import Scene
-    from mitsplat.splats import Splats
+from mitsplat.scene.scene import Scene, plan_frame
+from mitsplat.splats import Splats
 
 BASE = 2**30
 """Python, libraries, compiled kernels and the simulation of a layout [bytes]."""
@@ -54,9 +52,6 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     The sum of terms in the Gaussians of assets, those of all instances, the tiles that they cover as seen from some of
     the scene's cameras (in the middle of the region, where they are dropped), rays, objects, and objects times pixels.
     """
-    from mitsplat.plugins.tiles import PAIRS_MAX
-    from mitsplat.scene.scene import plan_frame
-
     spec = scene.spec
     most = [max(entry.count[1], len(entry.poses)) for entry in spec.objects]
     placed = [(asset.splats, count) for asset, count in zip(scene.assets, most, strict=True)]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Literal
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -40,8 +41,6 @@ def light_image(layers: Layers, composite: Composite) -> Float32Array:
 
 def shadow_from_image(shadow_map: Float32Array, parameters: ImageShadow) -> tuple[Float32Array, Float32Array]:
     """Factor and highlight (H, W) that the published chain makes of a shadow map (H, W)."""
-    import cv2
-
     brightest = float(np.percentile(shadow_map, 99.0))
     normalised = np.clip(shadow_map / max(brightest, 1e-6), 0.0, 1.0).astype(np.float32)
     soft = cv2.GaussianBlur(normalised, (0, 0), parameters.blur * shadow_map.shape[1] / 1280)
@@ -104,8 +103,6 @@ def _through_lens(linear: Float32Array, draws: Mapping[str, float]) -> Float32Ar
         share = square / (0.25 * (height**2 + width**2))
         linear = linear * np.exp2(-draws["vignetting"] * share).astype(np.float32)[..., None]
     if draws.get("motion_blur", 0.0):
-        import cv2
-
         kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
         blurred = cv2.filter2D(np.ascontiguousarray(linear), -1, kernel, borderType=cv2.BORDER_REPLICATE)
         return np.asarray(blurred, dtype=np.float32)
@@ -140,8 +137,6 @@ def _sensed(linear: Float32Array, iso: float, sensor: Sensor, seed: int) -> Floa
 
 def _compressed(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
     """The picture after JPEG compression."""
-    import cv2
-
     done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")

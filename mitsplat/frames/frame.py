@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,9 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb
+from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop, light_image
-from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
+from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.masks import Silhouette
 from mitsplat.physics.settle import settle_layout
 from mitsplat.plugins.device import plain_mesh
@@ -50,42 +52,64 @@ class Frame:
     """A labelled picture of H x W pixels with everything that it was made from. In a notebook it shows itself.
 
     Attributes:
-        index: Index of the frame in its scene.
         plan: Camera, lights and random draws.
         layout: Where the objects came to rest.
-        image: Display-encoded picture, (H, W, 3) uint8.
+        layers: What the integrator made of the view.
         rgb: Linear picture before the camera's development, (H, W, 3) float32.
-        depth: Depth along the optical axis [m], 0 where nothing is, (H, W) float32.
-        instance: Instance id per pixel, 0 for the environment, (H, W) uint16.
-        proxy_instance: The same from the proxy meshes, (H, W) uint16.
-        normal: World-space normal of the proxies, (H, W, 3) float32.
-        light: Factor of light and shadow on the linear colour, (H, W, 3) float32.
-        camera: Same as ``plan.camera``.
+        image: Display-encoded picture, (H, W, 3) uint8.
         labels: Labels of the visible instances.
-        draws: Same as ``plan.draws``.
         seconds: Time per stage [s].
-        layers: Further layers for EXR files, by name.
     """
 
-    index: int
     plan: FramePlan
     layout: Layout
-    image: npt.NDArray[np.uint8]
+    layers: Layers = field(repr=False)
     rgb: Float32Array
-    depth: Float32Array
-    instance: npt.NDArray[np.uint16]
-    proxy_instance: npt.NDArray[np.uint16]
-    normal: Float32Array
-    light: Float32Array
-    camera: Camera
+    image: npt.NDArray[np.uint8]
     labels: Labels
-    draws: Mapping[str, float]
     seconds: Mapping[str, float]
-    layers: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict, repr=False)
+
+    @property
+    def index(self) -> int:
+        """Index of the frame in its scene."""
+        return self.plan.index
+
+    @property
+    def camera(self) -> Camera:
+        """Where the image is taken from."""
+        return self.plan.camera
+
+    @property
+    def draws(self) -> Mapping[str, float]:
+        """Random values by name."""
+        return self.plan.draws
+
+    @property
+    def depth(self) -> Float32Array:
+        """Depth along the optical axis [m], 0 where nothing is, (H, W)."""
+        return self.layers.depth
+
+    @property
+    def instance(self) -> npt.NDArray[np.uint16]:
+        """Instance id per pixel, 0 for the environment, (H, W)."""
+        return self.layers.instance
+
+    @property
+    def proxy_instance(self) -> npt.NDArray[np.uint16]:
+        """The same from the proxy meshes, (H, W)."""
+        return self.layers.proxy_instance
+
+    @property
+    def normal(self) -> Float32Array:
+        """World-space normal of the proxies, (H, W, 3)."""
+        return self.layers.normal
+
+    @property
+    def light(self) -> Float32Array:
+        """Factor of light and shadow on the linear colour, (H, W, 3)."""
+        return self.layers.light
 
     def _repr_png_(self) -> bytes:
-        import cv2
-
         _, data = cv2.imencode(".png", cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR))
         return bytes(data)
 
@@ -105,7 +129,7 @@ def render_frame(
     Raises:
         InputError: If the index is out of range, or the layout cannot be settled.
     """
-    plan_frame(scene, index)  # a wrong index costs nothing
+    layout_of(scene, index)  # a wrong index costs nothing
     ensure_variant()
     return _kept_renderer(scene, quality, str(mi.variant())).render(index, layout=layout)
 
@@ -114,35 +138,6 @@ def render_frame(
 @lru_cache(maxsize=2)
 def _kept_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -> Renderer:
     return Renderer(scene, quality=quality)
-
-
-def _frame(
-    index: int,
-    plan: FramePlan,
-    layout: Layout,
-    image: npt.NDArray[np.uint8],
-    rgb: Float32Array,
-    layers: Layers,
-    labels: Labels,
-    seconds: dict[str, float],
-) -> Frame:
-    return Frame(
-        index=index,
-        plan=plan,
-        layout=layout,
-        image=image,
-        rgb=rgb,
-        depth=layers.depth,
-        instance=layers.instance,
-        proxy_instance=layers.proxy_instance,
-        normal=layers.normal,
-        light=layers.light,
-        camera=plan.camera,
-        labels=labels,
-        draws=plan.draws,
-        seconds=seconds,
-        layers={"alpha": layers.alpha, "captured": layers.captured, "highlight": layers.highlight},
-    )
 
 
 @contextmanager
@@ -159,6 +154,9 @@ class Renderer:
 
         with ms.Renderer(scene, quality="balanced") as renderer:
             frames = [renderer.render(index) for index in range(12)]
+
+    It takes no device, because that is Mitsuba's variant, of which a process has one (see :mod:`mitsplat.variant`): a
+    second renderer could not keep to another. ``mi.set_variant("cuda_ad_rgb")`` before the first one takes the GPU.
 
     Attributes:
         scene: The scene.
@@ -179,6 +177,7 @@ class Renderer:
         ensure_variant()
         self.scene = scene
         self.quality = quality
+        self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self._static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None
@@ -193,12 +192,20 @@ class Renderer:
 
     @one_at_a_time
     def render(self, index: int, *, layout: Layout | None = None) -> Frame:
-        """Render and label one frame; see :func:`render_frame`."""
+        """Render and label one frame; see :func:`render_frame`.
+
+        Raises:
+            InputError: As there, after the end of the renderer's ``with``, or in another variant than it was made in.
+        """
+        if self.integrator is None:
+            raise InputError("the renderer is closed: render before its `with` ends")
+        if mi.variant() != self._variant:
+            raise InputError(f"the renderer was made in Mitsuba's variant {self._variant} (got {mi.variant()} by now)")
         seconds: dict[str, float] = {}
         plan = plan_frame(self.scene, index)
         if layout is None:
             with _timed(seconds, "settle"):
-                layout = self._settle(layout_of(self.scene, index))
+                layout = self._settle(plan.layout)
         with _timed(seconds, "place"):
             mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights))
         with _timed(seconds, "render"):
@@ -212,7 +219,7 @@ class Renderer:
             silhouettes = render_silhouettes(self.integrator, mitsuba_scene, plan.camera, source=source)
         with _timed(seconds, "label"):
             labels = self._label(layers, silhouettes, layout, plan.camera)
-        return _frame(index, plan, layout, image, rgb, layers, labels, seconds)
+        return Frame(plan, layout, layers, rgb, image, labels, seconds)
 
     def _settle(self, index: int) -> Layout:
         """A layout, kept for the next views of it."""
@@ -230,7 +237,7 @@ class Renderer:
             Truth(ids, second, silhouettes, depth),
             layout.instances,
             scene.class_names,
-            LabelRules(**rules.model_dump(exclude={"source"})),
+            rules,
             camera=camera,
             keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
         )

@@ -28,7 +28,7 @@ def layer_sheet(frame: Frame) -> ByteImage:
         "ids by splats": _id_colours(frame.instance),
         f"depth: {near:.3g} to {far:.3g} m": np.where(frame.depth[..., None] > 0, depth, 0).astype(np.uint8),
         "light: black 0, grey 1 (as captured), white 2": _grey(frame.light / 2),
-        "highlight: white 1, square root": _grey(np.sqrt(np.maximum(frame.layers["highlight"], 0))),
+        "highlight: white 1, square root": _grey(np.sqrt(np.maximum(frame.layers.highlight, 0))),
     }
     height, width = frame.image.shape[:2]
     sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)

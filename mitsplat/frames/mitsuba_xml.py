@@ -20,6 +20,7 @@ from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
 from mitsplat.physics.settle import settle_layout
+from mitsplat.plugins.sensors import view_of
 from mitsplat.progress import Note
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import describe_sensor, ensure_variant
@@ -130,8 +131,7 @@ class _RenderOne:
 
 
 def _render(path: Path, scene: Any) -> Any:
-    from mitsplat.plugins.sensors import view_of
-    from mitsplat.plugins.splat_proxy import SplatProxyIntegrator
+    from mitsplat.plugins.splat_proxy import SplatProxyIntegrator  # derives from a class of the variant
 
     if not scene.sensors():
         raise InputError(f"{path}: the scene has no sensor")
@@ -176,7 +176,7 @@ def one_sentence(path: Path, message: str) -> str:
 
 def _documented(plugin: str) -> list[str]:
     """Properties that one of our plugins takes."""
-    from mitsplat.plugins import opencv_camera, splat_proxy, splats
+    from mitsplat.plugins import opencv_camera, splat_proxy, splats  # derive from classes of the variant
 
     classes = {
         "splats": splats.SplatsShape,

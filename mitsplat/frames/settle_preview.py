@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from PIL import Image
+from rich.table import Table
 
 from mitsplat.errors import InputError
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import replay_layout
 from mitsplat.scene.layout import Layout
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from mitsplat.scene.scene import Scene
+from mitsplat.scene.scene import Scene
 
 _INTERVAL = 0.04  # between pictures of a drop [s]; GIF counts in hundredths
 _PAUSE = 1500  # on the last picture [ms]
@@ -25,8 +21,6 @@ _PAUSE = 1500  # on the last picture [ms]
 
 def certificate_table(layouts: Iterable[Layout]) -> Table:
     """The rest certificates of layouts, a row each."""
-    from rich.table import Table
-
     table = Table()
     for title in ("layout", "objects", "rest [s]", "speed [mm/s]", "spin [rad/s]", "motion in 1 s [mm]"):
         table.add_column(title, justify="right")

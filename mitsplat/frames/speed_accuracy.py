@@ -25,9 +25,14 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
+from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.frames.frame import render_frame
+from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.progress import Progress
 from mitsplat.quality import PRESETS, Quality
+from mitsplat.render.layers import ensure_variant, render_splats
+from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
 
 INSTANCE_MIN = 50
@@ -104,7 +109,7 @@ def measure_steps(
     frames: int = 3,
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
-    note: Progress | None = None,
+    progress: Progress | None = None,
 ) -> list[Row]:
     """Measure steps against the preset ``exact``.
 
@@ -114,7 +119,7 @@ def measure_steps(
         frames: Pictures to compare, spread evenly over the scene's.
         overrides: Changes to the scene file by key, such as ``output.width``.
         allow_outside: Whether the scene may name files outside of its folder.
-        note: Hears (steps done, steps, name of the next).
+        progress: Hears (steps done, steps, name of the next).
 
     Raises:
         InputError: If the file is not as it should be, or ``frames`` is below 1.
@@ -130,8 +135,8 @@ def measure_steps(
     rows: dict[str, Row] = {}
     truth: _Shots | None = None
     for i, step in enumerate(plan):
-        if note is not None:
-            note(i, len(plan), step.name)
+        if progress is not None:
+            progress(i, len(plan), step.name)
         shots = _run_alone(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
         truth = truth or shots
         rows[step.name] = _compare(step.name, shots, truth)
@@ -165,7 +170,7 @@ def choose_preset(
     *,
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
-    note: Progress | None = None,
+    progress: Progress | None = None,
 ) -> Row:
     """The cheapest preset for a scene, from two of its frames; see :func:`measure_steps`.
 
@@ -174,7 +179,7 @@ def choose_preset(
     """
     check_tolerance(tolerance)
     steps = STEPS[: len(PRESETS)]
-    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, note=note)
+    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, progress=progress)
     return cheapest(rows, tolerance)
 
 
@@ -214,10 +219,6 @@ Shot = tuple[Float32Array, npt.NDArray[np.uint16], float]
 def _scene_shooter(
     path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
 ) -> Callable[[int], Shot]:
-    from mitsplat.colour import encode_srgb
-    from mitsplat.frames.frame import render_frame
-    from mitsplat.scene.scene import load_scene
-
     scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
     drawn = scene.spec.rendering
     quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings)
@@ -232,9 +233,6 @@ def _scene_shooter(
 
 
 def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
-    from mitsplat.colour import encode_srgb
-    from mitsplat.render.layers import render_splats
-
     splats = Splats.load(path)
     width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
 
@@ -251,10 +249,6 @@ def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[s
 
 
 def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
-    from mitsplat.colour import encode_srgb
-    from mitsplat.frames.volprim import render_volprim, volprim_scene
-    from mitsplat.render.layers import ensure_variant
-
     ensure_variant()
     splats = Splats.load(path)
     width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
@@ -279,6 +273,7 @@ def look_around(splats: Splats, index: int, count: int, *, width: int, height: i
 
 
 def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
+    # Not for the processes that measure steps, in whose peak memory it would count.
     from skimage.metrics import structural_similarity
 
     difference = shots.pictures.astype(np.float64) - truth.pictures
@@ -322,7 +317,7 @@ def write_csv(rows: Sequence[Row], file: Path) -> None:
 
 def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float) -> None:
     """Time of an image against its error, both logarithmic; the steps that nothing beats in both are joined."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # takes half a second, which only a chart needs
 
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,7 @@ from scipy import ndimage
 from mitsplat.arrays import BoolArray, Float64Array, Int32Array
 from mitsplat.labels.polygons import fill_polygon, outline
 from mitsplat.masks import BOUNDARY_TOLERANCE, Box, Silhouette, boundary_f1, encode_mask, without_fragments
+from mitsplat.scene.spec import LabelRules as LabelRules
 
 if TYPE_CHECKING:
     from mitsplat.camera import Camera
@@ -41,25 +42,6 @@ KEYPOINT_TOLERANCE = 0.005
 
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
 """Visibility of a keypoint, as in COCO: outside the image, behind something, seen."""
-
-
-@dataclass(frozen=True)
-class LabelRules:
-    """Thresholds of the rules above.
-
-    Attributes:
-        min_pixels: Fewest visible pixels of a labelled instance.
-        min_fragment: Fewest pixels of a connected part.
-        min_visible: Smallest visible fraction.
-        min_agreement: Smallest IoU of the instance's masks by splats and by proxies.
-        below_threshold: What happens to instances below one of the last two.
-    """
-
-    min_pixels: int = 16
-    min_fragment: int = 8
-    min_visible: float = 0.0
-    min_agreement: float = 0.0
-    below_threshold: Literal["drop", "mark"] = "mark"
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 In: a :class:`~mitsplat.scene.scene.Scene` and the index of a layout. Out: a :class:`~mitsplat.scene.layout.Layout`
 with a certificate of what was measured of its rest on the true meshes. A layout is drawn, dropped and certified in
-:mod:`.drop`, declared at rest by :func:`.worlds.run_to_rest`, and kept by the hash of all that decides it in
+:mod:`.drop`, declared at rest by :func:`.rest.run_to_rest`, and kept by the hash of all that decides it in
 :mod:`.settle`.
 """
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
@@ -20,22 +18,14 @@ from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
 from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
-from mitsplat.physics.placement import Item, draw_poses, fixed_pose
-from mitsplat.physics.worlds import (
-    OVERFLOW,
-    Body,
-    Collider,
-    MujocoWorld,
-    Outcome,
-    WarpWorld,
-    World,
-    all_pieces,
-    run_to_rest,
-)
+from mitsplat.physics.placement import Item, draw_poses
+from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
+from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds
+from mitsplat.scene.streams import random_stream
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
@@ -112,7 +102,7 @@ class Drop:
             return Layout(index, (), NOTHING_TO_REST)
         frictions = self._draw_frictions(index)
         for attempt in range(spec.settle.attempts):
-            start = self.draw_poses(assets, _random(spec.seed, "object poses", index, attempt), given)
+            start = self.draw_poses(assets, random_stream(spec.seed, "object poses", index, attempt), given)
             world = self._world(assets, frictions, capacity)
             world.reset(start)
             outcome = self._run(world)
@@ -157,7 +147,7 @@ class Drop:
         if not assets:
             return
         certificate = layout.certificate
-        rng = _random(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
+        rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
         world = self._world(assets, self._draw_frictions(layout.index), capacity)
         world.reset(self.draw_poses(assets, rng, given))
@@ -177,12 +167,12 @@ class Drop:
 
     def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
         """Which entry each object of a layout is of, and the pose that the file gives it, if any."""
-        counts = _random(self.scene.spec.seed, "object counts", index)
+        counts = random_stream(self.scene.spec.seed, "object counts", index)
         assets: list[int] = []
         given: list[Float64Array | None] = []
         for position, entry in enumerate(self.scene.spec.objects):
             count = int(counts.integers(*entry.count, endpoint=True))
-            poses: list[Float64Array | None] = [fixed_pose(pose) for pose in entry.poses]
+            poses: list[Float64Array | None] = [stated_pose(pose) for pose in entry.poses]
             poses = poses or [None] * count
             assets += [position] * len(poses)
             given += poses
@@ -191,7 +181,7 @@ class Drop:
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
         """Friction coefficient of each entry in a layout."""
         spec = self.scene.spec
-        rng = _random(spec.seed, "friction", index)
+        rng = random_stream(spec.seed, "friction", index)
         return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
 
     def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float) -> World:
@@ -251,10 +241,7 @@ class Drop:
             elif shape.box is None:
                 collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
             else:
-                pose = np.eye(4)
-                pose[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
-                pose[:3, 3] = shape.box.position
-                collider = Collider(shape.friction, box=(shape.box.size, pose))
+                collider = Collider(shape.friction, box=(shape.box.size, stated_pose(shape.box)))
             self._colliders.append(collider)
             self._obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
         surroundings = scene.environment
@@ -272,7 +259,7 @@ class Drop:
         keys: dict[PlacedSurface, str] = {}
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
-                keys[self._placed(entry, fixed_pose(pose))] = f"objects[{entry}].poses[{number}]"
+                keys[self._placed(entry, stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
         for pair in all_clearances(list(keys), self._obstacles, reach=_REACH):
             if -pair.distance > _DEEPEST_GIVEN:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
@@ -374,10 +361,6 @@ def _fault(
 
 def _deepest(pairs: Iterable[Clearance]) -> float:
     return max([0.0, *(-pair.distance for pair in pairs)])
-
-
-def _random(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), *numbers]))
 
 
 def _pieces(

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.mesh_distance import PlacedSurface, Surface, clearance
-from mitsplat.scene.spec import Arrangement, ObjectPose, Region
+from mitsplat.scene.spec import Arrangement, Region
 from mitsplat.scene.walls import PILE_HEIGHT
 
 _PLACES = 200  # positions tried for an object before all are drawn anew
@@ -37,14 +37,6 @@ class Item:
     surface: Surface
     outline: Float64Array
     pose: Float64Array | None = None
-
-
-def fixed_pose(pose: ObjectPose) -> Float64Array:
-    """A pose of the scene file as a transform (4, 4)."""
-    world_from_object = np.eye(4)
-    world_from_object[:3, :3] = Rotation.from_euler("xyz", pose.rotate, degrees=True).as_matrix()
-    world_from_object[:3, 3] = pose.position
-    return world_from_object
 
 
 def draw_poses(

@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
 from mitsplat.cache import cache_folder, keep_file
+from mitsplat.content_hash import ContentHash
+from mitsplat.engine.pool import run_frames
 from mitsplat.errors import InputError
 from mitsplat.progress import Note
 from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import Scene, whole
 from mitsplat.variant import one_at_a_time
 from mitsplat.warp_start import quiet_warp
 
-if TYPE_CHECKING:
-    import trimesh
-
-    from mitsplat.scene.scene import Scene
-
 PACKAGE = Path(__file__).parents[1]
 
-_OWN = ("contacts", "drop", "friction", "placement", "worlds")
-MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.walls")
+_OWN = ("contacts", "drop", "friction", "placement", "rest", "worlds")
+MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.streams", "scene.walls")
 """Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
 LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
@@ -53,8 +50,6 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
         InputError: If the index is no layout's, the region is too small for the objects, or no draw of poses comes to
             rest within the limits.
     """
-    from mitsplat.scene.scene import whole
-
     index = whole(index, "layout")
     if index < 0:
         raise InputError(f"layout must be at least 0 (got {index})")
@@ -63,7 +58,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
         with suppress(OSError, ValueError, KeyError, TypeError):  # damaged or missing: settled anew
             return Layout.from_json(json.loads(path.read_bytes()))
     with warp_settings(progress):
-        from mitsplat.physics.drop import drop_of
+        from mitsplat.physics.drop import drop_of  # Newton compiles as these settings say
 
         layout = drop_of(scene, progress or (lambda text: None)).settle(index)
     if cached:
@@ -78,7 +73,7 @@ class _SettleOne:
     scene: Scene
     cached: bool
 
-    def __call__(self, index: int, note: Callable[[str], None], /) -> Layout:
+    def __call__(self, index: int, note: Note, /) -> Layout:
         return settle_layout(self.scene, index, progress=note, cached=self.cached)
 
 
@@ -90,8 +85,6 @@ def settle_layouts(
     Several layouts in one simulation (Newton's worlds) cost about as much each as one alone on a CPU, and would wait
     for the slowest (``python -m benchmarks.physics.settle worlds``).
     """
-    from mitsplat.engine.pool import run_frames
-
     layouts = {index: [index] for index in indices}
     return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
 
@@ -102,7 +95,7 @@ def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> It
     On a CPU the drop that is simulated again is the one that was.
     """
     with warp_settings():
-        from mitsplat.physics.drop import drop_of
+        from mitsplat.physics.drop import drop_of  # Newton compiles as these settings say
 
         for poses in drop_of(scene, lambda text: None).replay(layout, interval):
             moving = (
@@ -117,21 +110,21 @@ def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> It
 def _scene_hash(scene: Scene) -> str:
     """Hash of what decides where the objects of a scene come to rest."""
     spec = scene.spec
-    digest = hashlib.sha256()
+    digest = ContentHash()
 
     def add(*values: object) -> None:
-        digest.update(repr(values).encode())
+        digest.add(repr(values))
 
     def add_mesh(mesh: trimesh.Trimesh | None) -> None:
         if mesh is not None:
             for array in (mesh.vertices, mesh.faces):
                 add(array.shape)
-                digest.update(np.ascontiguousarray(array).tobytes())
+                digest.add(np.ascontiguousarray(array).tobytes())
 
     for name in LIBRARIES:
         add(name, version(name))
     for module in MODULES:
-        digest.update((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
+        digest.add((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
     for mesh in scene.shape_meshes:
@@ -147,7 +140,7 @@ def _scene_hash(scene: Scene) -> str:
 @contextmanager
 def warp_settings(progress: Note | None = None) -> Iterator[None]:
     """Keep Warp quiet and leave gradients out, without which the simulation compiles in two thirds of the time."""
-    import warp as wp
+    import warp as wp  # takes a third of a second, which a layout from the cache does not need
 
     kept = wp.config.enable_backward
     wp.config.enable_backward = False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import mitsuba as mi
 import numpy as np
 import trimesh
 
@@ -157,8 +158,6 @@ def show_held_out(
     """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
     integrator = make_integrator(shadow="none")
     shape = make_splats_shape(splats, instance=1, proxy=mesh)
-    import mitsuba as mi
-
     scene = mi.load_dict({"type": "scene", "splats": shape})
     views = []
     for photo in photos:

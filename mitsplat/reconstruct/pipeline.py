@@ -6,15 +6,18 @@ own inputs. The last stage is kept by a hash of everything that decides it, in `
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.pipeline import CaptureSettings, capture_photos
+from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import add_content, write_text
+from mitsplat.files import write_text
+from mitsplat.fit.folder import FIT_FILE, read_record
+from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import VERDICT_FILE, Verdict
@@ -28,10 +31,6 @@ from mitsplat.reconstruct.reconstruct import (
 from mitsplat.reconstruct.report import write_asset_report
 from mitsplat.splats import Splats
 from mitsplat.version import __version__
-
-if TYPE_CHECKING:
-    from mitsplat.capture.pipeline import CaptureSettings
-    from mitsplat.fit.trainer import FitSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ class AssetJob:
 
 
 @dataclass(frozen=True)
-class Finished:
+class AssetResult:
     """An asset on disk.
 
     Attributes:
@@ -86,14 +85,13 @@ def read_fit(path: Path) -> tuple[Path, float | None]:
     """
     if not path.is_dir():
         return path, None
-    record = path / "fit.json"
+    record = path / FIT_FILE
     try:
-        psnr = json.loads(record.read_text())["psnr"]
-    except FileNotFoundError:
-        raise InputError(f"{record}: no such file: has the fit finished?") from None
-    except (ValueError, KeyError, TypeError) as error:
+        psnr = read_record(record)["psnr"]
+        known = None if psnr is None else float(psnr)
+    except (KeyError, TypeError) as error:
         raise InputError(f"{record}: not the record of a fit ({error})") from error
-    return path / "splats.ply", None if psnr is None else float(psnr)
+    return path / "splats.ply", known
 
 
 def make_photo_asset(
@@ -104,7 +102,7 @@ def make_photo_asset(
     capture: CaptureSettings,
     fit: FitSettings,
     progress: Progress | None = None,
-) -> Finished:
+) -> AssetResult:
     """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
 
     Args:
@@ -119,9 +117,6 @@ def make_photo_asset(
         InputError: If the photographs do not suffice.
         MissingResourceError: If a program or model that is needed is missing.
     """
-    from mitsplat.capture.pipeline import capture_photos
-    from mitsplat.fit.trainer import FitProgress, fit_capture
-
     taken = capture_photos(photos, out / "capture", capture, progress=progress)
     found = taken.capture
 
@@ -137,7 +132,7 @@ def make_photo_asset(
 
 def make_asset(
     capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
-) -> Finished:
+) -> AssetResult:
     """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
 
     Args:
@@ -172,7 +167,7 @@ def make_asset(
     write_asset_report(out, capture, result)
     # Last, so that an interrupted run is not mistaken for a finished one.
     _save_verdict(out, result, inputs)
-    return Finished(out, result.verdict, kept=False)
+    return AssetResult(out, result.verdict, kept=False)
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
@@ -197,14 +192,15 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
     if job.imported is not None:
         matrix = job.imported.capture_from_mesh
         imported = [
-            hashlib.sha256(job.imported.mesh.vertices.tobytes() + job.imported.mesh.faces.tobytes()).hexdigest(),
+            ContentHash(job.imported.mesh.vertices.tobytes(), job.imported.mesh.faces.tobytes()).hexdigest(),
             None if matrix is None else matrix.tolist(),
             job.imported.metres_per_unit,
         ]
     decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported]
-    digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
+    digest = ContentHash()
+    digest.add_json(decisive)
     for path in (*_files(folder, capture), splats):
-        add_content(digest, path)
+        digest.add_file(path)
     return digest.hexdigest()
 
 
@@ -214,7 +210,7 @@ def _files(folder: Path, capture: Capture) -> list[Path]:
     return [folder / "capture.json", folder / "points.npz", *pictures]
 
 
-def _finished(out: Path, inputs: str) -> Finished | None:
+def _finished(out: Path, inputs: str) -> AssetResult | None:
     """What an earlier run of the same inputs left, if it is whole."""
     if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, "asset.yaml")):
         return None
@@ -222,6 +218,6 @@ def _finished(out: Path, inputs: str) -> Finished | None:
         record = json.loads((out / VERDICT_FILE).read_text())
         if record.pop("inputs") != inputs:
             return None
-        return Finished(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
+        return AssetResult(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
     except (ValueError, KeyError, TypeError, OSError):
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -108,10 +108,6 @@ def reconstruct_asset(
         InputError: If an object has no masks, a size is given to a capture in metres, what is to be refined was not
             reconstructed by masks, or masks and splats do not belong together.
     """
-
-    def telling(text: str) -> Callable[[int, int], None]:
-        return lambda done, total: None if progress is None else progress(done, total, text)
-
     if settings.size is not None and capture.units == "metre":
         raise InputError(f"{name}: the capture is in metres already: it takes no size (got {settings.size:g} m)")
     check_refinable(settings, kind, imported)
@@ -121,23 +117,23 @@ def reconstruct_asset(
     if kind == "object":
         if len(views) < 3:
             raise InputError(f"an object needs photos with masks from at least 3 sides (got {len(views)})")
-        isolation = isolate_object(splats, views, progress=telling("isolating the object"))
+        isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
     cameras = [camera for camera, _, _ in pictures]
     alignment = refinement = None
     if imported is None:
         masks = [view.mask for view in views] if kind == "object" else None
         seen_by = [view.camera for view in views] if kind == "object" else cameras
-        telling_surface = telling("finding the surface")
         floor = 0.0 if kind == "object" and capture.table and _stands(splats) else None
-        mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, floor=floor, progress=telling_surface)
+        mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, floor=floor, progress=progress)
         if settings.refine is not None:
-            refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=telling("refining the mesh"))
+            refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=progress)
             mesh = refinement.mesh
     else:
         mesh, alignment = _placed(imported, splats, cameras)
         mesh = simplify_surface(mesh, settings.surface.faces)
-    telling("judging by held-out photos")(0, 1)
+    if progress is not None:
+        progress(0, 1, "judging by held-out photos")
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
     verdict = judge(capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement)
     asset = Asset(
@@ -155,7 +151,8 @@ def reconstruct_asset(
         metres = imported.metres_per_unit / alignment.scale
         asset = replace(asset.scaled(metres), units="metre")
     if kind == "object":
-        telling("splitting the mesh into convex pieces")(0, 1)
+        if progress is not None:
+            progress(0, 1, "splitting the mesh into convex pieces")
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
     return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement)

@@ -8,10 +8,11 @@ removed after.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -24,6 +25,9 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.plugins.backward import pack_cloud, render_differentiable
+from mitsplat.plugins.sensors import view_of
+from mitsplat.progress import Progress
 from mitsplat.quality import Quality
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.spherical_harmonics import sh_basis
@@ -102,7 +106,7 @@ def isolate_object(
     splats: Splats,
     views: Sequence[MaskedView],
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Isolation:
     """The Gaussians of the object that the masks show.
 
@@ -121,7 +125,7 @@ def isolate_object(
     for done, view in enumerate(views, 1):
         weights += weigher(view)
         if progress is not None:
-            progress(done, len(views))
+            progress(done, len(views), "isolating the object")
     total = weights.sum(axis=1)
     seen = total > SEEN
     inside = seen & (weights[:, 0] >= INSIDE * total)
@@ -154,9 +158,6 @@ class _Weigher:
         self._inputs = [mi.Float(np.ravel(values)) for values in fields]
 
     def __call__(self, view: MaskedView) -> Float64Array:
-        from mitsplat.plugins.backward import pack_cloud, render_differentiable
-        from mitsplat.plugins.splat_proxy import view_of
-
         colours = dr.zeros(mi.Float, 3 * self._count)
         dr.enable_grad(colours)
         cloud = pack_cloud(*self._inputs, colours, 1)
@@ -169,8 +170,6 @@ class _Weigher:
 
 def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
     """Elongated Gaussians one of whose tips more than one view sees outside its mask."""
-    import cv2
-
     ordered = np.sort(splats.scales.astype(np.float64), axis=1)
     needle = np.flatnonzero(ordered[:, 2] > NEEDLE * ordered[:, 1])
     result = np.zeros(len(splats), dtype=bool)

@@ -16,7 +16,7 @@ colours that were found together with the vertices raised the error of the silho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
+from mitsplat.progress import Progress
 from mitsplat.reconstruct.mend import mend_motion
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.render.layers import ensure_variant
@@ -116,7 +117,7 @@ def refine_mesh(
     settings: MeshRefineSettings = MeshRefineSettings(),
     *,
     floor: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> RefinedMesh:
     """Move the vertices of a mesh to where masks want its outlines.
 
@@ -171,7 +172,7 @@ def refine_mesh(
             if found is not None and (errors := scene.errors(found, held)).mean() < after.mean():
                 refined, after = found, errors
         if progress is not None:
-            progress(step + 1, settings.steps)
+            progress(step + 1, settings.steps, "refining the mesh")
     gain = before - after
     kept = bool(np.isfinite(gain).all() and gain.mean() > gain.std() / np.sqrt(max(len(held) - 1, 1)))
     if kept:

@@ -10,7 +10,7 @@ table bounds it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,8 @@ from skimage.measure import marching_cubes
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.plugins.sensors import view_of
+from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.splats import Splats
 
@@ -83,7 +85,7 @@ def reconstruct_surface(
     settings: SurfaceSettings = SurfaceSettings(),
     *,
     floor: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the splats in their own frame.
 
@@ -110,7 +112,7 @@ def reconstruct_surface(
     for number, camera in enumerate(cameras):
         grid.fuse(state, splats, camera, None if masks is None else masks[number])
         if progress is not None:
-            progress(number + 1, len(cameras))
+            progress(number + 1, len(cameras), "finding the surface")
     distance, known = grid.combine(state, settings.blur)
     if floor is not None:
         distance = np.minimum(distance, grid.heights() - np.float32(floor))
@@ -238,8 +240,6 @@ class _Grid:
 
     def fuse(self, state: _State, splats: Splats, camera: Camera, mask: Float32Array | None) -> None:
         """Add what one view says."""
-        from mitsplat.plugins.splat_proxy import view_of
-
         layers = render_splats(splats, camera, quality="fast")
         depth = np.where(layers.alpha > _OPAQUE, layers.depth, 0.0).astype(np.float32)
         view = view_of(make_sensor(camera))

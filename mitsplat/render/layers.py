@@ -100,7 +100,7 @@ def make_splats_shape(
 ) -> Any:
     """The shape plugin ``splats`` around data in memory; ``properties`` are those of the plugin."""
     ensure_variant()
-    from mitsplat.plugins.splats import SplatsShape
+    from mitsplat.plugins.splats import SplatsShape  # derives from a class of the variant
 
     props = mi.Properties("splats")
     for name, value in properties.items():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import operator
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -26,70 +25,23 @@ from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.spec import (
-    AreaLight,
-    Bin,
-    Box,
+    SCHEMA_VERSION,
     CameraHemisphere,
     CameraOrbit,
-    CameraPath,
-    CameraSpec,
-    Composite,
-    Enclosure,
     EnvironmentLight,
     Intrinsics,
-    LightKey,
     LightSpec,
-    ObjectPose,
-    ObjectSpec,
     Output,
     PointLight,
-    PoseKey,
-    Randomise,
     Region,
     SceneSpec,
-    Settle,
     Shape,
     SpotLight,
 )
+from mitsplat.scene.streams import random_stream
 from mitsplat.scene.untrusted_images import check_image
-from mitsplat.scene.walls import bin_walls, enclosure_walls
+from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
 from mitsplat.yaml_input import key_place, load_yaml
-
-__all__ = [
-    "AreaLight",
-    "Bin",
-    "Box",
-    "CameraHemisphere",
-    "CameraOrbit",
-    "CameraPath",
-    "CameraSpec",
-    "Composite",
-    "Enclosure",
-    "EnvironmentLight",
-    "FramePlan",
-    "Intrinsics",
-    "LightKey",
-    "LightSpec",
-    "ObjectPose",
-    "ObjectSpec",
-    "Output",
-    "PointLight",
-    "PoseKey",
-    "Randomise",
-    "Region",
-    "Scene",
-    "SceneSpec",
-    "Settle",
-    "Shape",
-    "SpotLight",
-    "bin_walls",
-    "layout_of",
-    "load_scene",
-    "plan_frame",
-    "random_stream",
-    "scene_json_schema",
-]
-
 
 _DRAWN = (
     *("exposure", "vignetting", "motion_blur", "motion_angle", "iso"),
@@ -153,7 +105,7 @@ class FramePlan:
 
 
 def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
-    """Read a scene file and every asset and mesh that it names.
+    """Read a scene file, then every asset and mesh that it names, and then judge what was read.
 
     Args:
         path: The YAML file.
@@ -168,40 +120,92 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     spec = load_yaml(path, SceneSpec, overrides=overrides)
     if not allow_outside:
         _confine(spec, path)
-    folder = path.parent
-    images: dict[str, Path] = {}
-    for position, light in enumerate(spec.lights):
-        if isinstance(light, EnvironmentLight) and light.image is not None:
-            images[light.image] = folder / light.image
-            with _blaming(path, "lights", position, "image"):
-                if not images[light.image].is_file():
-                    raise InputError(f"{images[light.image]}: no such file")
-                check_image(images[light.image])
-    environment = None
-    if spec.environment is not None:
-        with _blaming(path, "environment"):
-            environment = _metric(Asset.load(folder / spec.environment))
-    assets = _load_objects(spec, path)
-    shape_meshes = []
-    for position, shape in enumerate(spec.shapes):
-        with _blaming(path, "shapes", position, "mesh"):
-            shape_meshes.append(_shape_mesh(shape, folder))
-    if spec.enclosure is not None:
-        supports = [mesh for shape, mesh in zip(spec.shapes, shape_meshes, strict=True) if shape.collider]
-        if spec.environment_collides and environment is not None and environment.mesh is not None:
-            supports.append(environment.mesh)
-        walls = enclosure_walls(spec.enclosure, spec, assets, supports)
-        shape_meshes += [_shape_mesh(wall, folder) for wall in walls]
-        spec = spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None})
+    named = _read_named(spec, path)
+    _check_images(spec, path, named)
+    with _blaming(path, "environment"):
+        environment = None if named.environment is None else _metric(named.environment)
+    assets = _sized_objects(spec, path, named)
+    spec, shape_meshes = _walled(spec, named, assets)
     return Scene(
         spec=spec,
         path=path,
         environment=environment,
         assets=assets,
-        shape_meshes=tuple(shape_meshes),
+        shape_meshes=shape_meshes,
         class_names=tuple(sorted({asset.class_name for asset in assets})),
-        images=images,
+        images=named.images,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """What a scene file names, as it is on disk; assets and images by their names in the file."""
+
+    environment: Asset | None
+    assets: Mapping[str, Asset]
+    shape_meshes: tuple[trimesh.Trimesh, ...]
+    images: Mapping[str, Path]
+
+
+def _read_named(spec: SceneSpec, path: Path) -> _Named:
+    """Read every asset and mesh that a scene file names, each once; images of lights are Mitsuba's to read."""
+    folder = path.parent
+    environment, assets, shape_meshes = None, dict[str, Asset](), []
+    if spec.environment is not None:
+        with _blaming(path, "environment"):
+            environment = Asset.load(folder / spec.environment)
+    for position, entry in enumerate(spec.objects):
+        if entry.asset not in assets:
+            with _blaming(path, "objects", position, "asset"):
+                assets[entry.asset] = Asset.load(folder / entry.asset)
+    for position, shape in enumerate(spec.shapes):
+        with _blaming(path, "shapes", position, "mesh"):
+            shape_meshes.append(_shape_mesh(shape, folder))
+    names = [light.image for light in spec.lights if isinstance(light, EnvironmentLight) and light.image is not None]
+    return _Named(environment, assets, tuple(shape_meshes), {name: folder / name for name in names})
+
+
+def _check_images(spec: SceneSpec, path: Path, named: _Named) -> None:
+    """Refuse images of lights that are absent, or that Mitsuba should not be given."""
+    for position, light in enumerate(spec.lights):
+        if isinstance(light, EnvironmentLight) and light.image is not None:
+            image = named.images[light.image]
+            with _blaming(path, "lights", position, "image"):
+                if not image.is_file():
+                    raise InputError(f"{image}: no such file")
+                check_image(image)
+
+
+def _sized_objects(spec: SceneSpec, path: Path, named: _Named) -> tuple[Asset, ...]:
+    """Asset of each entry, in its size; entries that differ in nothing but count and class share its arrays.
+
+    Raises:
+        InputError: If one is of unknown size, cannot be dropped, or does not fit into the region.
+    """
+    sized: dict[tuple[str, float | None, float], Asset] = {}
+    assets = []
+    for position, entry in enumerate(spec.objects):
+        key = (entry.asset, entry.size, entry.scale)
+        if key not in sized:
+            with _blaming(path, "objects", position, "asset"):
+                asset = named.assets[entry.asset]
+                asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
+                sized[key] = asset if entry.scale == 1.0 else asset.scaled(entry.scale)
+                _check_fit(sized[key], spec.region)
+        assets.append(replace(sized[key], class_name=entry.class_name or sized[key].class_name))
+    return tuple(assets)
+
+
+def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
+    """The specification with its enclosure written out as shapes, and the mesh of every shape."""
+    if spec.enclosure is None:
+        return spec, named.shape_meshes
+    supports = [mesh for shape, mesh in zip(spec.shapes, named.shape_meshes, strict=True) if shape.collider]
+    if spec.environment_collides and named.environment is not None and named.environment.mesh is not None:
+        supports.append(named.environment.mesh)
+    walls = enclosure_walls(spec.enclosure, spec, assets, supports)
+    meshes = tuple(_shape_mesh(wall, Path()) for wall in walls)  # boxes, which no file holds
+    return spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None}), (*named.shape_meshes, *meshes)
 
 
 def _confine(spec: SceneSpec, path: Path) -> None:
@@ -260,14 +264,10 @@ def plan_frame(scene: Scene, index: int) -> FramePlan:
     )
 
 
-def random_stream(seed: int, purpose: str, index: int) -> np.random.Generator:
-    """Random numbers for one purpose in one frame or layout, independent of those for every other."""
-    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), index]))
-
-
 def scene_json_schema() -> dict[str, Any]:
     """JSON Schema of a scene file, for editors."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **SceneSpec.model_json_schema()}
+    named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:mitsplat:scene:{SCHEMA_VERSION}"}
+    return {**named, **SceneSpec.model_json_schema()}
 
 
 @contextmanager
@@ -277,22 +277,6 @@ def _blaming(path: Path, *keys: str | int) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{key_place(path, keys)}: {error}") from error
-
-
-def _load_objects(spec: SceneSpec, path: Path) -> tuple[Asset, ...]:
-    """Asset of each entry; entries that differ in nothing but count and class share its arrays."""
-    loaded: dict[tuple[str, float | None, float], Asset] = {}
-    assets = []
-    for position, entry in enumerate(spec.objects):
-        key = (entry.asset, entry.size, entry.scale)
-        if key not in loaded:
-            with _blaming(path, "objects", position, "asset"):
-                asset = Asset.load(path.parent / entry.asset)
-                asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
-                loaded[key] = asset if entry.scale == 1.0 else asset.scaled(entry.scale)
-                _check_fit(loaded[key], spec.region)
-        assets.append(replace(loaded[key], class_name=entry.class_name or loaded[key].class_name))
-    return tuple(assets)
 
 
 def _metric(asset: Asset) -> Asset:
@@ -324,10 +308,7 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
         return walls
     if shape.box is None:
         return read_mesh(folder / str(shape.mesh))
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_euler("xyz", shape.box.rotate, degrees=True).as_matrix()
-    transform[:3, 3] = shape.box.position
-    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=transform)
+    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=stated_pose(shape.box))
     return box
 
 

@@ -14,6 +14,10 @@ from mitsplat.camera import Lens
 from mitsplat.quality import KernelName, PresetName, ResponseName
 from mitsplat.yaml_input import FieldError
 
+SCHEMA_VERSION = 1
+"""Goes up when a scene file that was right is refused or means something else. Scene files, which people write, state
+none: what is new to them are keys, and an unknown key is refused by its name."""
+
 
 class StrictModel(BaseModel):
     """Immutable, without unknown keys, infinities or NaN."""
@@ -58,7 +62,7 @@ CountRange = Annotated[
 ]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Kelvin = Annotated[float, Field(ge=1667, le=25000)]
-Quality = Annotated[float, Field(ge=1, le=100)]
+JpegQuality = Annotated[float, Field(ge=1, le=100)]
 EmittedColour = Annotated[
     tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
     AfterValidator(_some_colour),
@@ -379,7 +383,7 @@ class Randomise(StrictModel):
     motion_blur: NonNegativeRange = Field(
         (0.0, 0.0), description="Length of the camera's motion in the image, in a direction drawn anew [px]."
     )
-    jpeg: Annotated[tuple[Quality, Quality], AfterValidator(_ordered)] | None = Field(
+    jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(_ordered)] | None = Field(
         None, description="Quality of a JPEG compression before the image is written; none if absent."
     )
     friction: PositiveRange = Field(
@@ -442,6 +446,7 @@ FormatName = Literal[
     "panoptic",
     "poses",
     "voc",
+    "label-studio",
     "bop",
     "colmap",
     "depth",
@@ -486,7 +491,7 @@ class Rendering(StrictModel):
     lens_rings: int = Field(2, ge=1, le=8, description="Rings of points on a thin lens: 1, 2, 3 take 7, 19, 37 images.")
 
 
-class Labelling(StrictModel):
+class LabelRules(StrictModel):
     """What is labelled, see :mod:`mitsplat.labels.labels`."""
 
     source: Literal["splats", "proxies"] = Field(
@@ -521,7 +526,7 @@ class SceneSpec(StrictModel):
     lights: tuple[LightSpec, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
-    labels: Labelling = Field(Labelling(), description="What is labelled.")
+    labels: LabelRules = Field(LabelRules(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     quality: PresetName = Field("balanced", description="Rendering preset.")
     rendering: Rendering = Field(Rendering(), description="How splats are drawn.")

@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.scene.spec import Bin, Box, Enclosure, Region, SceneSpec, Shape
+from mitsplat.scene.spec import Bin, Box, Enclosure, ObjectPose, Region, SceneSpec, Shape
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset
@@ -53,6 +53,14 @@ def enclosure_walls(
         box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
         walls.append(Shape(name=f"{ENCLOSURE}{name}", box=box))
     return walls
+
+
+def stated_pose(place: Box | ObjectPose) -> Float64Array:
+    """A place of the scene file as a transform (4, 4)."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", place.rotate, degrees=True).as_matrix()
+    pose[:3, 3] = place.position
+    return pose
 
 
 def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:

@@ -309,6 +309,7 @@ STRAY = (
         "depth/train/000099.png",
     ),
     *("flow/train/000001.flo", "images/train/000099.png", "images/val/000000.png", "instances/train/000099.png"),
+    "label-studio/train/000099.json",
     *("labels/train/000099.txt", "layers/train/000099.exr", "layouts/0009.json", "normals/train/000099.png"),
     *("panoptic/train/000099.png", "semantic/train/000099.png", "voc/Annotations/000099.xml"),
     *("voc/JPEGImages/000099.png", "yolo-detect/labels/train/000099.txt", "yolo-obb/images/train/000099.png"),
@@ -330,6 +331,7 @@ def test_files_of_no_frame_are_found(dataset: Path) -> None:
 WHOLE = (
     *(f"annotations/{n}_{s}.json" for n in ("instances", "amodal", "panoptic", "poses") for s in ("train", "val")),
     *("data.yaml", "yolo-detect/data.yaml", "yolo-obb/data.yaml", "yolo-pose/data.yaml", "voc/labelmap.txt"),
+    "label-studio/config.xml",
     *("voc/ImageSets/Main/train.txt", "voc/ImageSets/Main/val.txt", "layouts/0000.json", "layouts/0002.json"),
     *(f"bop/train/000000/scene_{part}.json" for part in ("camera", "gt", "gt_info")),
     *("bop/models/models_info.json", "bop/models/obj_000001.ply", "contact_sheet.jpg"),

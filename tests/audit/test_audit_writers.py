@@ -6,6 +6,7 @@ import ast
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
-from mitsplat.formats import bop, coco, colmap, maps, voc, yolo
+from mitsplat.formats import bop, coco, colmap, label_studio, maps, voc, yolo
 from mitsplat.formats import registry as writers
 from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
@@ -108,8 +109,6 @@ class Swapped(Rotation):
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Any:
-        from types import SimpleNamespace
-
         x, y, z, w = Rotation.from_matrix(matrix).as_quat()
         return SimpleNamespace(as_quat=lambda: (w, x, y, z))
 
@@ -119,8 +118,8 @@ def with_camera(change: Callable[[camera.Camera], Any]) -> Patch:
 
     def patch(monkeypatch: pytest.MonkeyPatch) -> None:
         for owner in (coco, bop, colmap):
-            real = owner.camera_of
-            monkeypatch.setattr(owner, "camera_of", lambda record, real=real: change(real(record)))
+            read = SimpleNamespace(from_json=lambda stored: change(camera.Camera.from_json(stored)))
+            monkeypatch.setattr(owner, "Camera", read)
 
     return patch
 
@@ -152,8 +151,8 @@ def record_camera(change: Callable[[Any], Any]) -> Patch:
     real = writers.write_frame
 
     def write_frame(frame: Any, *args: Any) -> Any:
-        frame.camera = change(frame.camera)
-        return real(frame, *args)
+        seen = replace(frame, plan=replace(frame.plan, camera=change(frame.camera)))
+        return real(seen, *args)
 
     return lambda patch: patch.setattr("mitsplat.dataset.frame_job.write_frame", write_frame)
 
@@ -166,6 +165,8 @@ COCO, AMODAL = "annotations/instances_train.json", "annotations/amodal_train.jso
 PANOPTIC, POSES = "annotations/panoptic_train.json", "annotations/poses_train.json"
 GT, INFO, BOP_CAMERA = (f"bop/train/000000/scene_{part}.json" for part in ("gt", "gt_info", "camera"))
 OTHER = {1: 2, 2: 1, 3: 3}
+
+REAL_STROKE = label_studio.encode_brush
 
 FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     "coco: box one too far": ("coco", each_annotation(lambda e: add_to(e["bbox"], 0, 1)), COCO, "bbox is"),
@@ -229,6 +230,16 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "poses: world for camera": ("poses", with_camera(world_for_camera), POSES, "camera_from_object is not"),
     "poses: millimetres": ("poses", with_camera(millimetres_for_metres), POSES, "camera_from_object is not"),
+    "poses: objects from one": (
+        "poses",
+        entry(
+            coco,
+            "pose_entry",
+            lambda e: [instance.update(object=instance["object"] + 1) for instance in e["instances"]],
+        ),
+        POSES,
+        "object is",
+    ),
     "voc: pixels from zero": (
         "voc",
         changing(voc, "annotation", lambda made, *args: made.replace("<xmin>", "<xmin>1")),
@@ -311,7 +322,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "yolo: class names swapped": (
         "yolo",
-        changing(writers, "data_yaml", lambda made, *args: made.replace("0:", "2:").replace("1:", "0:")),
+        changing(yolo, "data_yaml", lambda made, *args: made.replace("0:", "2:").replace("1:", "0:")),
         "data.yaml",
         "names are",
     ),
@@ -332,6 +343,18 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         task("yolo-obb", lambda made: made.mean(axis=0) + 1.4 * (made - made.mean(axis=0))),
         "yolo-obb/labels/train/000000.txt",
         "fits",
+    ),
+    "label-studio: along columns": (
+        "label-studio",
+        changing(label_studio, "encode_brush", lambda made, mask: REAL_STROKE(mask.T.copy())),
+        "label-studio/train/000000.json",
+        "differ from its mask",
+    ),
+    "label-studio: neighbours' classes": (
+        "label-studio",
+        changing(label_studio, "region", lambda made, *args: made | {"value": made["value"] | {"brushlabels": ["?"]}}),
+        "label-studio/train/000000.json",
+        "class is",
     ),
     "instances: classes for ids": (
         "instances",
@@ -459,3 +482,13 @@ def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
     words[8], words[9] = words[9], words[8]
     path.write_text(" ".join(words) + "\n")
     assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}
+
+
+def test_a_lens_focused_nearer_than_cameras_see_by_default(tmp_path: Path) -> None:
+    """Formats and audit make the camera of a record anew, ``near`` included, without which it could not be focused."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
+    lens = Intrinsics(fov_x=60.0, aperture=0.002, focus=0.008, near=0.004)
+    seen = scene.spec.camera.model_copy(update={"intrinsics": lens})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))
+    out = write(scene, tmp_path / "out", ["bop", "colmap", "poses"])
+    assert audit_dataset(out).violations == ()

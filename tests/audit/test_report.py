@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mitsplat.audit.report import SAMPLES, write_report
-from mitsplat.audit.svg_charts import bars, columns, heat_map, histogram
+from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns
 from tests.audit.test_audit import records_of, store, swap_a_class
 from tests.cli.test_cli import run
 
@@ -132,7 +132,10 @@ def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:
 
 class TestCharts:
     def test_a_histogram_counts_every_value_once(self) -> None:
-        text = histogram("shares", [0.0, 0.05, 0.5, 1.0, 1.0], bins=10, bounds=(0, 1))
+        counted = Histogram((0, 1), bins=10)
+        counted.add([0.0, 0.05, 0.5])
+        counted.add([1.0, 1.0])
+        text = counted.draw("shares")
         counts = dict(re.findall(r'<th scope="row">([^<]+)</th><td>(\d+)</td>', text))
         assert counts == {"0 to 0.1": "2", "0.5 to 0.6": "1", "0.9 to 1": "2"}
 
@@ -143,9 +146,11 @@ class TestCharts:
         assert widths[0] == pytest.approx(widths[1] / 2)
 
     def test_a_heat_map_puts_points_where_they_are(self) -> None:
-        text = heat_map("m", [99.0, 99.0, 1.0], [49.0, 49.0, 1.0], size=(100, 50), cells=(10, 5), axes="px")
+        counted = HeatMap((100, 50), (10, 5))
+        counted.add([99.0, 99.0, 1.0], [49.0, 49.0, 1.0])
+        text = counted.draw("m", "px")
         assert "<td>10, 5: 2</td>" in text and "<td>2 of 50</td>" in text
 
-    @pytest.mark.parametrize("chart", [bars("c", {}), histogram("c", []), columns("c", [0], ["0"])])
+    @pytest.mark.parametrize("chart", [bars("c", {}), Histogram((0, 1)).draw("c"), columns("c", [0], ["0"])])
     def test_nothing_is_no_error(self, chart: str) -> None:
         assert Page(chart).open == []

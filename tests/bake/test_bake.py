@@ -22,7 +22,7 @@ from mitsplat.errors import InputError
 from mitsplat.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.scene import AreaLight, EnvironmentLight
+from mitsplat.scene.spec import AreaLight, EnvironmentLight
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats
 
@@ -230,6 +230,16 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
     np.testing.assert_allclose(
         corner_normals(part.mesh), np.repeat(part.mesh.face_normals[:, None], 3, axis=1), atol=1e-6
     )
+
+
+def test_slivers_have_normals_too() -> None:
+    """CAD files are full of them; a ray that meets one without a normal gives no number, and no splats."""
+    corners = np.array([(0, 0, 0), (0.01, 0, 0), (0.005, 1e-13, 0), (0.005, 0, 0.01)])
+    mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+    assert not mesh.face_normals[0].any()
+    np.testing.assert_allclose(corner_normals(mesh)[0], [(0, 0, 1)] * 3, atol=1e-9)
+    needle = trimesh.Trimesh([(0, 0, 0), (0, 0, 0), (0, 0, 0)], [(0, 1, 2)], process=False)
+    np.testing.assert_allclose(np.linalg.norm(corner_normals(needle), axis=2), 1)
 
 
 def test_studio_has_mean_radiance_one() -> None:

@@ -24,10 +24,10 @@ from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import agreed_masks, geometric_masks, object_points
-from mitsplat.capture.metric_frame import find_anchor, fit_similarity
+from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
 from mitsplat.capture.photos import prepare_photos
 from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
-from mitsplat.capture.structure_from_motion import Model
+from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from tests import rendered
 from tests.cli.test_cli import run
@@ -312,11 +312,11 @@ def test_a_crash_of_colmap_is_one_sentence(tmp_path: Path, monkeypatch: pytest.M
         capture_photos(tmp_path / "photos", tmp_path / "out")
 
 
-def model_of(capture: Capture, count: int | None = None) -> Model:
+def model_of(capture: Capture, count: int | None = None) -> SparseModel:
     """The first photos of a capture as structure from motion would have found them."""
     photos = capture.photos[:count]
     cameras, seen = ({photo.file.name: getattr(photo, key) for photo in photos} for key in ("camera", "seen"))
-    return Model(cameras, capture.points, capture.colours, seen)
+    return SparseModel(cameras, capture.points, capture.colours, seen)
 
 
 def test_photos_of_two_things_end_with_status_4(
@@ -346,7 +346,7 @@ def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
     given, _, result = captured
     model = model_of(result.capture)
     images = {photo.file.name: photo.file for photo in result.capture.photos}
-    seen, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed - {"photo03.png"})
+    seen, *_ = sorted(find_metric_frame(model, images, board=rendered.BOARD).confirmed - {"photo03.png"})
     model = replace(model, agreement=dict.fromkeys(model.cameras, 0.98) | {"photo03.png": 0.4, seen: 0.6})
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
     assert run("capture", given, "-o", tmp_path / "sure", "--square", 0.035, "--kind", "environment") == 0
@@ -371,7 +371,7 @@ def test_a_camera_that_the_board_contradicts_is_left_out(
     given, _, result = captured
     model = model_of(result.capture)
     images = {photo.file.name: photo.file for photo in result.capture.photos}
-    seen, doubted, *_ = sorted(find_anchor(model, images, board=rendered.BOARD).confirmed)
+    seen, doubted, *_ = sorted(find_metric_frame(model, images, board=rendered.BOARD).confirmed)
     pose = model.cameras[seen].world_from_camera.copy()
     pose[:3, 3] += (0.02, 0, 0)
     cameras = {**model.cameras, seen: replace(model.cameras[seen], world_from_camera=pose)}

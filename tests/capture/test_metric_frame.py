@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from mitsplat.camera import Camera
 from mitsplat.capture import metric_frame as anchor
 from mitsplat.capture.metric_frame import (
-    find_anchor,
+    find_metric_frame,
     find_table,
     fit_similarity,
     meeting_point,
     triangulate,
     vertical_from_cameras,
 )
-from mitsplat.capture.structure_from_motion import Model
+from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.capture.targets import Board, find_tags
 from mitsplat.errors import InputError
 
@@ -54,10 +54,10 @@ def lost(camera: Camera) -> Camera:
     return replace(camera, world_from_camera=pose)
 
 
-def model_of(cameras: list[Camera], points: np.ndarray) -> Model:
+def model_of(cameras: list[Camera], points: np.ndarray) -> SparseModel:
     seen = np.arange(len(points), dtype=np.int32)
     names = [f"{number:02}.png" for number in range(len(cameras))]
-    return Model(
+    return SparseModel(
         dict(zip(names, map(lost, cameras), strict=True)),
         points @ LOST[:3, :3].T + LOST[:3, 3],
         np.zeros((len(points), 3), dtype=np.uint8),
@@ -105,7 +105,7 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
     cameras = ring()
     images = photos_of_the_board(cameras, tmp_path)
     model = model_of(cameras, table_and_thing())
-    found = find_anchor(model, images, board=BOARD)
+    found = find_metric_frame(model, images, board=BOARD)
     scale, tilt, height = errors(found.matrix)
     assert (found.units, found.up, found.source, found.wrong) == ("metre", "z", "a ChArUco board (15 corners)", {})
     assert abs(scale) < 5e-4
@@ -113,7 +113,7 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
     assert abs(height) < 1e-4
     assert found.scale_error is not None
     assert anchor.PRINT_ERROR / BOARD.square <= found.scale_error < 1.2 * anchor.PRINT_ERROR / BOARD.square
-    middle = find_anchor(model, images, board=BOARD, centred=False).matrix @ LOST
+    middle = find_metric_frame(model, images, board=BOARD, centred=False).matrix @ LOST
     np.testing.assert_allclose(middle[:3, 3], 0, atol=1e-4)
     np.testing.assert_allclose(middle[:3, :3], np.eye(3), atol=1e-3)  # the board's own axes
 
@@ -122,7 +122,7 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
     pose = astray.world_from_camera.copy()
     pose[:3, 3] += 3.7 * np.array([0.03, 0, 0])
     cameras_astray = {**model.cameras, "03.png": replace(astray, world_from_camera=pose)}
-    spoilt = find_anchor(replace(model, cameras=cameras_astray), images, board=BOARD)
+    spoilt = find_metric_frame(replace(model, cameras=cameras_astray), images, board=BOARD)
     assert set(spoilt.wrong) == {"03.png"}
     assert spoilt.confirmed == set(images) - {"03.png"}
     assert abs(errors(spoilt.matrix)[0]) < 1e-3
@@ -131,7 +131,7 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
 def test_the_board_is_known_where_the_reconstruction_is_put(tmp_path: Path) -> None:
     cameras = ring()
     images = photos_of_the_board(cameras, tmp_path)
-    found = find_anchor(model_of(cameras, table_and_thing()), images, board=BOARD)
+    found = find_metric_frame(model_of(cameras, table_and_thing()), images, board=BOARD)
     assert found.board is not None
     truth = found.matrix @ LOST  # the board lies where the world's origin is
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
@@ -210,13 +210,13 @@ def test_tags_give_metres_and_the_vertical(tmp_path: Path) -> None:
     images = {f"{k:02}.png": draw(sheet, 8000.0, camera, tmp_path, f"{k:02}.png") for k, camera in enumerate(cameras)}
     assert set(find_tags(np.asarray(Image.open(images["00.png"])))) == {0, 1, 2}
     model = model_of(cameras, np.random.default_rng(0).normal(0, 0.02, (200, 3)))  # no table among the points
-    found = find_anchor(model, images, tag=0.04)
+    found = find_metric_frame(model, images, tag=0.04)
     scale, tilt, height = errors(found.matrix)
     assert (found.units, found.up, found.source) == ("metre", "z", "3 AprilTags")
     assert abs(scale) < 3e-3
     assert tilt < 0.3
     assert abs(height) < 5e-4
-    assert find_anchor(model, images).units == "unknown"
+    assert find_metric_frame(model, images).units == "unknown"
 
 
 @pytest.fixture
@@ -230,7 +230,7 @@ def test_a_distance_gives_metres_and_the_table_the_vertical(blank: dict[str, Pat
     points = table_and_thing()
     model = model_of(cameras, points)
     gap = float(np.linalg.norm(cameras[0].centre - cameras[4].centre))
-    found = find_anchor(model, blank, scale_from=("00.png", "04.png", gap))
+    found = find_metric_frame(model, blank, scale_from=("00.png", "04.png", gap))
     scale, tilt, height = errors(found.matrix)
     assert found.source == "the distance of 00.png and 04.png, the table plane"
     assert (found.units, found.up, found.table, found.scale_error) == ("metre", "z", True, None)
@@ -239,7 +239,7 @@ def test_a_distance_gives_metres_and_the_table_the_vertical(blank: dict[str, Pat
     assert abs(height) < 2e-4
     # The same by two points seen at pixels.
     spots = [f"00.png:{x:.2f},{y:.2f}" for x, y in cameras[0].project(points[[0, 1]])[0]]
-    found = find_anchor(model, blank, scale_from=(*spots, float(np.linalg.norm(points[0] - points[1]))))
+    found = find_metric_frame(model, blank, scale_from=(*spots, float(np.linalg.norm(points[0] - points[1]))))
     assert abs(errors(found.matrix)[0]) < 0.02
 
 
@@ -255,13 +255,13 @@ def test_a_distance_gives_metres_and_the_table_the_vertical(blank: dict[str, Pat
 )
 def test_a_wrong_distance_is_one_sentence(blank: dict[str, Path], spots: tuple[str, str, float], sentence: str) -> None:
     with pytest.raises(InputError) as raised:
-        find_anchor(model_of(ring(), table_and_thing()[:1000] * (0.1, 0.1, 1)), blank, scale_from=spots)
+        find_metric_frame(model_of(ring(), table_and_thing()[:1000] * (0.1, 0.1, 1)), blank, scale_from=spots)
     assert sentence in str(raised.value)
 
 
 def test_without_evidence_nothing_is_claimed(blank: dict[str, Path]) -> None:
     model = model_of(ring(), np.random.default_rng(0).normal(0, 0.05, (400, 3)))
-    found = find_anchor(model, blank)
+    found = find_metric_frame(model, blank)
     assert (found.units, found.up, found.table, found.source) == ("unknown", "unknown", False, "the cameras' attitude")
     centres = np.array([(found.matrix @ np.append(c.centre, 1))[:3] for c in model.cameras.values()])
     assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(1, abs=0.01)

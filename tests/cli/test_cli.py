@@ -38,7 +38,7 @@ from mitsplat.frames import speed_accuracy as chart
 from mitsplat.physics import settle
 from mitsplat.reconstruct import pipeline
 from mitsplat.reconstruct.evaluation import Verdict
-from mitsplat.reconstruct.pipeline import Finished
+from mitsplat.reconstruct.pipeline import AssetResult
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
@@ -310,7 +310,7 @@ def test_bake_takes_every_option(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("options", "sentence"),
     [
         (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
-        (["--density", "nan"], "--density must be finite and > 0 (got nan)"),
+        (["--density", "nan"], "density must be a number > 0 in kg/m^3 (got nan)"),
         (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
         (["--gaussians", "0"], "gaussians must be at least 1 (got 0)"),
     ],
@@ -329,6 +329,10 @@ def test_bad_option_of_bake_is_one_sentence(
         (
             "bake plant.splat -o a",
             "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got splats, which an asset.yaml",
+        ),
+        (
+            "bake nut.step -o a",
+            "nut.step: must be a mesh (.glb, .obj, .stl, .ply) (got solids of a CAD program",
         ),
         ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
         ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
@@ -354,6 +358,7 @@ def test_another_kind_of_file_is_named(
     box_asset("nut").mesh.export("part.stl")
     Path("folder").mkdir()
     Path("scene.xml").write_text('<scene version="3.9.0"/>')
+    Path("nut.step").touch()
     assert run(*words.split()) == 2
     told = capsys.readouterr().err
     assert told.startswith(f"mitsplat: {sentence}") and told.count("\n") == 1
@@ -379,7 +384,7 @@ def test_settle_prints_certificates_and_shows_the_drop(
 ) -> None:
     """The GIF moves, ends on the layout at rest, and shows the drop every 0.04 s as fast as it was."""
     monkeypatch.setattr(settle, "cache_folder", lambda: tmp_path / "cache")
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "80")  # its headings and numbers are whole all the same
     gif = tmp_path / "drop.gif"
     assert run("settle", scene_path, "-n", 2, "--preview", "-o", gif, "--size", "64x36") == 0
     out = capsys.readouterr().out
@@ -583,12 +588,12 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
 
 
-def finished(folder: Path, **changes: Any) -> Finished:
+def finished(folder: Path, **changes: Any) -> AssetResult:
     figures = Verdict(
         photos=9, rejected=1, psnr=27.0, psnr_object=26.0, splat_iou=0.97, mesh_iou=0.96, offset=0.001, spread=0.001,
         lost=0.0, scale_error=None, units="metre", gaussians=12, faces=99, watertight=True, solid=True,
     )  # fmt: skip
-    return Finished(folder, replace(figures, **changes), kept=False)
+    return AssetResult(folder, replace(figures, **changes), kept=False)
 
 
 def test_mesh_passes_every_option_on(
@@ -642,12 +647,12 @@ def test_asset_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4)
 
 
-def test_readme_documents_every_command_and_option() -> None:
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
+def test_every_command_and_option_is_documented() -> None:
+    page = (Path(__file__).parents[2] / "docs/first_dataset.md").read_text()
     commands = typer.main.get_command(app).commands
     assert set(commands) >= {"render", "audit", "report", "preview", "bake", "export", "schema", "doctor"}
     for name, command in commands.items():
-        line = next((row for row in readme.splitlines() if row.startswith(f"| `mitsplat {name}")), None)
+        line = next((row for row in page.splitlines() if row.startswith(f"| `mitsplat {name}")), None)
         assert line is not None, name
         for parameter in command.params:
             if parameter.param_type_name == "option" and parameter.name != "help":

@@ -266,9 +266,9 @@ def test_a_reader_that_leaves_early_is_no_fault() -> None:
 # Sentences
 
 
-def test_readme_shows_what_a_wrong_scene_is_told(scene_data: dict[str, object], write_scene: WriteScene) -> None:
+def test_the_guide_shows_what_a_wrong_scene_is_told(scene_data: dict[str, object], write_scene: WriteScene) -> None:
     shown = re.search(
-        r"^    (scenes/cell\.yaml:\d+: objects\[2\]\.count: .*)$", (ROOT / "README.md").read_text(), re.M
+        r"^    (scenes/cell\.yaml:\d+: objects\[2\]\.count: .*)$", (ROOT / "docs/first_dataset.md").read_text(), re.M
     )[1]
     wrong = [{"asset": "assets/nut"}, {"asset": "assets/bolt"}, {"asset": "assets/nut", "count": -3}]
     path = write_scene(scene_data | {"objects": wrong})

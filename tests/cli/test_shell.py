@@ -21,25 +21,30 @@ import trimesh
 import typer.main
 from ruamel.yaml import YAML
 
+from mitsplat.checks.preflight import check_scene
 from mitsplat.cli import app
+from mitsplat.scene.scene import load_scene
 from tests.conftest import box_asset
 
 if TYPE_CHECKING:
     from mitsplat.capture.pipeline import CaptureResult
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+PAGES = (ROOT / "README.md", *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts))
+"""What tells users what to type; README comes first, and makes most of what the others name."""
 MITSPLAT = Path(sys.executable).with_name("mitsplat")
 
 SMALLER = {
     "render": ["-n", "2", "--size", "64x36"],
     "preview": ["--size", "64x36"],
     "settle": ["-n", "1", "--size", "32x18"],
-    "merge": ["-o", "out/merged"],
+    "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60", "--sh-degree", "0"],
     "asset": ["--gaussians", "300", "--iterations", "20", "--edge", "64", "--faces", "300"],
+    "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
+    "mesh": ["--faces", "300", "--voxels", "48"],
 }
-"""Options that are added to README's commands, in place of their own, so that they are quick."""
+"""Options that are added to documented commands, in place of their own, so that they are quick."""
 
 
 def run(command: list[str] | str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -56,18 +61,25 @@ def run(command: list[str] | str, folder: Path, **variables: str) -> subprocess.
     )
 
 
-def block(after: str, language: str) -> str:
-    """README's first block in a language after some words."""
-    return re.search(rf"```{language}\n(.*?)```", README[README.index(after) :], re.DOTALL)[1]
+def blocks(page: Path, language: str) -> list[str]:
+    """A page's blocks in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
-def commands(text: str) -> list[list[str]]:
-    """The commands of a block for the shell, without their comments."""
-    return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
+def commands(page: Path) -> list[list[str]]:
+    """What a page shows of commands of mitsplat, without their comments."""
+    lines = (line for text in blocks(page, "sh") for line in text.splitlines())
+    return [words for line in lines if (words := shlex.split(line, comments=True))[:1] == ["mitsplat"]]
+
+
+def form(words: list[str]) -> tuple[str, ...]:
+    """A command without what is only a name or a number in it: its options, and the kinds of files it is given."""
+    kept = re.compile(r"-|\d+/\d+")
+    return (words[1], *sorted(word if kept.match(word) else Path(word).suffix for word in smaller(words)))
 
 
 def smaller(words: list[str]) -> list[str]:
-    """A command of README, made quick; a Mitsuba scene says its size itself."""
+    """A command that is documented, made quick; a Mitsuba scene says its size itself."""
     added = [] if words[2:3] == ["frame.xml"] else SMALLER.get(words[1], [])
     kept = list(words)
     for option in (word for word in added if word.startswith("-")):
@@ -79,7 +91,7 @@ def smaller(words: list[str]) -> list[str]:
 
 @pytest.fixture(scope="session")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what README's commands name: its own scene with two kinds of parts, a mesh in mm, splats."""
+    """A folder with what documented commands name: a scene with two kinds of parts, a mesh in mm, splats."""
     folder = tmp_path_factory.mktemp("desk")
     shipped = YAML(typ="safe", pure=True).load(ROOT / "scenes/workcell.yaml")
     parts = ("assets/hex_nut_m16", "assets/washer")
@@ -88,7 +100,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shipped["objects"] = [{"asset": name} for name in parts]
     shipped["settle"] = {"stepper": "mujoco"}
     shipped["output"] |= {"width": 128, "height": 72}
-    YAML(typ="safe", pure=True).dump(shipped, folder / "scenes/workcell.yaml")
+    for name in ("workcell", "tray"):
+        YAML(typ="safe", pure=True).dump(shipped, folder / f"scenes/{name}.yaml")
     gear = trimesh.creation.box((30, 20, 10))
     gear.visual.vertex_colors = [200, 60, 40, 255]
     gear.export(folder / "gear.glb")
@@ -96,25 +109,14 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-QUICK_START = commands(block("## Quick start", "sh"))
-SHARDS = [words for words in commands(block("goes on where it stopped", "sh")) if "--engine" not in words]
-
-# Those that need what another one has made come after it.
-FURTHER = [
-    "mitsplat check scenes/workcell.yaml",
-    "mitsplat check assets/gear",
-    "mitsplat render frame.xml -o frame_again.png",
-    "mitsplat fit captures/mug -o fits/mug --gaussians 200 --iterations 20 --edge 64",
-    "mitsplat mesh captures/mug fits/mug -o assets/mug_again --faces 300 --voxels 48",
-    "mitsplat chart plant.splat -n 1 --size 32x18",
-    "mitsplat doctor",
-]
-"""Commands of README's table that its blocks do not show."""
-
 PHOTOGRAPHS = ("capture", "asset", "fit", "mesh")
 """Commands that begin with photographs."""
 
-SHOWN = [*QUICK_START, *SHARDS, *map(shlex.split, FURTHER)]
+DOCUMENTED = [words for page in PAGES for words in commands(page)]
+
+SHOWN = [words for words in {form(words): words for words in reversed(DOCUMENTED)}.values() if "--engine" not in words]
+"""The first of each form: what differs in names and numbers alone is typed once. Clusters have tests of their own."""
+SHOWN.sort(key=DOCUMENTED.index)  # what needs something that another one has made comes after it
 
 
 def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
@@ -127,32 +129,49 @@ def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
 
 
 def test_every_command_is_shown() -> None:
-    assert {words[1] for words in SHOWN} == set(typer.main.get_command(app).commands)
-    assert [words for words in QUICK_START + SHARDS if words[0] != "mitsplat"] == []
+    known = typer.main.get_command(app).commands
+    assert {words[1] for words in SHOWN} == set(known)
+    for words in DOCUMENTED:  # those that are not typed below, too
+        given = words[2 : words.index(">") if ">" in words else None]
+        assert known[words[1]].make_context(words[1], list(given)), words
 
 
 @pytest.mark.slow
-def test_every_command_runs_by_itself_as_readme_shows_it(desk: Path) -> None:
+def test_every_command_runs_by_itself_as_documented(desk: Path) -> None:
     for words in SHOWN:
-        if words[1] not in PHOTOGRAPHS:
+        if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
             # 1 is that of findings, which a box of sixty Gaussians and small machines may give.
             obey(words, desk, good=(0, 1) if words[1] in ("check", "doctor") else (0,))
     made = ("out/cell/report.html", "frame.png", "drop.gif", "assets/gear/asset.yaml", "board.pdf", "frame.xml")
-    assert [name for name in (*made, "frame_again.png") if not (desk / name).stat().st_size] == []
+    assert [
+        name for name in (*made, "frame_again.png", "out/whole/contact_sheet.jpg") if not (desk / name).stat().st_size
+    ] == []
     assert json.loads((desk / "scene.schema.json").read_text())["properties"]["camera"]
     assert len(list((desk / "out/cell/images").rglob("*.jpg"))) == 2
 
 
 @pytest.mark.slow
-def test_the_python_example_runs_as_it_stands(desk: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", block("In a notebook", "python")], cwd=desk, capture_output=True, text=True, check=False
-    )
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+def test_python_examples_run_as_they_stand(desk: Path, page: Path) -> None:
+    """Each page's in one process, after the commands above, which have made the datasets that some read."""
+    code = "\n".join(blocks(page, "python"))
+    done = subprocess.run([sys.executable, "-c", code], cwd=desk, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_the_guides_scene_is_one(tmp_path: Path) -> None:
+    (text,) = (text for text in blocks(ROOT / "docs/first_dataset.md", "yaml") if text.startswith("# Parts"))
+    (tmp_path / "tray.yaml").write_text(text)
+    scene_data = YAML(typ="safe", pure=True).load(text)
+    for entry in scene_data["objects"]:
+        shutil.copytree(ROOT / "scenes" / entry["asset"], tmp_path / entry["asset"])
+    scene = load_scene(tmp_path / "tray.yaml")
+    assert scene.num_frames == 20
+    assert [finding.text for finding in check_scene(scene) if not finding.ok] == []
+
+
 @pytest.mark.slow
-def test_photographs_become_assets_as_readme_shows_it(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
+def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
     """Their cameras are there, as if a first run had ended after structure from motion, which takes a minute.
 
     Status 4 is that of a tiny fit, which misses the thresholds of an asset.
@@ -162,7 +181,7 @@ def test_photographs_become_assets_as_readme_shows_it(desk: Path, captured: tupl
     for place in ("captures/mug", "assets/mug/capture"):
         shutil.copytree(out, desk / place)
     for words in SHOWN:
-        if words[1] in PHOTOGRAPHS:
-            obey(words, desk, good=(0, 4) if words[1] in ("asset", "mesh") else (0,))
-    made = ("captures/mug/capture.png", "assets/mug/report.html", "assets/mug_again/report.html")
+        if words[1] in PHOTOGRAPHS or "assets/mug" in words:
+            obey(words, desk, good={"asset": (0, 4), "mesh": (0, 4), "check": (0, 1)}.get(words[1], (0,)))
+    made = ("captures/mug/capture.png", "assets/mug/report.html", "assets/mug_by_stages/report.html")
     assert [name for name in made if not (desk / name).stat().st_size] == []

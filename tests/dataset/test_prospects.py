@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -183,9 +184,8 @@ def test_a_dataset_without_any_label_is_told(scene_data, write_scene, tmp_path, 
         frame = render(scene, index, layout=layout)
         nothing = np.zeros_like(frame.instance)
         dropped = {**frame.labels.dropped, "outside": len(layout.instances)}
-        frame.labels = type(frame.labels)(frame.labels.width, frame.labels.height, (), dropped)
-        frame.instance, frame.proxy_instance = nothing, nothing
-        return frame
+        layers = replace(frame.layers, instance=nothing, proxy_instance=nothing)
+        return replace(frame, layers=layers, labels=replace(frame.labels, instances=(), dropped=dropped))
 
     def write(scene, out, **options):
         return write_dataset(scene, out, **options, render=away, settle=laid_out)

@@ -5,8 +5,7 @@ import json
 import os
 import shutil
 import socket
-from dataclasses import dataclass
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -26,25 +25,12 @@ from mitsplat.frames.layer_sheet import layer_sheet
 from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
 from mitsplat.labels.overlay import class_colour, draw_labels
 from mitsplat.masks import Silhouette
-from mitsplat.scene.layout import Instance, Layout, RestCertificate
-from mitsplat.scene.scene import load_scene, plan_frame, random_stream
+from mitsplat.scene.layout import Instance, Layout
+from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.streams import random_stream
+from tests.synthetic import CERTIFICATE, frame_around
 
 PARSE_LINE = manifest.parse_line
-CERTIFICATE = RestCertificate(
-    rested=True,
-    inside=True,
-    overflow=False,
-    time_to_rest=1.5,
-    max_speed=0.0,
-    max_spin=0.0,
-    surface_motion=0.0,
-    collider_penetration=1e-5,
-    pair_penetration=0.0,
-    support_gap=0.0,
-    standoff=0.0,
-    attempts=2,
-    refused=("too deep",),
-)
 
 
 def settle(scene, index, *, progress):
@@ -69,23 +55,9 @@ def render(scene, index, *, layout):
         cv2.circle(ids, (int(x), int(y)), 7, instance.id, cv2.FILLED)
     image = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
     silhouettes = {int(i): Silhouette.cropped(ids == i, 0, 0) for i in np.unique(ids[ids > 0])}
-    return SimpleNamespace(
-        index=index,
-        plan=plan,
-        layout=layout,
-        camera=camera,
-        image=image,
-        rgb=image.astype(np.float32) / 255,
-        depth=ids.astype(np.float32),
-        instance=ids.astype(np.uint16),
-        proxy_instance=ids.astype(np.uint16),
-        normal=np.stack(np.meshgrid(range(camera.width), range(camera.height), [0.5]), -1)[:, :, 0].astype(np.float32),
-        light=np.ones((*ids.shape, 3), dtype=np.float32),
-        layers={"alpha": np.ones(ids.shape, dtype=np.float32)},
-        labels=label_instances(Truth(ids, ids, silhouettes, ids), layout.instances, scene.class_names, LabelRules()),
-        draws=plan.draws,
-        seconds={"march": 0.01},
-    )
+    labels = label_instances(Truth(ids, ids, silhouettes, ids), layout.instances, scene.class_names, LabelRules())
+    normal = np.stack(np.meshgrid(range(camera.width), range(camera.height), [0.5]), -1)[:, :, 0].astype(np.float32)
+    return frame_around(plan, layout, labels, image=image, ids=ids, depth=ids, normal=normal)
 
 
 @dataclass(frozen=True)
@@ -181,9 +153,7 @@ class TestContent:
 
     def test_an_image_without_instances_has_an_empty_label(self, scene, tmp_path):
         def empty(scene, index, *, layout):
-            frame = render(scene, index, layout=layout)
-            frame.labels = Labels(64, 48, (), {"hidden": 3})
-            return frame
+            return replace(render(scene, index, layout=layout), labels=Labels(64, 48, (), {"hidden": 3}))
 
         summary = write(scene, tmp_path / "out", frames=1, render=empty)
         assert (tmp_path / "out/labels/train/000000.txt").read_text() == ""
@@ -213,7 +183,8 @@ class TestContent:
         with OpenEXR.File(str(tmp_path / "out/layers/train/000000.exr"), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
         single = {"R", "G", "B", "A", "Z", "instance", "proxy_instance"}
-        assert set(channels) == single | {f"normal.{axis}" for axis in "XYZ"} | {f"light.{axis}" for axis in "RGB"}
+        colours = {f"{layer}.{axis}" for layer in ("light", "captured", "highlight") for axis in "RGB"}
+        assert set(channels) == single | colours | {f"normal.{axis}" for axis in "XYZ"}
         np.testing.assert_array_equal(channels["R"], frame.rgb[..., 0])
         np.testing.assert_array_equal(channels["normal.Y"], frame.normal[..., 1])
         np.testing.assert_array_equal(channels["instance"], frame.instance)
@@ -260,7 +231,7 @@ class TestSameBytes:
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as patch, pytest.raises(MissingResourceError, match=r"No space .*: make room"):
-            patch.setattr("mitsplat.formats.registry.yolo_lines", fail)
+            patch.setattr("mitsplat.formats.yolo.yolo_lines", fail)
             write(scene, out)
         assert (out / "images/train/000000.png").is_file()
         assert not list(out.rglob("*.txt"))
@@ -432,7 +403,6 @@ class TestPictures:
 
     def test_layers_lie_side_by_side(self, scene):
         frame = render(scene, 0, layout=settle(scene, 0, progress=print))
-        frame.layers["highlight"] = np.zeros((48, 64, 3), dtype=np.float32)
         sheet = layer_sheet(frame)
         height, width = 48 + 24 + 6, 64 + 6
         assert sheet.shape == (2 * height - 6, 3 * width - 6, 3)

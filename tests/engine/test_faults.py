@@ -32,8 +32,8 @@ from tests.dataset.test_write import settle
 from tests.engine.test_faults import slow
 
 if __name__ == "__main__":
-    dataset._default_render = lambda: partial(slow, {seconds}, {stop})
-    dataset._default_settle = lambda: settle
+    dataset.render_frame = partial(slow, {seconds}, {stop})
+    dataset.settle_layout = settle
     main(sys.argv[1:])
 """
 

@@ -178,13 +178,13 @@ class Scripted:
         self.alive: set[int] = set()
         self.hired = 0
 
-    def hire(self):
+    def start(self):
         self.alive.add(self.hired)
         self.hired += 1
         self.most = max(self.most, len(self.alive))
         return self.hired - 1
 
-    def dismiss(self, worker):
+    def stop(self, worker):
         self.alive.remove(worker)
 
     def give(self, worker, frame, layout):

@@ -262,7 +262,7 @@ def test_machines_that_join_are_told_of_once(monkeypatch):
     assert openings(second=0.0, first=0.0) == 0  # lost: theirs is what is made again
     assert openings(again=4.0) == 2
     few = pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), 2)
-    workers = [few.hire(), few.hire()]
+    workers = [few.start(), few.start()]
     assert (few.room, openings(third=8.0)) == (2, 0)
     del few._actors[workers[0]]
     assert openings(fourth=8.0) == 1

@@ -26,7 +26,7 @@ from mitsplat.fit import trainer as fit
 from mitsplat.fit.depth_priors import DepthMaps, align_maps
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
-from mitsplat.fit.training_view import Sight
+from mitsplat.fit.training_view import TrainingView
 from mitsplat.render.layers import ensure_variant, render_splats
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
@@ -315,7 +315,7 @@ def test_of_points_in_one_pixel_the_nearest_counts(capture: Capture) -> None:
     local = np.column_stack([slopes, np.ones(4)]) * depths[:, None] + (1e-4, 1e-4, 0)
     points = local @ camera.world_from_camera[:3, :3].T + camera.centre
     photo = replace(capture.photos[0], camera=camera, seen=np.arange(4, dtype=np.int32))
-    pixel, inverse = (np.array(values) for values in Sight(photo, 1.0, masked=False).depths(points))
+    pixel, inverse = (np.array(values) for values in TrainingView(photo, 1.0, masked=False).depths(points))
     middle = HEIGHT // 2 * WIDTH + WIDTH // 2
     np.testing.assert_array_equal(pixel, [middle, middle + int(0.1 * camera.fx)])
     np.testing.assert_allclose(inverse, [1, 1], rtol=1e-4)
@@ -338,7 +338,7 @@ def test_maps_take_the_place_of_points(capture: Capture, tmp_path: Path) -> None
     maps = depth_maps(capture, tmp_path)
     inverse, warnings = align_maps([photo], capture.points, maps, 64)
     ensure_variant()
-    dense = Sight(photo, 1.0, masked=True, inverse_depth=inverse[photo.name])
+    dense = TrainingView(photo, 1.0, masked=True, inverse_depth=inverse[photo.name])
     assert warnings == ()
     for sight in (dense, dense.half):
         pixel, found = (np.array(values) for values in sight.depths(capture.points))
@@ -371,7 +371,9 @@ def test_weight_of_maps_falls_and_that_of_points_does_not(capture: Capture) -> N
     ensure_variant()
     photo = capture.training[0]
     state = fit._Fit(capture, (photo,), (photo,), replace(SMALL, depth_weight=2.0), {})
-    sparse, dense = (Sight(photo, 1.0, masked=True, inverse_depth=m) for m in (None, np.ones((3, 4), np.float32)))
+    sparse, dense = (
+        TrainingView(photo, 1.0, masked=True, inverse_depth=m) for m in (None, np.ones((3, 4), np.float32))
+    )
     assert [state._depth_weight(sparse, fraction) for fraction in (0.0, 1.0)] == [2.0, 2.0]
     assert [state._depth_weight(dense, f) for f in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 0.2, 0.02])
     state.steps = 1

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from mitsplat.capture.capture import Capture
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.folder import FitResult
+from mitsplat.fit.image_metrics import psnr
 from mitsplat.fit.trainer import FitSettings, fit_capture
-from mitsplat.image_metrics import psnr
 from mitsplat.render.layers import render_splats
 from mitsplat.splats import Splats
 from tests.fit.test_fit import SMALL, photograph, seeing

@@ -43,7 +43,7 @@ def test_fit_comes_back_to_disturbed_splats_and_generalises() -> None:
     )
     shown = [picture(truth, camera) for camera in cameras(8)]
     steps: list[float] = []
-    fitted = refine_splats(start, shown, RefineSettings(iterations=160), progress=lambda step, psnr: steps.append(psnr))
+    fitted = refine_splats(start, shown, RefineSettings(iterations=160), observe=lambda step, psnr: steps.append(psnr))
     unseen = Camera.look_at((1.5, 1.6, 0.5), (0, 0, 0), width=48, height=40, fov_x=45)
     assert len(steps) == 160
     assert error(fitted, truth, unseen) < 0.15 * error(start, truth, unseen)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mitsplat.fit.optimizer import Model
+from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.strategy_classic import Classic, control_density, image_gradient, lower_opacities
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.render.layers import ensure_variant, make_sensor
@@ -21,13 +21,13 @@ from tests.render.test_render import CAMERA
 UNIT = 0.7
 
 
-def tracked(splats: Splats) -> Model:
+def tracked(splats: Splats) -> GaussianModel:
     """A model with the gradients of the loss of :func:`loss_of_twin`."""
     ensure_variant()
     from mitsplat.plugins.backward import render_differentiable
     from mitsplat.plugins.splat_proxy import view_of
 
-    own = Model(splats, UNIT)
+    own = GaussianModel(splats, UNIT)
     own.track()
     rgb, alpha = render_differentiable(own.cloud(), view_of(make_sensor(CAMERA)), QUALITY)
     colour_weight, alpha_weight = weights()
@@ -66,18 +66,18 @@ def test_what_the_photo_does_not_show_is_not_counted() -> None:
     scales = np.full((5, 3), 0.01)
     scales[3, 1] = 0.2 * slope[0]  # three of these reach back into the image
     splats = seed_splats(places @ inverse[:3, :3].T + inverse[:3, 3], np.full((5, 3), 0.5), 0)
-    own = Model(replace(splats, scales=scales), UNIT)
+    own = GaussianModel(replace(splats, scales=scales), UNIT)
     own.track()
     np.testing.assert_array_equal(np.array(image_gradient(own, CAMERA)[1]), [True, False, False, True, False])
 
 
-def model() -> Model:
+def model() -> GaussianModel:
     """Six Gaussians in a row, in the model's unit: two small, two large, one faint, one very large."""
     ensure_variant()
     splats = seed_splats(np.arange(18.0).reshape(6, 3), np.full((6, 3), 0.5), 0, opacity=0.8)
     size = np.array([0.002, 0.002, 0.05, 0.05, 0.002, 0.5])
     opacities = np.where(np.arange(6) == 4, 0.004, 0.8)
-    own = Model(replace(splats, scales=UNIT * np.repeat(size[:, None], 3, axis=1), opacities=opacities), UNIT)
+    own = GaussianModel(replace(splats, scales=UNIT * np.repeat(size[:, None], 3, axis=1), opacities=opacities), UNIT)
     own.second["means"] = own.second["means"] + 1
     return own
 
@@ -130,7 +130,7 @@ def test_parts_are_spread_as_what_they_are_parts_of() -> None:
     splats = seed_splats(np.zeros((count, 3)) + np.arange(count)[:, None], np.full((count, 3), 0.5), 0)
     scales = np.tile([0.3, 0.1, 0.02], (count, 1))
     splats = replace(splats, means=np.zeros((count, 3)), quats=np.tile(turn.as_quat(), (count, 1)), scales=scales)
-    own = Model(splats, 1.0)
+    own = GaussianModel(splats, 1.0)
     control_density(own, np.ones(count), 2 * count, np.random.default_rng(0), remove_large=False)
     assert own.count == 2 * count
     spread = turn.inv().apply(own.splats().means).std(axis=0)

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.fit.optimizer import Model
+from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.refine_splats import QUALITY
 from mitsplat.fit.strategy_mcmc import grow, jitter, relocate, seed_splats, shared
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
@@ -27,16 +27,16 @@ def test_copies_absorb_along_a_line_what_one_did(copies: int, opacity: float) ->
     assert 1 - (1 - own) ** copies == pytest.approx(opacity)
 
 
-def model() -> Model:
+def model() -> GaussianModel:
     ensure_variant()
     splats = make_splats(40, 9, bands=4)
-    return Model(replace(splats, opacities=np.where(np.arange(40) < 10, 0.001, splats.opacities)), 1.0)
+    return GaussianModel(replace(splats, opacities=np.where(np.arange(40) < 10, 0.001, splats.opacities)), 1.0)
 
 
 def test_model_gives_back_what_it_was_given() -> None:
     ensure_variant()
     splats = make_splats(12, 3, bands=4)
-    again = Model(splats, 0.7).splats()
+    again = GaussianModel(splats, 0.7).splats()
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_allclose(getattr(again, name), getattr(splats, name), rtol=2e-5, atol=1e-6, err_msg=name)
 
@@ -72,14 +72,14 @@ def test_noise_follows_shape_and_spares_the_opaque() -> None:
     count = 20000
     axis = np.tile([0.2, 0.1, 0.02], (count, 1))
     splats = seed_splats(np.random.default_rng(0).normal(size=(count, 3)), np.full((count, 3), 0.5), 0)
-    faint = Model(replace(splats, scales=axis, opacities=np.full(count, 0.0005)), 1.0)
+    faint = GaussianModel(replace(splats, scales=axis, opacities=np.full(count, 0.0005)), 1.0)
     before = np.array(faint.values["means"]).reshape(-1, 3)
     jitter(faint, 1e-5, (3, 4))
     moved = np.array(faint.values["means"]).reshape(-1, 3) - before
     gate = 1 / (1 + np.exp(-100 * (0.005 - 0.0005)))
     np.testing.assert_allclose(moved.std(axis=0), 5 * gate * axis[0] ** 2, rtol=0.03)
     assert np.abs(moved.mean(axis=0) / moved.std(axis=0)).max() < 0.03
-    opaque = Model(replace(splats, scales=axis, opacities=np.full(count, 0.9)), 1.0)
+    opaque = GaussianModel(replace(splats, scales=axis, opacities=np.full(count, 0.9)), 1.0)
     jitter(opaque, 1e-5, (3, 4))
     np.testing.assert_array_equal(np.array(opaque.values["means"]).reshape(-1, 3), before)
 
@@ -103,7 +103,7 @@ def test_gaussians_at_the_camera_stay_finite_and_where_they_are() -> None:
     splats = make_splats(20, 3, bands=4)
     means = splats.means.copy()
     means[0], means[1] = CAMERA.centre, CAMERA.centre + 0.1 * CAMERA.world_from_camera[:3, 0]
-    own = Model(replace(splats, means=means), 1.0)
+    own = GaussianModel(replace(splats, means=means), 1.0)
     own.track()
     rgb, alpha = render_differentiable(own.cloud(), view_of(make_sensor(CAMERA)), QUALITY)
     dr.backward(dr.sum(rgb[0] + alpha))

@@ -32,6 +32,7 @@ from mitsplat.masks import Silhouette
 from mitsplat.scene.scene import load_scene
 from mitsplat.scene.spec import FORMATS
 from tests.labels.test_labels import Seen, read_yolo, resample, whole
+from tests.synthetic import frame_around
 
 WIDTH, HEIGHT = 160, 120
 CLASSES = ("bolt", "nut")
@@ -112,28 +113,24 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
     )
     following = Camera.look_at((0.05, 0, 1), (0.05, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60)
     plan = SimpleNamespace(
+        index=index,
         layout=index // 2,
         view=index % 2,
         split="train" if index % 4 < 2 else "val",
-        seed=index,
+        camera=CAMERA,
         next_camera=following,
         lights=(),
-    )
-    return SimpleNamespace(
-        index=index,
-        plan=plan,
-        layout=SimpleNamespace(to_json=lambda: {"certificate": {}}),
-        camera=CAMERA,
-        image=rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8),
-        rgb=np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32),
-        depth=depth,
-        instance=ids,
-        proxy_instance=ids,
-        normal=np.broadcast_to(np.float32([0, -0.6, 0.8]), (HEIGHT, WIDTH, 3)) * (ids > 0)[..., None],
-        light=np.ones((HEIGHT, WIDTH, 3), dtype=np.float32),
-        labels=labels,
         draws={},
-        layers={},
+        seed=index,
+    )
+    return frame_around(
+        plan,
+        SimpleNamespace(to_json=lambda: {"certificate": {}}),
+        labels,
+        image=rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8),
+        ids=ids,
+        depth=depth,
+        normal=np.broadcast_to(np.float32([0, -0.6, 0.8]), (HEIGHT, WIDTH, 3)) * (ids > 0)[..., None],
     )
 
 
@@ -342,6 +339,7 @@ class TestCoco:
                 for label, entry in zip(frame.labels.instances, frames[frame.index]["instances"], strict=True):
                     expected = CAMERA.camera_from_world @ label.world_from_object
                     np.testing.assert_allclose(entry["camera_from_object"], expected, atol=1e-12)
+                    assert entry["object"] == label.asset
 
 
 class TestVoc:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import fields, replace
 from typing import Any
 
@@ -19,7 +20,8 @@ from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.quality import PRESETS
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
-from mitsplat.scene.scene import FramePlan, LightSpec
+from mitsplat.scene.scene import FramePlan
+from mitsplat.scene.spec import LightSpec
 from tests.conftest import WriteScene
 from tests.render.test_render import make_splats
 
@@ -117,19 +119,9 @@ def test_frame_is_remade_from_its_record(
     (tmp_path / "labels" / frame.plan.split).mkdir(parents=True)
     record = json.loads(json.dumps(write_frame(frame, tmp_path, first.spec, Catalogue.of(first))))
 
-    taken = record["camera"]
-    (fx, _, cx), (_, fy, cy), _ = taken["intrinsics"]
-    camera = Camera(
-        taken["width"],
-        taken["height"],
-        *(fx, fy, cx, cy),
-        np.array(taken["world_from_camera"]),
-        tuple(taken["distortion"]),
-        taken["near"],
-    )
     plan = FramePlan(
         **{name: record[name] for name in ("index", "layout", "view", "split", "draws", "seed")},
-        camera=camera,
+        camera=Camera.from_json(record["camera"]),
         next_camera=None,
         lights=tuple(TypeAdapter(LightSpec).validate_python(light) for light in record["lights"]),
     )
@@ -182,7 +174,7 @@ def test_exported_xml_renders_the_same_picture(
     picture = render_xml(tmp_path / "one.xml", tmp_path / "out")
     frame = ms.render_frame(scene, 1, layout=layout)
     ours = np.asarray(Image.open(picture), dtype=np.float64)
-    covered = frame.layers["alpha"] > 0.99
+    covered = frame.layers.alpha > 0.99
     assert covered.any()
     assert np.abs(ours - frame.image)[covered].mean() < 1.0
 
@@ -193,6 +185,27 @@ def test_bad_xml_is_one_sentence(tmp_path: Any) -> None:
         render_xml(tmp_path / "bad.xml", tmp_path)
     with pytest.raises(InputError, match="no such file"):
         render_xml(tmp_path / "absent.xml", tmp_path)
+
+
+def test_a_frame_keeps_what_it_was_made_of(scene: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    frame = ms.render_frame(scene, 1, layout=layout)
+    assert (frame.index, frame.camera, frame.draws) == (1, frame.plan.camera, frame.plan.draws)
+    for name in ("depth", "instance", "proxy_instance", "normal", "light"):
+        assert getattr(frame, name) is getattr(frame.layers, name)
+    again = pickle.loads(pickle.dumps(frame))
+    np.testing.assert_array_equal(again.image, frame.image)
+    np.testing.assert_array_equal(again.layers.highlight, frame.layers.highlight)
+
+
+def test_a_closed_renderer_says_so(scene: ms.Scene, settled: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    with ms.Renderer(scene) as renderer, monkeypatch.context() as patch:
+        patch.setattr("mitsplat.frames.frame.mi.variant", lambda: "cuda_ad_rgb")
+        with pytest.raises(InputError, match="was made in Mitsuba's variant llvm_ad_rgb"):
+            renderer.render(0, layout=layout)
+    with pytest.raises(InputError, match="closed"):
+        renderer.render(0, layout=layout)
 
 
 def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:

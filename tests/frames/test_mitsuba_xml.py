@@ -1,4 +1,4 @@
-"""Scenes that are written in XML by hand: what they may name, what is refused and how, and the README's own."""
+"""Scenes that are written in XML by hand: what they may name, what is refused and how, and the documented one."""
 
 from __future__ import annotations
 
@@ -160,9 +160,9 @@ def test_an_asset_outside_of_the_scenes_folder_is_refused(small: Path) -> None:
     check_xml(small / "in/scene.xml", allow_outside=True)
 
 
-def test_the_readmes_scene_renders_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documented_scene_renders_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its size alone is less, so that the test is fast."""
-    (text,) = re.findall(r"```xml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (text,) = re.findall(r"```xml\n(.*?)```", (ROOT / "docs/xml_and_plugins.md").read_text(), re.DOTALL)
     for name in set(re.findall(r'name="asset" value="([^"]+)"', text)):
         shutil.copytree(ROOT / name, tmp_path / name)
     text = re.sub(r'name="(width|height)" value="(\d+)"', lambda m: f'name="{m[1]}" value="{int(m[2]) // 8}"', text)

@@ -88,7 +88,7 @@ def test_the_frame_is_the_meshs_and_not_the_centre_of_mass(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_small_parts_come_to_rest_on_the_table(stepper):
     """A box of 10 mm flat, one on edge, a washer-thin disc on its rim, and one with its origin elsewhere."""
-    from mitsplat.physics.worlds import run_to_rest
+    from mitsplat.physics.rest import run_to_rest
 
     box = trimesh.creation.box((0.010, 0.010, 0.010))
     disc = trimesh.creation.cylinder(radius=0.006, height=0.0015, sections=32)
@@ -207,7 +207,7 @@ def test_mujoco_in_c_is_stepped_as_by_itself(monkeypatch):
 
 
 def test_a_contact_buffer_that_is_too_small_is_noticed():
-    from mitsplat.physics.worlds import OVERFLOW, run_to_rest
+    from mitsplat.physics.rest import OVERFLOW, run_to_rest
 
     boxes = [body_of(trimesh.creation.box((0.03, 0.03, 0.03)))] * 4
     poses = [pose_at((0.1 * i, 0, 0.016)) for i in range(4)]
@@ -242,7 +242,7 @@ def test_worlds_that_share_kernels_do_not_meet():
 
 def test_mean_speeds():
     """A turn of t about an axis through the centre of mass, and a way of w, in s seconds: t / s and w / s."""
-    from mitsplat.physics.worlds import _mean_speeds
+    from mitsplat.physics.rest import _mean_speeds
 
     body = body_of(trimesh.creation.box((0.02, 0.03, 0.01)))
     before = pose_at((0.1, 0, 0), Rotation.from_rotvec((0.3, -1, 2)))[None]
@@ -253,7 +253,7 @@ def test_mean_speeds():
 
 def test_a_light_part_carries_a_heavy_one():
     """A plate a hundred times as heavy rests on two nuts: none of them sinks by more than 0.1 mm."""
-    from mitsplat.physics.worlds import run_to_rest
+    from mitsplat.physics.rest import run_to_rest
 
     nut, plate = trimesh.creation.box((0.01, 0.01, 0.005)), trimesh.creation.box((0.15, 0.05, 0.0135))
     bodies = [body_of(nut), body_of(nut), body_of(plate)]
@@ -282,7 +282,7 @@ def test_an_incline_is_crept_down_by_less_than_a_tenth_of_a_millimetre(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_box_ends_on_a_face_however_it_is_dropped(stepper):
     """Flat on each face, on edges, and on a corner below the centre of mass: the energy is least on a face."""
-    from mitsplat.physics.worlds import run_to_rest
+    from mitsplat.physics.rest import run_to_rest
 
     box = trimesh.creation.box((0.02, 0.03, 0.01))
     on_corner = Rotation.align_vectors([[0, 0, -1]], [[2, 3, 1]])[0]
@@ -307,7 +307,7 @@ def test_a_box_ends_on_a_face_however_it_is_dropped(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_box_does_not_balance_on_its_edge(stepper):
     """The centre of mass stands above the edge at a tilt of atan(d / b), where only roll friction could hold it."""
-    from mitsplat.physics.worlds import run_to_rest
+    from mitsplat.physics.rest import run_to_rest
 
     breadth, depth = 0.03, 0.009
     slab = trimesh.creation.box((breadth, breadth, depth))
@@ -403,7 +403,8 @@ def test_an_overlap_of_ten_millimetres_ejects_nothing(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_ball_rests_inside_a_cup_and_not_on_its_hull(stepper):
     """The floor of the cup is 6 mm thick: the ball's centre comes to rest a radius above it, not above the rim."""
-    from mitsplat.physics.worlds import Collider, run_to_rest
+    from mitsplat.physics.rest import run_to_rest
+    from mitsplat.physics.worlds import Collider
 
     profile = [[0, 0], [0.03, 0], [0.03, 0.03], [0.025, 0.03], [0.025, 0.006], [0, 0.006]]
     cup = trimesh.creation.revolve(profile, sections=8)
@@ -441,7 +442,7 @@ def test_bodies_are_thrown_as_said(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
     """A block at 0.3 mm/s moves by less than 0.1 mm in a quarter of a second and 0.5 mm in one; not if it speeds up."""
-    from mitsplat.physics import worlds as physics
+    from mitsplat.physics import rest as physics
 
     block = trimesh.creation.box((0.04, 0.04, 0.01))
     world = world_of(stepper, [body_of(block, friction=0.0)], [table(friction=0.0)], [pose_at((0, 0, 0.005))])
@@ -463,7 +464,7 @@ def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_what_is_poured_falls_no_faster_than_it_may(stepper):
     """A ball falls 0.5 m in h / v + v / 2 g = 0.55 s at v = 1 m/s, and no faster."""
-    from mitsplat.physics import worlds as physics
+    from mitsplat.physics import rest as physics
 
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
     world = world_of(stepper, [body_of(ball)], [table()], [pose_at((0, 0, 0.52))])

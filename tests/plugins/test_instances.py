@@ -10,9 +10,11 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.camera import Camera
+from mitsplat.frames.frame import NOTHING
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.render.layers import ensure_variant, make_integrator, make_splats_shape, render_layers
 from mitsplat.splats import Splats
@@ -77,6 +79,24 @@ def test_porous_instances_in_one_place_have_the_ids_of_the_twin(count: int) -> N
     assert len(np.unique(shares.argmax(axis=2))) >= count  # all of them are seen somewhere
     wrong, ties = differences(shown(splats, ids, EXACT), shares)
     assert wrong == 0 and ties < 8
+
+
+@pytest.mark.parametrize("before", range(1, 4))
+def test_shapes_without_gaussians_move_no_other(before: int) -> None:
+    """Proxies have none, and come first in a scene without an environment."""
+    ensure_variant()
+    ball = gaussians([(0, 0, 0)], [(0, 0, 0, 1)], [(0.1, 0.1, 0.1)], [0.9])
+    poses = [mi.ScalarTransform4f().translate([x, y, 0]).matrix for x, y in ((-0.4, 0.2), (0, -0.3), (0.4, 0.1))]
+    balls = {f"ball_{i}": make_splats_shape(ball, np.array(pose), instance=i) for i, pose in enumerate(poses, start=1)}
+    proxy = trimesh.creation.box((0.1, 0.1, 0.1), np.array(mi.ScalarTransform4f().translate([0, 0, 9]).matrix))
+    proxies = {f"proxy_{i}": make_splats_shape(NOTHING, proxy=proxy) for i in range(before)}
+    integrator = make_integrator(quality=EXACT, shadow="none")
+    alone, first = (
+        render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), CAMERA).instance
+        for shapes in (balls, proxies | balls)
+    )
+    assert set(np.unique(alone)) == {0, 1, 2, 3}
+    assert (first == alone).all()
 
 
 @pytest.mark.parametrize("order", ["tile", "ray"])

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from mitsplat import image_metrics as metrics
+from mitsplat.fit import image_metrics as metrics
 from mitsplat.render.layers import ensure_variant
 
 WIDTH, HEIGHT = 45, 37

@@ -17,7 +17,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.mesh_distance import Surface
 from mitsplat.reconstruct.evaluation import Verdict
-from mitsplat.reconstruct.pipeline import AssetJob, Finished, make_asset, make_photo_asset, read_fit
+from mitsplat.reconstruct.pipeline import AssetJob, AssetResult, make_asset, make_photo_asset, read_fit
 from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.scene import load_scene
@@ -39,7 +39,7 @@ def quick_pieces() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished]:
+def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssetResult]:
     folder = tmp_path_factory.mktemp("made")
     (folder / "fit").mkdir()
     known_object.splats.save(folder / "fit" / "splats.ply")
@@ -50,7 +50,9 @@ def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) ->
     return folder, make_asset(folder / "capture", folder / "fit", folder / "asset", job)
 
 
-def test_mesh_and_splats_share_the_frame_of_the_truth(known_object: KnownObject, made: tuple[Path, Finished]) -> None:
+def test_mesh_and_splats_share_the_frame_of_the_truth(
+    known_object: KnownObject, made: tuple[Path, AssetResult]
+) -> None:
     folder, done = made
     asset = Asset.load(folder / "asset")
     assert asset.class_name == "bracket"
@@ -71,7 +73,7 @@ def test_mesh_and_splats_share_the_frame_of_the_truth(known_object: KnownObject,
     assert done.shortcoming is None
 
 
-def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, Finished]) -> None:
+def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, AssetResult]) -> None:
     folder, _ = made
     scene = folder / "scene.yaml"
     camera = "camera: {kind: orbit, radius: 1, height: 1, target: [0, 0, 0]}"
@@ -86,7 +88,7 @@ def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, Finis
     assert loaded.mesh.extents.max() == pytest.approx(0.3)
 
 
-def test_the_page_is_one_file_with_every_part(made: tuple[Path, Finished]) -> None:
+def test_the_page_is_one_file_with_every_part(made: tuple[Path, AssetResult]) -> None:
     page = (made[0] / "asset" / "report.html").read_text()
     assert not re.search(r'(src|href)="(?!data:)', page)
     for heading in ("Verdict", "Held-out views", "Cameras", "Photos", "Rejected"):
@@ -98,7 +100,7 @@ def test_the_page_is_one_file_with_every_part(made: tuple[Path, Finished]) -> No
 
 
 def test_the_same_inputs_are_kept_and_others_are_not(
-    made: tuple[Path, Finished], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    made: tuple[Path, AssetResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     folder, first = made
     job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
@@ -207,14 +209,16 @@ def test_photos_go_through_all_stages(
     def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:
         overwritten.append(overwrite)
 
-    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, *, progress: object) -> Finished:
+    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, *, progress: object) -> AssetResult:
         assert (capture, fit) == (out / "capture", out / "fit")
-        return Finished(out, GOOD, kept=False)
+        return AssetResult(out, GOOD, kept=False)
 
     capture = known_object.capture.save(tmp_path / "asset" / "capture")
     captured = CaptureResult(capture, 32, "a board", 0.5, doubtful={"05.png": 0.6})
-    monkeypatch.setattr("mitsplat.capture.pipeline.capture_photos", lambda photos, out, settings, progress: captured)
-    monkeypatch.setattr("mitsplat.fit.trainer.fit_capture", fit_capture)
+    monkeypatch.setattr(
+        "mitsplat.reconstruct.pipeline.capture_photos", lambda photos, out, settings, progress: captured
+    )
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.fit_capture", fit_capture)
     monkeypatch.setattr("mitsplat.reconstruct.pipeline.make_asset", made_of)
     job = AssetJob(name="part")
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):

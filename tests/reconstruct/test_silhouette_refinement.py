@@ -66,10 +66,10 @@ def test_a_disturbed_mesh_comes_back_to_the_solid(
     factor: float,
 ) -> None:
     start = bumpy(bumps, scale)
-    told: list[tuple[int, int]] = []
-    found = refine_mesh(start, views, settings, progress=lambda done, total: told.append((done, total)))
+    told: list[tuple[int, int, str]] = []
+    found = refine_mesh(start, views, settings, progress=lambda *step: told.append(step))
     assert found.kept and found.after < found.before
-    assert (found.judges, told[-1]) == (4, (40, 40))
+    assert (found.judges, told[-1]) == (4, (40, 40, "refining the mesh"))
     assert chamfer(start, truth) > factor * chamfer(found.mesh, truth)
     assert overlap(found.mesh, truth) > overlap(start, truth)
     assert found.mesh.is_volume

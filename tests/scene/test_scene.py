@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.scene.scene import FramePlan, Scene, layout_of, load_scene, plan_frame, random_stream, scene_json_schema
+from mitsplat.scene.scene import FramePlan, Scene, layout_of, load_scene, plan_frame, scene_json_schema
+from mitsplat.scene.spec import SCHEMA_VERSION
+from mitsplat.scene.streams import random_stream
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
@@ -59,6 +62,19 @@ def test_entries_of_one_asset_share_its_data(scene_data: SceneData, write_scene:
     assert first.splats is second.splats
     assert first.mesh is second.mesh
     assert (first.class_name, second.class_name) == ("nut", "other")
+
+
+def test_all_is_read_once_before_any_of_it_is_judged(
+    scene_data: SceneData, write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first object does not fit into the region, the asset of the last one is absent: the latter is told."""
+    nut, read, load = scene_data["objects"][0]["asset"], [], Asset.load
+    monkeypatch.setattr(Asset, "load", lambda folder: (read.append(Path(folder).name), load(folder))[1])
+    scene_data["objects"] = [{"asset": nut}, {"asset": nut, "scale": 2.0}]
+    load_scene(write_scene(scene_data))
+    assert read.count(Path(nut).name) == 1
+    scene_data["objects"] = [{"asset": nut, "scale": 1000.0}, {"asset": "assets/absent"}]
+    assert "assets/absent" in refusal(write_scene(scene_data))
 
 
 def test_overrides_replace_what_the_file_says(scene_data: SceneData, write_scene: WriteScene) -> None:
@@ -439,6 +455,8 @@ def test_light_path_warms_evenly_in_reciprocal_temperature(scene_data: SceneData
 
 def test_schema_describes_every_key() -> None:
     schema = scene_json_schema()
+    assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert schema["$id"] == f"urn:mitsplat:scene:{SCHEMA_VERSION}"
     json.dumps(schema)
     models = [schema, *schema["$defs"].values()]
     undescribed = [

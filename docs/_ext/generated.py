@@ -1,0 +1,182 @@
+"""Fills in what is generated: a page says where by a comment such as ``<!-- generated: scene -->``.
+
+So the pages stay readable where nothing is built, and what they say of the code cannot be out of date.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from docutils import nodes
+from pictures import GALLERY, SCENES
+from scene_reference import scene_reference
+from sphinx.application import Sphinx
+from sphinx.domains.python import PyObject
+
+ROOT = Path(__file__).parents[2]
+WINGS = (
+    *("scene", "physics", "render", "labels", "frames", "formats", "dataset", "engine", "audit"),
+    *("capture", "fit", "reconstruct", "bake", "checks"),
+)
+
+
+def _scene() -> str:
+    from mitsplat.scene import scene_json_schema
+
+    return scene_reference(scene_json_schema())
+
+
+def _cli() -> str:
+    """Typer's own reference without its first heading; the list of commands, which it cuts short, whole and linked."""
+    command = [sys.executable, "-m", "typer", "mitsplat.cli", "utils", "docs", "--name", "mitsplat"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    told = dict(re.findall(r"^## `mitsplat (\w+)`\n\n(.+)", text, re.MULTILINE))
+    text = re.sub(
+        r"^\* `(\w+)`: .*", lambda m: f"* [`{m[1]}`](#mitsplat-{m[1]}): {told[m[1]]}", text, flags=re.MULTILINE
+    )
+    return text.split("\n", 1)[1]
+
+
+def _gallery() -> str:
+    sections = []
+    for name in (*GALLERY, "mirror_ball.xml"):
+        path = SCENES / name
+        first = path.read_text().split("\n", 1)[0]
+        told, language = re.sub(r"^# |^<!-- | -->$", "", first), "xml" if path.suffix == ".xml" else "yaml"
+        title = path.stem.replace("_", " ").capitalize()
+        sections.append(
+            f"## {title}\n\n{told}\n\n![A frame of {name}](pictures/scene/gallery-{path.stem}.jpg)\n\n"
+            f"```{{literalinclude}} ../scenes/{name}\n:language: {language}\n:caption: scenes/{name}\n```"
+        )
+    return "\n\n".join(sections)
+
+
+def _scripts() -> str:
+    sections = []
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        told = inspect.cleandoc(ast.get_docstring(ast.parse(path.read_text())) or "")
+        code = f"```{{literalinclude}} ../examples/{path.name}\n:language: python\n```"
+        sections.append(f"### `{path.name}`\n\n{told.replace('``', '`')}\n\n{code}")
+    return "\n\n".join(sections)
+
+
+def _api() -> str:
+    """The names that ``import mitsplat as ms`` gives."""
+    import mitsplat
+
+    return "\n\n".join(_documented("mitsplat", name) for name in mitsplat.__all__)
+
+
+def _wings() -> str:
+    """What the doors of the wings hand out beyond that."""
+    import mitsplat
+
+    sections = []
+    for wing in WINGS:
+        module = importlib.import_module(f"mitsplat.{wing}")
+        sections.append(
+            f"## `mitsplat.{wing}`\n\n```{{eval-rst}}\n.. automodule:: mitsplat.{wing}\n   :no-members:\n```"
+        )
+        public = [name for name in module.__all__ if name in mitsplat.__all__]
+        if public:
+            sections.append("Also hands out " + ", ".join(f"{{py:obj}}`mitsplat.{name}`" for name in public) + ".")
+        sections += [_documented(f"mitsplat.{wing}", name) for name in module.__all__ if name not in public]
+    return "\n\n".join(sections)
+
+
+def _documented(module: str, name: str) -> str:
+    value = getattr(importlib.import_module(module), name)
+    kind = "class" if inspect.isclass(value) else "function" if inspect.isfunction(value) else "data"
+    # What a pydantic model holds is told by the reference of scene files.
+    members = "   :members:\n" if kind == "class" and not hasattr(value, "model_fields") else ""
+    return f"```{{eval-rst}}\n.. auto{kind}:: {module}.{name}\n{members}```"
+
+
+def _plugins() -> str:
+    """The docstrings of the plugins, which are their manuals as Mitsuba's are."""
+    sections = []
+    for path in (ROOT / "plugins" / f"{name}.py" for name in ("splats", "splat_proxy", "opencv_camera")):
+        classes = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef))
+        manual = next(text for node in classes if ":monosp:" in (text := ast.get_docstring(node) or ""))
+        manual = re.sub(r"\|(\w+)\|", r"\1", manual)  # |string| and the like, which Mitsuba's documentation replaces
+        sections.append(f"## `{path.stem}`\n\n```{{eval-rst}}\n{manual}\n```")
+    return "\n\n".join(sections)
+
+
+GENERATED: dict[str, Callable[[], str]] = {
+    "scene": _scene,
+    "cli": _cli,
+    "gallery": _gallery,
+    "scripts": _scripts,
+    "api": _api,
+    "wings": _wings,
+    "plugins": _plugins,
+}
+
+
+def _fill_in(app: Sphinx, docname: str, source: list[str]) -> None:
+    if docname.startswith("examples/"):
+        return
+    source[0] = re.sub(r"<!-- generated: (\w+) -->", lambda match: GENERATED[match[1]](), source[0])
+
+
+def _undocumented(
+    _app: Sphinx, _env: object, node: nodes.Element, shown: nodes.TextElement
+) -> nodes.TextElement | None:
+    """What the code has but no page tells of is shown without a link; what it has not is left to be complained of."""
+    target: str = node.get("reftarget", "")
+    if target.startswith("."):
+        target = f"{node.get('py:module')}{target}"
+    if not target.startswith("mitsplat."):
+        return None
+    try:
+        if importlib.util.find_spec(target):
+            return shown
+    except ModuleNotFoundError:
+        pass
+    try:
+        pkgutil.resolve_name(target)
+    except (ImportError, AttributeError):
+        return None
+    return shown
+
+
+def _tidy_signature(_app: Sphinx, *told: object) -> tuple[str | None, str | None]:
+    """Defaults that only a factory knows, as dots, since what is no Python is not laid out; aliases by their names."""
+    signature, returns = (part and re.sub(r"TypeAliasForwardRef\('([\w.]+)'\)", r"\1", str(part)) for part in told[-2:])
+    return signature and signature.replace("<factory>", "..."), returns
+
+
+def _part_attributes(_app: Sphinx, *told: object) -> None:
+    """``a, b: text`` among the attributes as one entry each, after Napoleon."""
+    lines = told[-1]
+    for position in reversed(range(len(lines))):
+        if match := re.match(r":ivar (\w+(?:, \w+)+):(.*)", lines[position]):
+            end = position + 1
+            while end < len(lines) and lines[end].startswith(" "):
+                end += 1
+            text = lines[position + 1 : end]
+            lines[position:end] = [
+                line for name in match[1].split(", ") for line in (f":ivar {name}:{match[2]}", *text)
+            ]
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Sphinx's entry."""
+    app.connect("source-read", _fill_in)
+    app.connect("missing-reference", _undocumented)
+    app.connect("autodoc-process-signature", _tidy_signature)
+    app.connect("autodoc-process-docstring", _part_attributes, priority=900)
+    for field in PyObject.doc_field_types:
+        if field.name == "variable":
+            field.label = "Attributes"
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

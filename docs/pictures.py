@@ -1,0 +1,157 @@
+"""Makes the pictures of the scene reference and of the gallery.
+
+Run as ``python docs/pictures.py [--missing] [KEY or SCENE ...]``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+DOCS = Path(__file__).parent
+SCENES = DOCS.parent / "scenes"
+FOLDER = DOCS / "pictures" / "scene"
+SIZE = (320, 200)
+"""Of the reference's pictures [px]; those of the gallery are twice as large."""
+
+GALLERY = ("workcell.yaml", "bin_picking.yaml", "stacks.yaml", "fisheye.yaml", "close_up.yaml", "moving_light.yaml")
+"""Scenes of the gallery, in its order; ``mirror_ball.xml`` follows them."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture of a key of the scene file.
+
+    Attributes:
+        key: The key, such as ``settle.arrangement``.
+        fragment: YAML that is put over the base scene.
+        scene: What comes of that.
+        file: Where the picture lies.
+        frames: Frames shown, one or four.
+        zoom: How many times larger its pixels are shown.
+        labels: Whether labels are drawn.
+    """
+
+    key: str
+    fragment: str
+    scene: dict[str, Any]
+    file: Path
+    frames: tuple[int, ...]
+    zoom: float
+    labels: bool
+
+
+def read_pictures() -> list[Picture]:
+    """All pictures that ``pictures.yaml`` asks for, those of a key one after the other."""
+    yaml = YAML(typ="safe")
+    told = yaml.load((DOCS / "pictures.yaml").read_text())
+    return [
+        Picture(
+            key=key,
+            fragment=fragment,
+            scene=_merged(told["bases"][entry["base"]], yaml.load(fragment)),
+            file=FOLDER / f"{key.replace('[]', '').replace('.', '-')}-{number}.jpg",
+            frames=tuple(entry.get("frames", (0,))),
+            zoom=entry.get("zoom", 1),
+            labels=entry.get("labels", False),
+        )
+        for key, entry in told["pictures"].items()
+        for number, fragment in enumerate(entry["each"])
+    ]
+
+
+def _merged(base: Any, over: Any) -> Any:
+    """``over`` put over ``base``; lists, and mappings of another ``kind``, are replaced."""
+    if not isinstance(base, dict) or not isinstance(over, dict) or over.get("kind") not in (None, base.get("kind")):
+        return over
+    return base | {name: _merged(base.get(name), value) for name, value in over.items()}
+
+
+def _render_key(picture: Picture, folder: Path) -> Any:
+    import cv2
+    import numpy as np
+
+    import mitsplat as ms
+    from mitsplat.labels import draw_labels
+
+    yaml = YAML(typ="safe")
+    width, height = (round(edge / picture.zoom) for edge in SIZE)
+    several = len(picture.frames) > 1
+    size = {"width": width // 2, "height": height // 2} if several else {"width": width, "height": height}
+    yaml.dump(picture.scene | {"output": picture.scene["output"] | size}, folder / "scene.yaml")
+    with ms.Renderer(ms.load_scene(folder / "scene.yaml", allow_outside=True)) as renderer:
+        frames = [renderer.render(index) for index in picture.frames]
+    images = [draw_labels(frame.image, frame.labels) if picture.labels else frame.image for frame in frames]
+    image = np.vstack([np.hstack(images[:2]), np.hstack(images[2:])]) if several else images[0]
+    return cv2.resize(image, SIZE, interpolation=cv2.INTER_NEAREST if picture.zoom > 1 else cv2.INTER_AREA)
+
+
+def _render_scene(name: str) -> Any:
+    import mitsplat as ms
+
+    overrides = {"output.width": 2 * SIZE[0], "output.height": 2 * SIZE[1]}
+    return ms.render_frame(ms.load_scene(SCENES / name, overrides=overrides), 0).image
+
+
+def _render_xml(name: str, folder: Path) -> Any:
+    import cv2
+
+    from mitsplat.frames.mitsuba_xml import render_xml
+
+    return cv2.imread(str(render_xml(SCENES / name, folder / "picture.png")))[..., ::-1]
+
+
+def main() -> None:
+    """Make the pictures that are asked for, or all."""
+    import cv2
+    import trimesh
+
+    from mitsplat.errors import InputError
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", help="keys of the scene file, and files of the gallery; all if absent")
+    parser.add_argument("--missing", action="store_true", help="keep what is there")
+    options = parser.parse_args()
+    wanted = set(options.names)
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    work = {
+        picture.file: (picture.key, lambda folder, it=picture: _render_key(it, folder)) for picture in read_pictures()
+    }
+    for name in GALLERY:
+        work[FOLDER / f"gallery-{Path(name).stem}.jpg"] = (name, lambda _, it=name: _render_scene(it))
+    work[FOLDER / "gallery-mirror_ball.jpg"] = (
+        "mirror_ball.xml",
+        lambda folder: _render_xml("mirror_ball.xml", folder),
+    )
+    if unknown := wanted - {name for name, _ in work.values()}:
+        sys.exit(f"no such picture: {', '.join(sorted(unknown))}")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "assets").symlink_to(SCENES / "assets")
+        trimesh.creation.torus(0.05, 0.015).apply_translation((0, 0, 0.015)).export(folder / "ring.ply")
+        failed = []
+        for file, (key, make) in work.items():
+            if (wanted and key not in wanted) or (options.missing and file.exists()):
+                continue
+            start = time.perf_counter()
+            try:
+                image = make(folder)
+            except InputError as error:
+                failed.append(f"{file.name}: {error}")
+                continue
+            cv2.imwrite(str(file), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+            size, seconds = file.stat().st_size / 1000, time.perf_counter() - start
+            print(f"{key}: {file.name}, {size:.0f} kB, {seconds:.0f} s", flush=True)
+    extra = [f"{file.name} is no longer asked for" for file in sorted(set(FOLDER.glob("*.jpg")) - set(work))]
+    sys.exit("\n".join(failed + extra) or None)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""What a format is, and the files of one frame while they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.errors import InputError
+from mitsplat.files import Record, link_file, write_file
+from mitsplat.formats import maps
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from mitsplat.frames.frame import Frame
+    from mitsplat.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """What the labels of a scene refer to.
+
+    Attributes:
+        class_names: By class index.
+        keypoint_names: Keypoints of every class.
+        assets: Names, by position among the scene's assets.
+        meshes: Their proxy meshes [m].
+    """
+
+    class_names: Sequence[str]
+    keypoint_names: Sequence[Sequence[str]]
+    assets: Sequence[str]
+    meshes: Sequence[trimesh.Trimesh]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Catalogue:
+        """The catalogue of a scene, checked against the formats that it asks for.
+
+        Raises:
+            InputError: If assets of one class name different keypoints, or a format cannot show what the scene has.
+        """
+        points: dict[str, tuple[str, tuple[str, ...]]] = {}
+        for asset in scene.assets:
+            names = tuple(asset.keypoints)
+            other, known = points.setdefault(asset.class_name, (asset.name, names))
+            if known != names:
+                raise InputError(
+                    f"{scene.path}: assets of class {asset.class_name!r} must name the same keypoints "
+                    f"(got {list(known)} in {other} and {list(names)} in {asset.name})"
+                )
+        keypoint_names = tuple(points[name][1] if name in points else () for name in scene.class_names)
+        formats = scene.spec.output.formats
+        if "yolo-pose" in formats and not any(keypoint_names):
+            raise InputError(f"{scene.path}: output.formats: yolo-pose needs an asset with keypoints (got none)")
+        if "bop" in formats and any(scene.spec.camera.intrinsics.distortion):
+            raise InputError(
+                f"{scene.path}: output.formats: bop must have a camera without lens distortion "
+                f"(got {list(scene.spec.camera.intrinsics.distortion)})"
+            )
+        meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
+        return cls(scene.class_names, keypoint_names, [asset.name for asset in scene.assets], meshes)
+
+    @property
+    def num_keypoints(self) -> int:
+        """Keypoints of the class that has most."""
+        return max(map(len, self.keypoint_names), default=0)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFiles:
+    """The files of one frame below ``root``; ``record`` is its line of the manifest, which lists them.
+
+    Attributes:
+        frame: What is written.
+        image: The frame's picture, relative to the root, which is there before any other file.
+        ids: Ids of the instances that labels are of, shape (H, W), those without a label included.
+    """
+
+    root: Path
+    frame: Frame
+    catalogue: Catalogue
+    record: Record
+    image: str
+    ids: npt.NDArray[np.integer[Any]] = field(repr=False)
+
+    @property
+    def number(self) -> str:
+        """How the frame's files are called."""
+        return f"{self.frame.index:06d}"
+
+    @property
+    def name(self) -> str:
+        """The same in the folder of its split."""
+        return f"{self.frame.plan.split}/{self.number}"
+
+    @property
+    def image_name(self) -> str:
+        """File name of the picture."""
+        return Path(self.image).name
+
+    @cached_property
+    def labelled(self) -> npt.NDArray[np.uint16]:
+        """Ids of the labelled instances, shape (H, W)."""
+        return maps.instance_picture(self.frame.labels)
+
+    @cached_property
+    def depth(self) -> npt.NDArray[np.uint16]:
+        """Depth in units of the record's ``depth_scale``, shape (H, W)."""
+        return maps.depth_picture(self.frame.depth)
+
+    def add(self, file: str, write: Callable[[Path], object]) -> None:
+        """Write a file whole or not at all, and list it."""
+        self.record["files"][file] = write_file(self.root / file, write)
+
+    def add_bytes(self, file: str, content: bytes) -> None:
+        """Write a file of this content."""
+        self.add(file, lambda path: path.write_bytes(content))
+
+    def add_png(self, file: str, picture: npt.NDArray[Any]) -> None:
+        """Write a picture without loss."""
+        self.add_bytes(file, maps.encode_png(picture))
+
+    def add_image(self, file: str) -> None:
+        """Give the frame's picture a second name."""
+        self.add(file, lambda path: link_file(self.root / self.image, path))
+
+
+class Describer(Protocol):
+    """Writes files that describe a whole dataset, frame by frame; they get their names when they are kept."""
+
+    def add(self, record: Record) -> None:
+        """Describe a frame; frames come by ascending index."""
+
+    def keep(self) -> None:
+        """End the files, and give them their names."""
+
+    def discard(self) -> None:
+        """Remove what was not kept."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A label format.
+
+    Attributes:
+        entries: Names of its files and folders in the dataset's own folder.
+        write: Writes the files of a frame.
+        describe: Makes what writes the files that describe all frames.
+    """
+
+    entries: tuple[str, ...]
+    write: Callable[[FrameFiles], None] | None = None
+    describe: Callable[[Path, Catalogue], Describer] | None = None

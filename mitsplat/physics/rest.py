@@ -1,0 +1,141 @@
+"""When bodies that fall are at rest, and when it is clear that they will not be."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mitsplat.arrays import Float64Array
+from mitsplat.physics.worlds import Body, ContactOverflow, World
+
+OVERFLOW = "contact buffer overflow"
+"""Why :func:`run_to_rest` refuses a drop that a larger capacity may save."""
+
+# How far no surface may move [m] in how long [s] for all to be at rest, and before what may still roll is let go.
+# Speeds say less: contacts of rounded hulls flicker from step to step, and with them what stays where it is.
+_MOTION, _WATCH_TIME = 5e-4, 1.0
+_QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
+_MEAN_TIME = 0.05  # over which speeds are told [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How a drop ended.
+
+    Attributes:
+        refused: Why it cannot be used, or empty.
+        time: Simulated time from which the bodies were at rest [s].
+        surface_motion: Farthest that a point of any body moved in the second after that [m]; infinite if refused.
+        max_speed, max_spin: Of the fastest body at the end of that second [m/s, rad/s].
+        poses: World-from-body transforms then, shape (N, 4, 4).
+    """
+
+    refused: str
+    time: float
+    max_speed: float
+    max_spin: float
+    surface_motion: float
+    poses: Float64Array = field(repr=False)
+
+
+def run_to_rest(
+    world: World,
+    *,
+    max_time: float,
+    bounds: tuple[Float64Array, Float64Array],
+    fastest: float = np.inf,
+    observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
+) -> Outcome:
+    """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
+
+    At rest no surface moves by half a millimetre in a second, and by a tenth in its first quarter. After that quarter
+    nothing rolls with friction, which would let a box balance on its edge.
+
+    Args:
+        world: Changed in place.
+        max_time: When they must have come to rest [s].
+        bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+        fastest: Speed to which faster bodies are slowed down after each advance [m/s].
+        observe: Told the time [s] and the poses (N, 4, 4) after each advance.
+    """
+    try:
+        return _run_to_rest(world, max_time, bounds, fastest, observe)
+    except ContactOverflow:
+        reason = OVERFLOW
+    except _Refused as refused:
+        reason = str(refused)
+    return Outcome(reason, world.time, np.inf, np.inf, np.inf, world.poses)
+
+
+class _Refused(Exception):
+    """Why a drop cannot be used."""
+
+
+def _run_to_rest(
+    world: World,
+    max_time: float,
+    bounds: tuple[Float64Array, Float64Array],
+    fastest: float,
+    observe: Callable[[float, Float64Array], None],
+) -> Outcome:
+    mean_frames = max(1, round(_MEAN_TIME / world.interval))
+    past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
+    since, rest, motion = 0.0, world.poses, 0.0
+    while world.time - since < _WATCH_TIME:
+        world.let_roll(world.time - since >= _QUIET_TIME)
+        poses = _advance_within(world, bounds, fastest)
+        past.append(poses)
+        observe(world.time, poses)
+        motion = max(motion, _surface_motion(world.bodies, rest, poses))
+        if motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _MOTION):
+            since, rest, motion = world.time, poses, 0.0
+        if since >= max_time:
+            raise _Refused(f"not at rest within {max_time:g} s")
+    speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
+    return Outcome("", since, speed, spin, motion, world.poses)
+
+
+def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fastest: float) -> Float64Array:
+    """Advance, and return the poses."""
+    world.advance()
+    poses, velocities = world.poses, world.velocities
+    if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
+        raise _Refused("the simulation diverged")
+    speeds = np.linalg.norm(velocities[:, 0], axis=1)
+    if speeds.max() > fastest:
+        velocities[:, 0] *= np.minimum(1.0, fastest / np.maximum(speeds, fastest))[:, None]
+        world.set_velocities(velocities)
+    centres = _centres(world.bodies, poses)
+    outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
+    if outside.any():
+        raise _Refused(f"{int(outside.sum())} left the enclosure")
+    return poses
+
+
+def _centres(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
+    """Centres of mass [m], shape (N, 3)."""
+    local = np.array([body.mass.centre for body in bodies])
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3])
+
+
+def _mean_speeds(
+    bodies: Sequence[Body], before: Float64Array, after: Float64Array, seconds: float
+) -> tuple[float, float]:
+    """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
+    way = np.linalg.norm(_centres(bodies, after) - _centres(bodies, before), axis=1)
+    # Rotations that are an angle t apart differ by a matrix of Frobenius norm 2 sqrt(2) sin(t / 2).
+    apart = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2))
+    turn = 2 * np.arcsin(np.minimum(1.0, apart / np.sqrt(8.0)))
+    return float(way.max()) / seconds, float(turn.max()) / seconds
+
+
+def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> float:
+    """Farthest that a point of any body is displaced between two sets of poses [m]."""
+    moved = after - before
+    return max(
+        float(np.linalg.norm(body.outline @ change[:3, :3].T + change[:3, 3], axis=1).max())
+        for body, change in zip(bodies, moved, strict=True)
+    )

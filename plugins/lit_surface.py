@@ -1,0 +1,83 @@
+"""From what pixels show to the points that light is traced at: splats lend their place to the proxies under them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.plugins.device import gathered
+from mitsplat.plugins.light import Surface
+from mitsplat.plugins.proxies import Hit
+from mitsplat.plugins.rays import View
+from mitsplat.plugins.traits import Traits
+
+AGREEMENT = 0.02
+"""Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What pixels show.
+
+    Attributes:
+        direction: Of their rays.
+        alpha, depth, instance: As in the layers.
+        trait: Row of what is shown in :class:`Traits`.
+        mesh: Whether it is a visible mesh.
+    """
+
+    direction: Any
+    alpha: Any
+    depth: Any
+    instance: Any
+    trait: Any
+    mesh: Any
+
+
+def lit_surface(traits: Traits, view: View, eye: Any, pixel: Any, seen: Seen, hit: Hit, static: Hit) -> Surface:
+    """Points that light is traced at: on the proxy where it agrees with what is seen, else at the seen depth.
+
+    Args:
+        traits: How shapes are lit.
+        view: The camera.
+        eye: Where its rays start.
+        pixel: Which pixels.
+        seen: What all pixels show.
+        hit: What their rays meet first of the proxies.
+        static: What they meet first of those that do not move.
+    """
+    seen, hit, static = gathered(seen, pixel), gathered(hit, pixel), gathered(static, pixel)
+    ray, depth, instance = mi.Ray3f(eye, seen.direction), seen.depth, seen.instance
+    cosine = view.cosine(ray)
+    met = hit.distance < dr.inf
+    known = ~met | (hit.instance == instance)
+    # What shows through or beside a dynamic object's proxy lies on a static one.
+    behind = instance == 0
+    same = dr.select(behind, static.distance < dr.inf, met & known)
+    proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
+    shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
+    towards = mi.Normal3f(-ray.d)
+    # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
+    on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
+    z = dr.select(on_proxy, proxy_depth, depth)
+    position = ray(z / cosine)
+    valid = (seen.alpha > 1 / 255) & (z > 0)
+    reach = dr.max(dr.abs(position))
+    return Surface(
+        position=position,
+        normal=mi.Vector3f(dr.select(same, shown[0], towards)),
+        face=mi.Vector3f(dr.select(same, shown[1], towards)),
+        lift=dr.select(on_proxy, shown[2], 0),
+        to_camera=-ray.d,
+        offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
+        instance=mi.Float(instance),
+        trait=mi.Float(seen.trait),
+        relit=dr.gather(mi.Bool, traits.relit, seen.trait) | seen.mesh,
+        roughness=dr.gather(mi.Float, traits.roughness, seen.trait),
+        specular=dr.select(seen.mesh, 0, dr.gather(mi.Float, traits.specular, seen.trait)),
+        known=known,
+        valid=valid,
+    )

@@ -1,0 +1,46 @@
+"""What no physics and no renderer made: a certificate, and frames around maps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mitsplat.frames.frame import Frame
+from mitsplat.labels.labels import Labels
+from mitsplat.render.layers import Layers
+from mitsplat.scene.layout import RestCertificate
+
+CERTIFICATE = RestCertificate(
+    rested=True,
+    inside=True,
+    overflow=False,
+    time_to_rest=1.5,
+    max_speed=0.0,
+    max_spin=0.0,
+    surface_motion=0.0,
+    collider_penetration=1e-5,
+    pair_penetration=0.0,
+    support_gap=0.0,
+    standoff=0.0,
+    attempts=2,
+    refused=("too deep",),
+)
+
+
+def frame_around(plan: Any, layout: Any, labels: Labels, *, image: Any, ids: Any, depth: Any, normal: Any) -> Frame:
+    """A frame of these maps, whose splats and proxies agree, lit as captured."""
+    colour, ids, depth = image.astype(np.float32) / 255, ids.astype(np.uint16), depth.astype(np.float32)
+    layers = Layers(
+        rgb=colour,
+        alpha=np.ones(ids.shape, dtype=np.float32),
+        captured=colour,
+        depth=depth,
+        instance=ids,
+        proxy_depth=depth,
+        proxy_instance=ids,
+        normal=normal,
+        light=np.ones_like(colour),
+        highlight=np.zeros_like(colour),
+    )
+    return Frame(plan, layout, layers, colour, image, labels, {"march": 0.01})

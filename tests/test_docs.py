@@ -1,0 +1,101 @@
+"""The documentation's machinery: what it shows exists, loads, and is all there; building the site is ``make docs``."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mitsplat.checks import check_path
+from mitsplat.scene import SceneSpec, scene_json_schema
+from mitsplat.scene.untrusted_xml import check_xml
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _docs_on_path() -> Iterator[None]:
+    folders = [str(DOCS), str(DOCS / "_ext")]
+    sys.path[:0] = folders
+    yield
+    for folder in folders:
+        sys.path.remove(folder)
+
+
+def test_pictures_are_of_keys_that_there_are() -> None:
+    from pictures import read_pictures
+    from scene_reference import scene_keys
+
+    keys = scene_keys(scene_json_schema())
+    assert {"objects[].count", "camera.intrinsics.fov_x", "lights[].path[].position"} <= set(keys)
+    assert {picture.key for picture in read_pictures()} <= set(keys)
+
+
+def test_every_picture_is_there_and_none_is_left_over() -> None:
+    from pictures import FOLDER, GALLERY, read_pictures
+
+    asked = {picture.file.name for picture in read_pictures()}
+    asked |= {f"gallery-{Path(name).stem}.jpg" for name in (*GALLERY, "mirror_ball.xml")}
+    assert {path.name for path in FOLDER.iterdir()} == asked
+    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 2_000_000
+
+
+def test_every_fragment_below_a_picture_makes_a_scene() -> None:
+    """By the models alone: rendering all of them is ``python docs/pictures.py``."""
+    from pictures import read_pictures
+
+    for picture in read_pictures():
+        SceneSpec.model_validate_json(json.dumps(picture.scene))
+
+
+@pytest.mark.slow
+def test_scenes_of_the_gallery_have_nothing_questionable() -> None:
+    from pictures import GALLERY, SCENES
+
+    check_xml(SCENES / "mirror_ball.xml")
+    for name in GALLERY:
+        findings = list(check_path(SCENES / name))
+        assert len(findings) > 5
+        assert [finding for finding in findings if not finding.ok] == [], name
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("[a](other.md)", None),
+        ("[a](other.md#a-title)", None),
+        ("[a](other.md#no-title)", "leads to no such place"),
+        ("[a](missing.md)", "leads to no file"),
+        ("![a](missing.jpg)", "leads to no file"),
+        ("[a](#here)", None),
+        ("[a](#elsewhere)", "leads to no such place"),
+        ("[a](https://example.org/b#c)", None),
+        ("[a](http://example.org)", "must be https and name a host"),
+        ("[a](https:/example.org)", "must be https and name a host"),
+        ("    [a](missing.md)", None),  # code
+    ],
+)
+def test_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, fault: str | None) -> None:
+    import links
+
+    monkeypatch.setattr(links, "ROOT", tmp_path)
+    (tmp_path / "page.md").write_text(f"# Here\n\n{text}\n")
+    (tmp_path / "other.md").write_text("# A `title`!\n")
+    assert [line.split(": ", 1)[1].split(" ", 1)[1] for line in links.faults([tmp_path / "page.md"])] == (
+        [fault] if fault else []
+    )
+
+
+def test_the_command_line_is_documented() -> None:
+    """Typer's reference, which the site shows, has every command."""
+    from mitsplat.cli import app
+
+    command = [sys.executable, "-m", "typer", "mitsplat.cli", "utils", "docs", "--name", "mitsplat"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    names = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
+    assert len(names) > 10
+    assert all(f"## `mitsplat {name}`" in text for name in names)

@@ -38,7 +38,7 @@ _SCAN_FACES, _DEVIATION, _MOST_DEVIATION = 3000, 5e-4, 1e-4
 # left of a bad fit, and comes apart into more pieces than it has faces. Parts and scans have 0.15 at most.
 _RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
 # Of CoACD's search for every cut; a scan has more cuts than it has concavities, and any of them will do.
-_ITERATIONS, _SCAN_ITERATIONS = 150, 60
+_ITERATIONS, _SCAN_ITERATIONS = 150, 20
 # Faces that meet at a larger angle form an edge that can poke into something [rad].
 _SHARP = 0.17
 

@@ -10,10 +10,13 @@ import shapely
 import trimesh
 
 from mitsplat.bake.parts import Part
+from mitsplat.mesh import simplify_solid
 from mitsplat.plugins.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
 """Distance from a solid, relative to its own size, within which a sheet is a label on it."""
+_FIRST_TOLERANCE = 1e-5
+"""Of simplification, relative to the size; more is tried until the faces are few enough."""
 
 
 def make_proxy(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
@@ -30,9 +33,21 @@ def make_proxy(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
         sheets = [sheet for sheet in sheets if not _lies_on(sheet, solids[0])]
     sheets = [_flattened(sheet) for sheet in sheets]
     room = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
-    solids = [s if len(s.faces) <= room else s.simplify_quadric_decimation(face_count=room) for s in solids]
+    solids = [_of_fewer_faces(solid, room) for solid in solids]
     proxy = trimesh.util.concatenate(solids + sheets)
     return trimesh.Trimesh(proxy.vertices, proxy.faces)
+
+
+def _of_fewer_faces(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
+    """A solid of at most about ``most`` faces; what quadric decimation tears, as it does scans, Manifold thins."""
+    if len(solid.faces) <= most:
+        return solid
+    fewer = solid.simplify_quadric_decimation(face_count=most)
+    tolerance = _FIRST_TOLERANCE * solid.scale
+    while not fewer.is_volume and tolerance < _LABEL_GAP * solid.scale:
+        whole = simplify_solid(solid, tolerance)
+        fewer, tolerance = (whole if len(whole.faces) <= most else fewer), 1.5 * tolerance
+    return fewer
 
 
 def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

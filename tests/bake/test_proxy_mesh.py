@@ -1,0 +1,24 @@
+"""The one surface of an asset that physics and shadows use."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from mitsplat.bake.parts import Part
+from mitsplat.bake.proxy_mesh import make_proxy
+from mitsplat.mesh_distance import Surface
+
+
+def test_a_scan_of_many_faces_stays_closed() -> None:
+    """Quadric decimation tears this one, and physics would rebuild it from voxels, for minutes."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    factors = 1 + 0.005 * np.random.default_rng(0).normal(size=(len(ball.vertices), 1))
+    scan = trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False)
+    assert scan.is_volume and not scan.simplify_quadric_decimation(face_count=4000).is_volume
+    proxy = make_proxy(
+        [Part("scan", scan, np.full((len(scan.faces), 3, 3), 0.5), None, None, 0.0, None, True, 0.04, ())], 4000
+    )
+    assert proxy.is_volume
+    assert 1000 < len(proxy.faces) <= 4000
+    assert np.abs(Surface(scan).signed_distances(proxy.sample(2000, seed=0))).max() < 0.01 * scan.scale

@@ -12,7 +12,7 @@ render: $(STAMPS)/package
 	$(VENV)/bin/mitsplat render scenes/workcell.yaml -o out/workcell --resume
 
 test: $(STAMPS)/tools
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(STAMPS)/tools
 	$(VENV)/bin/ruff check

@@ -101,7 +101,7 @@ def record(index: int) -> dict[str, Any]:
     }
     camera = {
         **{"width": 64, "height": 48, "intrinsics": [[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]]},
-        **{"distortion": [], "lens": "opencv", "aperture_radius": 0.0, "focus_distance": 1.0},
+        **{"distortion": [], "lens": "opencv", "aperture_radius": 0.0, "focus_distance": 1.0, "near": 0.01},
         "world_from_camera": pose,
     }
     return {
@@ -124,22 +124,24 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path, monkeypatch: pytes
             file.writelines(encode_line(record(index ^ 1)) for index in range(count))
         catalogue = Catalogue(["nut"], [()], ["nut"], [])
         tracemalloc.start()
-        manifest = Manifest(folder / "manifest.jsonl")
-        held = []
+        try:
+            manifest = Manifest(folder / "manifest.jsonl")
+            held = []
 
-        def hear(found: dict[str, Any]) -> None:
-            collection.add(found)
-            if found["index"] == count - 1:
-                # The paths' interpreter-wide table of names grows by leaps, wherever those fall.
-                paths = tracemalloc.Filter(inclusive=False, filename_pattern=pathlib.__file__)
-                kept = tracemalloc.take_snapshot().filter_traces([paths]).statistics("filename")
-                held.append(sum(entry.size for entry in kept))
+            def hear(found: dict[str, Any]) -> None:
+                collection.add(found)
+                if found["index"] == count - 1:
+                    # The paths' interpreter-wide table of names grows by leaps, wherever those fall.
+                    paths = tracemalloc.Filter(inclusive=False, filename_pattern=pathlib.__file__)
+                    kept = tracemalloc.take_snapshot().filter_traces([paths]).statistics("filename")
+                    held.append(sum(entry.size for entry in kept))
 
-        formats = ["yolo", "coco", "amodal", "panoptic", "poses", "voc", "bop", "colmap"]
-        with CollectionWriter(folder, catalogue, formats) as collection:
-            manifest.sort(hear)
-            collection.keep()
-        tracemalloc.stop()
+            formats = ["yolo", "coco", "amodal", "panoptic", "poses", "voc", "bop", "colmap"]
+            with CollectionWriter(folder, catalogue, formats) as collection:
+                manifest.sort(hear)
+                collection.keep()
+        finally:  # what is counted from now on would be other tests'
+            tracemalloc.stop()
         assert [found["index"] for found in Manifest(folder / "manifest.jsonl")] == list(range(count))
         return held[0]
 

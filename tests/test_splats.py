@@ -385,10 +385,12 @@ class TestBadFiles:
         path = tmp_path / name
         path.write_bytes(data)
         tracemalloc.start()
-        with pytest.raises(InputError, match=sentence) as error:
-            Splats.load(path)
-        assert tracemalloc.get_traced_memory()[1] < 2**22
-        tracemalloc.stop()
+        try:
+            with pytest.raises(InputError, match=sentence) as error:
+                Splats.load(path)
+            assert tracemalloc.get_traced_memory()[1] < 2**22
+        finally:
+            tracemalloc.stop()
         assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
     def test_missing_file_and_folder(self, tmp_path):

@@ -1,10 +1,12 @@
-"""A dataset's COCO and VOC annotations imported by others' tools, and compared with the manifest.
+"""A dataset's COCO, VOC and Label Studio files read by others' tools, and compared with the manifest.
 
     python benchmarks/labels/imports.py datumaro DATASET      # pip install datumaro pycocotools; CVAT imports by it
     python benchmarks/labels/imports.py fiftyone DATASET      # pip install fiftyone pycocotools
+    python benchmarks/labels/imports.py labelstudio DATASET   # pip install label-studio-sdk pycocotools
 
-Each tool has an environment of its own, which needs no mitsplat. The dataset has the formats coco and voc. Every image,
-class, box and pixel must be what the manifest says. FiftyOne's importers are asked themselves, without its database.
+Each tool has an environment of its own, which needs no mitsplat. The dataset has the formats coco, voc and
+label-studio. Every image, class, box and pixel must be what the manifest says. FiftyOne's importers are asked
+themselves, without its database, and Label Studio's brush strokes are decoded by its own converter.
 """
 
 from __future__ import annotations
@@ -97,10 +99,26 @@ def by_fiftyone(root: Path, truth: Truth) -> None:
                     truth.check_mask(label, one.mask)
 
 
+def by_labelstudio(root: Path, truth: Truth) -> None:
+    """Tasks."""
+    from label_studio_sdk.converter.brush import decode_rle
+
+    for split, instances in truth.splits.items():
+        for path in sorted((root / "label-studio" / split).glob("*.json")):
+            task = json.loads(path.read_bytes())
+            truth.images += task["data"]["image"].endswith((f"images/{split}/{path.stem}.jpg", f"{path.stem}.png"))
+            regions = task["annotations"][0]["result"]
+            for label, region in zip(instances.pop(path.stem), regions, strict=True):
+                if region["value"]["brushlabels"] != [label["class"]]:
+                    raise SystemExit(f"{region['value']['brushlabels']} is {label['class']} in the manifest")
+                values = decode_rle(region["value"]["rle"]).reshape(truth.height, truth.width, 4)
+                truth.check_mask(label, values[..., 3] > 0)
+
+
 def main() -> None:
     """Print what was compared."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tool", choices=("datumaro", "fiftyone"))
+    parser.add_argument("tool", choices=("datumaro", "fiftyone", "labelstudio"))
     parser.add_argument("dataset", type=Path)
     options = parser.parse_args()
     command = "python", "benchmarks/labels/imports.py"
@@ -114,7 +132,8 @@ def compare(options: argparse.Namespace) -> None:
     held = [instances for split in truth.splits.values() for instances in split.values()]
     figure(len(held), "", "images")
     figure(sum(map(len, held)), "", "instances")
-    {"datumaro": by_datumaro, "fiftyone": by_fiftyone}[options.tool](options.dataset, truth)
+    tools = {"datumaro": by_datumaro, "fiftyone": by_fiftyone, "labelstudio": by_labelstudio}
+    tools[options.tool](options.dataset, truth)
     if missing := [name for instances in truth.splits.values() for name in instances]:
         raise SystemExit(f"images that were not imported: {missing}")
     for count, what in ((truth.images, "images"), (truth.boxes, "boxes"), (truth.masks, "masks")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,23 +10,9 @@ import numpy as np
 from mitsplat.frames.frame import Frame
 from mitsplat.labels.labels import Labels
 from mitsplat.render.layers import Layers
-from mitsplat.scene.layout import RestCertificate
+from mitsplat.scene.layout import NOTHING_TO_REST
 
-CERTIFICATE = RestCertificate(
-    rested=True,
-    inside=True,
-    overflow=False,
-    time_to_rest=1.5,
-    max_speed=0.0,
-    max_spin=0.0,
-    surface_motion=0.0,
-    collider_penetration=1e-5,
-    pair_penetration=0.0,
-    support_gap=0.0,
-    standoff=0.0,
-    attempts=2,
-    refused=("too deep",),
-)
+CERTIFICATE = replace(NOTHING_TO_REST, time_to_rest=1.5, collider_penetration=1e-5, attempts=2, refused=("too deep",))
 
 
 def frame_around(plan: Any, layout: Any, labels: Labels, *, image: Any, ids: Any, depth: Any, normal: Any) -> Frame:

@@ -15,8 +15,8 @@ from mitsplat.plugins.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
 """Distance from a solid, relative to its own size, within which a sheet is a label on it."""
-_FIRST_TOLERANCE = 1e-5
-"""Of simplification, relative to the size; more is tried until the faces are few enough."""
+_TOLERANCES = 1e-5 * 1.5 ** np.arange(18)
+"""Of simplification, relative to the size, up to a hundredth; tried in turn until the faces are few enough."""
 
 
 def make_proxy(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
@@ -43,11 +43,10 @@ def _of_fewer_faces(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     if len(solid.faces) <= most:
         return solid
     fewer = solid.simplify_quadric_decimation(face_count=most)
-    tolerance = _FIRST_TOLERANCE * solid.scale
-    while not fewer.is_volume and tolerance < _LABEL_GAP * solid.scale:
-        whole = simplify_solid(solid, tolerance)
-        fewer, tolerance = (whole if len(whole.faces) <= most else fewer), 1.5 * tolerance
-    return fewer
+    if fewer.is_volume:
+        return fewer
+    closed = (simplify_solid(solid, tolerance) for tolerance in _TOLERANCES * solid.scale)
+    return next((mesh for mesh in closed if len(mesh.faces) <= most), fewer)
 
 
 def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -45,7 +45,7 @@ def write(files: FrameFiles) -> None:
     """Write a frame's pictures, and its own under a second name."""
     scene = scene_folder(files.record)
     files.add_image(f"{scene}/rgb/{files.image_name}")
-    files.add_png(f"{scene}/depth/{files.number}.png", files.depth)
+    files.add_depth(f"{scene}/depth/{files.number}.png")
     for folder, position, data in mask_pictures(files.frame.labels):
         files.add_bytes(f"{scene}/{folder}/{files.number}_{position:06d}.png", data)
 

@@ -189,8 +189,11 @@ def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
 
 
 def write_panoptic(files: FrameFiles) -> None:
-    """Write a frame's picture of segments."""
-    picture = panoptic_image(files.labelled, files.ids, files.record.get("environment"))
+    """Write a frame's picture of segments, and into its record that of the environment."""
+    environment = environment_segment(files.frame.labels, files.ids)
+    if environment is not None:
+        files.record["environment"] = environment
+    picture = panoptic_image(files.labelled, files.ids, environment)
     files.add_png(f"panoptic/{files.name}.png", picture)
 
 

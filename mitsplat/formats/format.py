@@ -110,8 +110,7 @@ class FrameFiles:
         return maps.instance_picture(self.frame.labels)
 
     @cached_property
-    def depth(self) -> npt.NDArray[np.uint16]:
-        """Depth in units of the record's ``depth_scale``, shape (H, W)."""
+    def _depth(self) -> npt.NDArray[np.uint16]:
         return maps.depth_picture(self.frame.depth)
 
     def add(self, file: str, write: Callable[[Path], object]) -> None:
@@ -125,6 +124,11 @@ class FrameFiles:
     def add_png(self, file: str, picture: npt.NDArray[Any]) -> None:
         """Write a picture without loss."""
         self.add_bytes(file, maps.encode_png(picture))
+
+    def add_depth(self, file: str) -> None:
+        """Write the frame's depth as a picture, in units that the record states as ``depth_scale`` [mm]."""
+        self.record["depth_scale"] = maps.depth_scale(self.frame.depth)
+        self.add_png(file, self._depth)
 
     def add_image(self, file: str) -> None:
         """Give the frame's picture a second name."""

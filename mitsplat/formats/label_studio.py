@@ -75,8 +75,8 @@ def encode_brush(mask: BoolArray) -> list[int]:
             repeated = min(left, most) - 1
             which, size = next((i, size) for i, size in enumerate(_COUNT_BITS) if repeated < 1 << size)
             bits.append(f"1{which:02b}{repeated:0{size}b}{255 * is_set:08b}")
-    packed = np.packbits(np.frombuffer("".join(bits).encode(), dtype=np.uint8) - ord("0"))
-    return [int(value) for value in packed]
+    code: list[int] = np.packbits(np.frombuffer("".join(bits).encode(), dtype=np.uint8) - ord("0")).tolist()
+    return code
 
 
 class ConfigWriter:

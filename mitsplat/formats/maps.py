@@ -44,7 +44,7 @@ def write_semantic(files: FrameFiles) -> None:
 
 def write_depth(files: FrameFiles) -> None:
     """Write a frame's depth."""
-    files.add_png(f"depth/{files.name}.png", files.depth)
+    files.add_depth(f"depth/{files.name}.png")
 
 
 def write_normals(files: FrameFiles) -> None:

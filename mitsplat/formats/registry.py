@@ -67,11 +67,8 @@ TABLE = {
 
 def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue) -> Record:
     """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest."""
-    plan, labels, output = frame.plan, frame.labels, spec.output
-    formats = set(output.formats)
+    plan, output = frame.plan, spec.output
     ids = frame.instance if spec.labels.source == "splats" else frame.proxy_instance
-    environment = coco.environment_segment(labels, ids) if "panoptic" in formats else None
-    scale = maps.depth_scale(frame.depth) if formats & {"bop", "depth"} else None
     record: Record = {
         "index": frame.index,
         "layout": plan.layout,
@@ -82,16 +79,14 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         "draws": dict(frame.draws),
         "lights": [light.model_dump(mode="json") for light in plan.lights],
         "camera": frame.camera.to_json(),
-        "labels": labels.to_json(),
+        "labels": frame.labels.to_json(),
         "rest": frame.layout.to_json()["certificate"],
-        **({"environment": environment} if environment is not None else {}),
-        **({"depth_scale": scale} if scale is not None else {}),
     }
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"
     files = FrameFiles(root, frame, catalogue, record, image, ids)
     files.add_bytes(image, encode_image(frame.image, output))
     for name, format in TABLE.items():
-        if name in formats and format.write is not None:
+        if name in output.formats and format.write is not None:
             format.write(files)
     return record
 

@@ -166,23 +166,23 @@ def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mappin
 def _blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
     """Correlated with a kernel (K, K); the picture goes on beyond its border as it ends there."""
     height, width = shape
-    dr.eval(linear)
+    picture = dr.ravel(mi.Vector4f(*linear, 0.0))  # a CPU gathers four neighbours as fast as one
     rows, columns = np.nonzero(kernel)
     reach = kernel.shape[0] // 2
-    dy, dx = (wrapped(mi.Int32, (places - reach).astype(np.int32)) for places in (rows, columns))
-    weights, taps = wrapped(mi.Float, kernel[rows, columns]), dr.opaque(mi.UInt32, len(rows))
-    row = mi.Int32(pixel // width)
-    column = mi.Int32(pixel) - row * width
+    lines = np.stack([columns - reach, rows - reach, kernel[rows, columns], np.zeros_like(rows)], axis=-1)
+    taps, count = wrapped(mi.Float, lines.astype(np.float32)), dr.opaque(mi.UInt32, len(rows))
+    row = pixel // width
+    x, y = mi.Int32(pixel - row * width), mi.Int32(row)
+    dr.eval(picture, taps)
 
-    def add(tap: Any, total: Any) -> tuple[Any, Any]:
-        x = dr.clip(column + dr.gather(mi.Int32, dx, tap), 0, width - 1)
-        y = dr.clip(row + dr.gather(mi.Int32, dy, tap), 0, height - 1)
-        source = mi.UInt32(y * width + x)
-        weight = dr.gather(mi.Float, weights, tap)
-        return tap + 1, total + weight * dr.gather(mi.Color3f, linear, source)
+    def add(number: Any, total: Any) -> tuple[Any, Any]:
+        tap = dr.gather(mi.Vector4f, taps, number)
+        column, line = dr.clip(x + mi.Int32(tap.x), 0, width - 1), dr.clip(y + mi.Int32(tap.y), 0, height - 1)
+        seen = dr.gather(mi.Vector4f, picture, mi.UInt32(line * width + column))
+        return number + 1, total + tap.z * mi.Color3f(seen.x, seen.y, seen.z)
 
     state = mi.UInt32(0), mi.Color3f(0)
-    return dr.while_loop(state, lambda tap, _: tap < taps, add, label="motion blur")[1]
+    return dr.while_loop(state, lambda number, _: number < count, add, label="motion blur")[1]
 
 
 def motion_kernel(length: float, angle: float) -> Float32Array:

@@ -105,7 +105,7 @@ def develop_layers(
     pixel = dr.arange(mi.UInt32, height * width)
     linear = _through_lens(linear, pixel, shape, draws)
     if "iso" in draws:
-        linear = _sensed(linear, pixel, draws["iso"], sensor, seed)
+        linear = sensed(linear, pixel, draws["iso"], sensor, seed)
     matrix = colour_matrix(
         white_balance=draws.get("white_balance", 6504.0),
         hue=draws.get("hue", 0.0),
@@ -159,11 +159,11 @@ def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mappin
         linear = linear * dr.exp2(_opaque(-draws["vignetting"]) * share)
     if draws.get("motion_blur", 0.0):
         kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
-        return _blurred(linear, pixel, shape, kernel)
+        return blurred(linear, pixel, shape, kernel)
     return linear
 
 
-def _blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
+def blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
     """Correlated with a kernel (K, K); the picture goes on beyond its border as it ends there."""
     height, width = shape
     picture = dr.ravel(mi.Vector4f(*linear, 0.0))  # a CPU gathers four neighbours as fast as one
@@ -200,7 +200,7 @@ def motion_kernel(length: float, angle: float) -> Float32Array:
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
-def _sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> Any:
+def sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> Any:
     """With shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
 
     Display white fills the wells at ISO 100. The Poisson noise of N is taken as normal. Its numbers are counted by the

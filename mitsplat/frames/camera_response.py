@@ -116,7 +116,8 @@ def develop_layers(
     position = dr.sqrt(dr.clip(linear, 0.0, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
     table, data = _byte_curve(tone, str(mi.variant())), dr.empty(mi.UInt8, 3 * height * width)
     for c in range(3):
-        value = dr.gather(mi.UInt32, table, mi.UInt32(dr.round(position[c])))
+        entry = dr.minimum(mi.UInt32(dr.round(position[c])), CURVE_STEPS - 1)  # also where that is no number
+        value = dr.gather(mi.UInt32, table, entry)
         dr.scatter(data, mi.UInt8(value), 3 * pixel + c, mode=dr.ReduceMode.Permute)
     dr.eval(data)
     return Development(data, shape, round(draws["jpeg"]) if "jpeg" in draws else None)

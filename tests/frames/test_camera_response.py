@@ -62,6 +62,16 @@ def test_white_balance_for_a_warm_light_makes_white_cooler() -> None:
     np.testing.assert_allclose(colour_matrix(white_balance=6504.0), np.eye(3))
 
 
+def test_pixels_without_a_number_harm_no_others() -> None:
+    linear = np.full((4, 8, 3), 0.2, np.float32)
+    linear[1, 2:5] = [[np.inf], [np.nan], [-np.inf]]
+    for draws in ({}, {"iso": 100.0, "hue": 3.0}):
+        image, clean = develop(linear, draws), develop(np.full_like(linear, 0.2), draws)
+        clean[1, 2:5] = image[1, 2:5]
+        np.testing.assert_array_equal(image, clean)
+    assert develop(linear, {})[1, [2, 4]].tolist() == [[255] * 3, [0] * 3]
+
+
 @pytest.mark.parametrize("tone", ["neutral", "filmic"])
 def test_tone_curves_rise_from_black_to_white(tone: str) -> None:
     curve = tone_curve(tone)

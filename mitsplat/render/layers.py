@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.splats import Splats
@@ -150,7 +151,7 @@ def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0)
     def three(name: str) -> Float32Array:
         return np.stack([host(channel) for channel in layers[name]], axis=-1)
 
-    return Layers(
+    brought = Layers(
         rgb=three("rgb"),
         alpha=one("alpha", np.float32),
         captured=three("captured"),
@@ -162,8 +163,12 @@ def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0)
         light=three("light"),
         highlight=three("highlight"),
     )
+    refuse_lost_rays()
+    return brought
 
 
 def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
     """Every instance as it would be seen alone, by its ``splats`` or by its ``proxies``, see the integrator plugin."""
-    return dict(integrator.silhouettes(scene, make_sensor(camera), source=source))
+    silhouettes = dict(integrator.silhouettes(scene, make_sensor(camera), source=source))
+    refuse_lost_rays()
+    return silhouettes

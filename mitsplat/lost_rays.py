@@ -1,7 +1,7 @@
 """Rays that Dr.Jit leaves out on a GPU, made an error: it only warns, and the picture lacks shadows or objects.
 
-A kernel of ``cuda_ad_rgb`` can trace one ray-tracing scene. Of one that traces two, Dr.Jit keeps the first and logs that
-it disables the others, which then hit nothing.
+A kernel of ``cuda_ad_rgb`` can trace one scene. Of one that traces two, Dr.Jit keeps the first, and logs that it
+disables the others, which then hit nothing.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def watch_rays() -> None:
         MissingResourceError: If the library of this Dr.Jit has no such function.
     """
     level = max(dr.log_level().value, dr.LogLevel.Warn.value)
-    _set_callback()(level, _keep)
+    _set_callback()(level, _callback)
 
 
 def refuse_lost_rays() -> None:
@@ -54,7 +54,6 @@ def refuse_lost_rays() -> None:
         raise RuntimeError(f"the picture is wrong, because Dr.Jit left out rays ({count} times): {text}")
 
 
-@_Callback
 def _keep(level: int, message: bytes) -> None:
     """Must not raise: it is called from within Dr.Jit."""
     text = message.decode(errors="replace")
@@ -62,6 +61,9 @@ def _keep(level: int, message: bytes) -> None:
         _lost.append(text)
     elif sys.stderr is not None:
         sys.stderr.write(f"{text}\n")
+
+
+_callback = _Callback(_keep)
 
 
 @lru_cache

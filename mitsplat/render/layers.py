@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.device import wrapped
 from mitsplat.quality import Quality, resolve_quality
@@ -165,9 +166,9 @@ def _alone(splats: Splats, variant: str) -> tuple[Any, Any]:
 
 def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
     """Run the integrator; each layer comes to the host when it is first looked at, see :class:`Layers`."""
-    return Layers.on_device(
-        integrator.render_layers(scene, make_sensor(camera), seed=seed), (camera.height, camera.width)
-    )
+    layers = integrator.render_layers(scene, make_sensor(camera), seed=seed)
+    refuse_lost_rays()
+    return Layers.on_device(layers, (camera.height, camera.width))
 
 
 def device_array(values: npt.NDArray[Any]) -> Any:
@@ -204,4 +205,6 @@ def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
 
 def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
     """Every instance as it would be seen alone, by its ``splats`` or by its ``proxies``, see the integrator plugin."""
-    return dict(integrator.silhouettes(scene, make_sensor(camera), source=source))
+    silhouettes = dict(integrator.silhouettes(scene, make_sensor(camera), source=source))
+    refuse_lost_rays()
+    return silhouettes

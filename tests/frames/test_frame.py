@@ -17,6 +17,7 @@ import mitsplat as ms
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.frames.camera_response import develop, light_image
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.quality import PRESETS
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
@@ -196,6 +197,26 @@ def test_a_frame_keeps_what_it_was_made_of(scene: ms.Scene, settled: dict[str, A
     again = pickle.loads(pickle.dumps(frame))
     np.testing.assert_array_equal(again.image, frame.image)
     np.testing.assert_array_equal(again.layers.highlight, frame.layers.highlight)
+
+
+@pytest.mark.parametrize(("source", "depth"), [("splats", "depth"), ("proxies", "proxy_depth")])
+def test_labels_bring_ids_and_one_depth_to_the_host(
+    scene_data: dict[str, Any],
+    write_scene: WriteScene,
+    scene: ms.Scene,
+    settled: dict[str, Any],
+    source: str,
+    depth: str,
+) -> None:
+    chosen = ms.load_scene(write_scene(scene_data | {"labels": {"source": source}}, f"{source}.yaml"))
+    frame = ms.render_frame(chosen, 1, layout=layout_of_small_scene(scene, settled))
+    names = {field.name for field in fields(frame.layers)}
+    assert names & vars(frame.layers).keys() == {"instance", "proxy_instance", depth}
+    assert "rgb" not in vars(frame)
+    np.testing.assert_array_equal(frame.rgb, light_image(frame.layers, chosen.spec.composite))
+    how = chosen.spec.composite
+    again = develop(frame.rgb, frame.draws, tone=how.tone, sensor=how.sensor, seed=frame.plan.seed)
+    np.testing.assert_array_equal(again, frame.image)
 
 
 def test_a_closed_renderer_says_so(scene: ms.Scene, settled: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:

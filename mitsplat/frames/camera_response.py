@@ -91,7 +91,7 @@ def develop(
             missing changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
         sensor: What turns ``iso`` into noise.
-        seed: Seed of the noise, below 2^64. The noise of a pixel and channel is a function of these three alone.
+        seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
     """
     height, width = linear.shape[:2]
     return develop_layers(device_array(linear), (height, width), draws, tone=tone, sensor=sensor, seed=seed).image()

@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from mitsplat.errors import InputError
 from mitsplat.llvm import check_llvm
+from mitsplat.lost_rays import watch_rays
 from mitsplat.plugins import refuse, register
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
@@ -49,6 +50,8 @@ def ensure_variant() -> None:
             mi.set_variant(VARIANTS[0])
         # Mitsuba names a variant before it calls back those who register under it: another thread may be that far.
         register_plugins(mi.variant())
+        if mi.variant() == "cuda_ad_rgb":
+            watch_rays()
 
 
 def choose_variant(variant: str) -> None:

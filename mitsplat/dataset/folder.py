@@ -300,13 +300,13 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
+        "device": device,
         "mitsplat": __version__,
         "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
         "classes": list(scene.class_names),
         "keypoints": [list(names) for names in catalogue.keypoint_names],
         "assets": list(catalogue.assets),
         "inputs": describe_inputs(scene),
-        "device": device,
         "libraries": {name: importlib.metadata.version(name) for name in libraries},
     }
 

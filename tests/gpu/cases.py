@@ -77,9 +77,7 @@ def visible(kind: str) -> dict[str, Any]:
     transform = mi.ScalarTransform4f()
     if kind == "plain":
         diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}}
-        return {
-            "cube": {"type": "cube", "to_world": transform.translate([0.0, -0.1, 0.03]).scale(0.03), "bsdf": diffuse}
-        }
+        return {"cube": {"type": "cube", "to_world": transform.translate([0.0, -0.1, 0.03]).scale(0.03), "bsdf": diffuse}}
     sphere = {"type": "sphere", "to_world": transform.translate([0.02, -0.12, 0.041]).scale(0.04)}
     materials = {"glass": {"type": "dielectric"}, "mirror": {"type": "conductor", "material": "Cu"}}
     return {kind: sphere | {"bsdf": materials[kind]}}

@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from mitsplat.errors import InputError
 from mitsplat.llvm import check_llvm
+from mitsplat.lost_rays import watch_rays
 from mitsplat.plugins import refuse, register
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
@@ -49,6 +50,19 @@ def ensure_variant() -> None:
             mi.set_variant(VARIANTS[0])
         # Mitsuba names a variant before it calls back those who register under it: another thread may be that far.
         register_plugins(mi.variant())
+        if mi.variant() == "cuda_ad_rgb":
+            watch_rays()
+
+
+def choose_variant(variant: str) -> None:
+    """Choose one of :data:`VARIANTS` for this process, whatever was chosen before.
+
+    Raises:
+        MissingResourceError: If it is ``llvm_ad_rgb``, and Dr.Jit has no usable LLVM.
+    """
+    with _turn:
+        mi.set_variant(variant)
+        ensure_variant()
 
 
 def register_plugins(variant: str | None) -> None:

@@ -88,17 +88,37 @@ def bounced_light(grid: RadianceGrid, proxies: Any, origin: Any, normal: Any, se
         sequence: Gives the point of the unit square for ray ``i`` of every point.
     """
     static, dynamic = proxies.static.scene, proxies.dynamic
+    count = dr.width(origin)
     frame = mi.Frame3f(normal)
+    rounds = dr.opaque(mi.UInt32, BOUNCE_RAYS)
+
+    def ray_of(i: Any) -> Any:
+        return mi.Ray3f(origin, frame.to_world(mi.warp.square_to_cosine_hemisphere(sequence(i))))
+
+    def meet(i: Any) -> Any:
+        """Distance [m] to what ray ``i`` of every point meets, infinite for nothing."""
+        return static.ray_intersect_preliminary(ray_of(i)).t
+
+    known = None
+    if proxies.apart and dynamic is not None:
+        known = dr.empty(mi.Float, BOUNCE_RAYS * count)
+        lane = dr.arange(mi.UInt32, count) * BOUNCE_RAYS
+
+        def note(i: Any) -> tuple[Any]:
+            dr.scatter(known, meet(i), lane + i)
+            return (i + 1,)
+
+        dr.while_loop((dr.zeros(mi.UInt32, count),), lambda i: i < rounds, note, label="met")
+        dr.eval(known)
 
     def body(i: Any, total: Any) -> tuple[Any, Any]:
-        ray = mi.Ray3f(origin, frame.to_world(mi.warp.square_to_cosine_hemisphere(sequence(i))))
-        hit = static.ray_intersect_preliminary(ray)
-        met = hit.is_valid()
+        ray = ray_of(i)
+        away = meet(i) if known is None else dr.gather(mi.Float, known, lane + i)
+        met = away < dr.inf
         if dynamic is not None:
-            ray.maxt = hit.t
+            ray.maxt = away
             met &= ~dynamic.scene.ray_test(ray, active=met)
-        return i + 1, total + dr.select(met, grid.at(ray(hit.t), met), 0)
+        return i + 1, total + dr.select(met, grid.at(ray(away), met), 0)
 
-    rounds = dr.opaque(mi.UInt32, BOUNCE_RAYS)
-    state = dr.zeros(mi.UInt32, dr.width(origin)), dr.zeros(mi.Color3f, dr.width(origin))
+    state = dr.zeros(mi.UInt32, count), dr.zeros(mi.Color3f, count)
     return dr.while_loop(state, lambda i, _: i < rounds, body, label="bounce")[1] / BOUNCE_RAYS

@@ -27,9 +27,9 @@ import mitsuba as mi
 
 from mitsplat.plugins.bounce import RadianceGrid, bounced_light
 from mitsplat.plugins.device import gathered
-from mitsplat.plugins.emitters import Emitters, receiver
+from mitsplat.plugins.emitters import Beam, Emitters, receiver
 from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter
-from mitsplat.plugins.proxies import Proxies
+from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
 
 BLOCK = 8
@@ -49,6 +49,9 @@ the scene's lights. Metals reflect more, and keep the rest as it was captured: i
 
 FIRST_RAYS = 4
 """Rays per point after which its error is first estimated."""
+
+WORD = 32
+"""Rays whose fate is kept as bits of one number."""
 
 
 @dataclass(eq=False)
@@ -150,7 +153,7 @@ def light_factor(
     light_filter = LightFilter(here, view, index)
     tracer = _Tracer(emitters, proxies, here, index, view, seed)
     places = _blockwise(light_filter.place, view)
-    estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), dr.opaque(mi.UInt32, rays))
+    estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), rays)
     if rays < accuracy.most:
         wanted = light_filter.rays_for(estimate, accuracy.error)
         # Doubled until enough: pixels with the same number of rays go together, so that no lane waits for another.
@@ -161,7 +164,7 @@ def light_factor(
             if not dr.width(places):
                 break
             extra = min(done, accuracy.most - done)
-            estimate = tracer.trace(places, estimate, dr.opaque(mi.UInt32, extra), first=done)
+            estimate = tracer.trace(places, estimate, extra, first=done)
             done += extra
     lit, base, shine = light_filter.smooth(estimate)
     share = dr.select(base > 0, lit / base, 1)
@@ -239,19 +242,26 @@ class _Tracer:
 
     def search(self, active: Any) -> Any:
         """1 where one ray from a point towards the light is stopped by a dynamic object, else 0."""
-        if self.proxies.casting is None:
-            return mi.Float(0)
         surface = self.surface
         beam = self.emitters.sample(
             receiver(surface.position, surface.normal), _sequence(self._start(self.pixel)), active & surface.valid
         )
         active = active & surface.valid & (dr.sum(beam.irradiance) > 0)
         ray = _shadow_ray(_origin(surface), beam, surface.offset)
-        stopped = self.proxies.casting.stop(ray, surface.instance, self.pixel, active)
+        stopped = mi.Bool(False)
+        for stopper in self.proxies.casting:
+            if self.proxies.apart:
+                dr.eval(stopped)
+            stopped = stopped | stopper.stop(ray, surface.instance, self.pixel, active & ~stopped)
         return dr.select(stopped, mi.Float(1), 0)
 
-    def trace(self, places: Any, before: Estimate, rays: Any, *, first: int = 0) -> Estimate:
+    def trace(self, places: Any, before: Estimate, rays: int, *, first: int = 0) -> Estimate:
         """What ``rays`` more rays add to an estimate at the points ``places``, which have had ``first``."""
+        apart = self.proxies.apart
+        if apart and rays > WORD:
+            for begin in range(0, rays, WORD):
+                before = self.trace(places, before, min(WORD, rays - begin), first=first + begin)
+            return before
         surface = gathered(self.surface, places)
         pixel = dr.gather(mi.UInt32, self.pixel, places)
         start = self._start(pixel) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
@@ -260,19 +270,43 @@ class _Tracer:
         alpha2 = dr.square(dr.square(surface.roughness))
         cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
         static, casting = self.proxies.static, self.proxies.casting
+        stoppers: tuple[Stopper, ...] = casting if static is None else (static, *casting)
+        count = dr.opaque(mi.UInt32, rays)
+        known: list[Any] = []
 
-        def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
+        def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:
+            """Ray ``i`` of every point: where to, whether it counts, its number, and what is known to stop it."""
             number = start + i * (BLOCK * BLOCK)
             beam = self.emitters.sample(si, _sequence(number), surface.valid)
             active = surface.valid & (dr.sum(beam.irradiance) > 0)
+            return beam, active, number, [(word >> i & 1) != 0 for word in known]
+
+        def stop(stopper: Stopper, beam: Beam, number: Any, active: Any) -> Any:
             ray = _shadow_ray(origin, beam, surface.offset)
-            blocked = mi.Bool(False) if static is None else static.scene.ray_test(ray, active=active)
-            shadowed = mi.Bool(False)
-            if casting is not None:
-                shadowed = casting.stop(ray, surface.instance, pixel * R2[0] + number, active & ~blocked)
-            static_light = dr.select(active & ~blocked, beam.irradiance, 0)
-            light = dr.select(shadowed, 0, static_light)
-            compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), static_light)
+            return stopper.stop(ray, surface.instance, pixel * R2[0] + number, active)
+
+        def note(i: Any, word: Any) -> tuple[Any, Any]:
+            beam, free, number, stopped = send(i)
+            for each in stopped:
+                free = free & ~each
+            return i + 1, word | dr.select(stop(stoppers[len(known)], beam, number, free), mi.UInt32(1) << i, 0)
+
+        if apart:  # a bit for each ray and scene but the last, each by a kernel of its own
+            for _ in stoppers[1:]:
+                nothing = dr.zeros(mi.UInt32, dr.width(places))
+                _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < count, note, label="stopped")
+                dr.eval(word)
+                known.append(word)
+
+        def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
+            beam, active, number, stopped = send(i)
+            static_light = free = active
+            for each, stopper in enumerate(stoppers):
+                free = free & ~(stopped[each] if each < len(stopped) else stop(stopper, beam, number, free))
+                if stopper is static:
+                    static_light = free
+            light, unshadowed = (dr.select(where, beam.irradiance, 0) for where in (free, static_light))
+            compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), unshadowed)
             lit += light
             base += compared
             shine += light * _ggx(surface, beam.direction, cos_camera, alpha2)
@@ -281,9 +315,8 @@ class _Tracer:
 
         sums = [dr.gather(type(v), v, places) for v in (before.lit, before.base, before.shine, before.squares)]
         state = dr.zeros(mi.UInt32, dr.width(places)), *sums
-        _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
-        count = dr.gather(mi.Float, before.rays, places) + mi.Float(rays)
-        return before.updated(places, *sums, count)
+        _, *sums = dr.while_loop(state, lambda i, *_: i < count, body, label="light")
+        return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(count))
 
     def bounce(self, grid: RadianceGrid) -> Any:
         """Irradiance (Color3f) from the surroundings over that of display white, averaged over neighbours."""

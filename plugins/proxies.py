@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -65,8 +65,21 @@ class Hit:
         return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0))
 
 
+class Stopper(Protocol):
+    """A ray-traceable scene of what stops light."""
+
+    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+        """Whether rays from points of some instances are stopped; a ``key`` per ray decides where chance does."""
+
+
 class Proxies:
-    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones."""
+    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones.
+
+    Attributes:
+        static, dynamic: They, as they are met.
+        casting: What casts the shadows of what is dynamic: none, one or two scenes.
+        apart: Whether a kernel may trace but one scene, as on CUDA: there Dr.Jit leaves out all but the first one.
+    """
 
     def __init__(
         self, occluders: Sequence[Occluder], visible: Sequence[Any] = (), casters: Sequence[Caster] | None = None
@@ -77,13 +90,14 @@ class Proxies:
         """
         self.static = _TraceScene.build([o for o in occluders if not o.dynamic])
         self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
-        self.casting = self.dynamic if casters is None else _Both.of(SplatOccluders.build(casters), visible)
+        casting = [self.dynamic] if casters is None else [_TraceScene.build([], visible), SplatOccluders.build(casters)]
+        self.casting: tuple[Stopper, ...] = tuple(stopper for stopper in casting if stopper is not None)
+        self.apart = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
 
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
         """What rays meet first, and what they would meet without the dynamic proxies."""
         static = _TraceScene.nearest(self.static, ray, Hit.nothing())
-        # A kernel of its own: on CUDA none may trace two scenes.
-        dr.eval(static)
+        dr.eval(static)  # a kernel of its own, see `apart`
         return _TraceScene.nearest(self.dynamic, ray, static), static
 
 
@@ -166,27 +180,6 @@ class _TraceScene:
             positions,
             wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Both:
-    """Splats and visible meshes that stop rays."""
-
-    splats: SplatOccluders
-    meshes: _TraceScene
-
-    @classmethod
-    def of(cls, splats: SplatOccluders | None, visible: Sequence[Any]) -> _Both | _TraceScene | SplatOccluders | None:
-        """What there is of the two."""
-        meshes = _TraceScene.build([], visible)
-        if splats is None or meshes is None:
-            return splats or meshes
-        return cls(splats, meshes)
-
-    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
-        """Whether rays are stopped."""
-        stopped = self.meshes.stop(ray, instance, key, active)
-        return stopped | self.splats.stop(ray, instance, key, active & ~stopped)
 
 
 @lru_cache(maxsize=64)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
 from mitsplat.plugins.emitters import reference_irradiance
@@ -214,6 +215,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         image = mi.TensorXf(flat, shape=(view.height, view.width, len(channels)))
         if evaluate:
             dr.eval(image)
+            refuse_lost_rays()
         return image
 
     def render_layers(self, scene: Any, sensor: Any, *, seed: int = 0) -> dict[str, Any]:

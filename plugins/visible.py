@@ -330,12 +330,10 @@ class PathTracer:
         dr.eval(ray, light, key)
         free = dr.max(light) > 0
         free &= ~self.scene.ray_test(ray, active=free)
-        dr.eval(free)
-        if self.proxies.static is not None:
-            free &= ~self.proxies.static.scene.ray_test(ray, active=free)
+        static = self.proxies.static
+        for stopper in (*(() if static is None else (static,)), *self.proxies.casting):
             dr.eval(free)
-        if self.proxies.casting is not None:
-            free &= ~self.proxies.casting.stop(ray, mi.UInt32(0), key, free)
+            free = free & ~stopper.stop(ray, mi.UInt32(0), key, free)
         _add(result, lane, dr.select(free, light, 0))
 
     def _look(self, path: _Path, smooth: Any, dice: _Dice, depth: int, result: Any) -> Glimpse | None:

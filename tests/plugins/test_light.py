@@ -11,7 +11,7 @@ import trimesh
 
 from mitsplat.camera import Camera
 from mitsplat.mesh_normals import CREASE_ANGLE
-from mitsplat.plugins.proxies import smooth_normals
+from mitsplat.plugins.proxies import Proxies, smooth_normals
 from mitsplat.render.layers import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
@@ -456,3 +456,50 @@ def test_red_wall_lights_what_stands_before_it() -> None:
     added = (with_bounce - without).mean(axis=(0, 1))
     np.testing.assert_allclose(added / red, 0.5, atol=0.03)
     np.testing.assert_allclose(without, 0.5, atol=0.03)
+
+
+@pytest.mark.parametrize("occluders", ["proxies", "splats"])
+@pytest.mark.parametrize("rays", [8, 80])
+def test_one_scene_in_each_kernel_makes_the_same_light(
+    occluders: str, rays: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on CUDA, where a kernel cannot trace several: what static and dynamic things stop is kept from one to the
+    next."""
+    make_integrator()
+    ball = trimesh.creation.icosphere(2, 0.05)
+    ball.apply_translation([0, 0, 0.06])
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.1, 0.05, 0.03]).scale(0.03)}
+    wall = trimesh.creation.box(bounds=[[-0.16, -0.2, 0.001], [-0.15, 0.2, 0.1]])
+    thing = Splats(
+        ball.vertices,
+        np.tile([0, 0, 0, 1.0], (len(ball.vertices), 1)),
+        np.full((len(ball.vertices), 3), 0.008),
+        np.full(len(ball.vertices), 0.9),
+        np.zeros((len(ball.vertices), 1, 3)),
+    )
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "wall": make_splats_shape(nothing(), proxy=wall),
+        "thing": make_splats_shape(thing, proxy=ball, instance=1, capture_light="uniform", specular=0.3),
+        "cube": cube,
+        "sky": WHITE_SKY,
+        "lamp": {"type": "point", "position": [0.5, 0.2, 0.8], "intensity": {"type": "rgb", "value": 1.0}},
+    }
+    camera = Camera.look_at((0.1, -0.5, 0.4), (0, 0, 0), width=48, height=40, fov_x=40)
+
+    def layers() -> Layers:
+        return render(shapes, camera, samples=rays, occluders=occluders)
+
+    together = layers()
+    assert together.light.min() < 0.5
+    build = Proxies.__init__
+
+    def apart(self: Proxies, *args: Any) -> None:
+        build(self, *args)
+        assert len(self.casting) == (2 if occluders == "splats" else 1)
+        self.apart = True
+
+    monkeypatch.setattr(Proxies, "__init__", apart)
+    one_by_one = layers()
+    for name in ("rgb", "light", "highlight", "normal"):
+        assert getattr(one_by_one, name).tobytes() == getattr(together, name).tobytes(), name

@@ -1,0 +1,43 @@
+"""What :func:`tests.gpu.test_same_as_cpu.fault` sees; needs no GPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.gpu.test_same_as_cpu import fault
+
+PICTURE = np.random.default_rng(0).random((100, 100, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["rgb", "instance", "depth", "normal", "mask_1", "gradient_means", "boxes"])
+def test_equal_arrays_have_no_fault(name: str) -> None:
+    assert not fault(name, PICTURE, PICTURE.copy())
+
+
+def test_one_pixel_in_a_thousand_is_too_many_ids() -> None:
+    ids = np.zeros((100, 100), np.uint16)
+    other = ids.copy()
+    other[0, :5] = 1
+    assert not fault("instance", ids, other)
+    other[0, :10] = 1
+    assert fault("instance", ids, other) == "0.10 % of the pixels differ"
+
+
+def test_a_lost_shadow_is_seen() -> None:
+    light = np.ones((100, 100, 3), np.float32)
+    light[:10, :20] = 0.4
+    assert "dB < 60" in fault("light", light, np.ones_like(light))
+    assert not fault("rgb", PICTURE, PICTURE + np.float32(9e-4))
+    assert fault("rgb", PICTURE, PICTURE + np.float32(2e-3)) == "54.0 dB < 60 dB"
+    assert not fault("rgb", PICTURE, PICTURE + np.float32(2e-3), "path-traced glass")
+    assert fault("rgb", PICTURE, PICTURE * np.float32(np.nan)) == "not finite"
+
+
+def test_depth_and_gradients_are_relative() -> None:
+    depth = PICTURE[..., 0] + 1
+    assert not fault("depth", depth, depth * np.float32(1.00005))
+    assert fault("depth", depth, depth * np.float32(1.0005)) == "100.00 % of the pixels differ"
+    assert not fault("gradient_means", PICTURE, PICTURE + np.float32(9e-4))
+    assert fault("gradient_means", PICTURE, PICTURE + np.float32(2e-3))
+    assert fault("depth", depth, depth[1:]).startswith("float64(100, 100)") or fault("depth", depth, depth[1:])

@@ -1,0 +1,75 @@
+"""The GPU renders what the CPU renders; both in processes of their own, because a process has one variant."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.gpu.cases import CASES
+
+SHARE = 5e-4
+"""Of the pixels, which may differ in ids, depth and normals: float32 rounds at edges either way."""
+
+DECIBEL = {"path-traced": 45.0}
+"""PSNR that pictures must have where it is not 60: one path in thousands takes another turn where it is rounded."""
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory, gpu: None) -> dict[str, dict[str, np.ndarray]]:
+    """Every array of every case, by variant."""
+    folder, found = tmp_path_factory.mktemp("rendered"), {}
+    root = Path(__file__).resolve().parents[2]
+    processes = {}
+    for variant in ("llvm_ad_rgb", "cuda_ad_rgb"):
+        command = [sys.executable, "-m", "tests.gpu.cases", variant, str(folder / f"{variant}.npz")]
+        processes[variant] = subprocess.Popen(command, cwd=root, env=os.environ, stderr=subprocess.PIPE, text=True)
+    for variant, process in processes.items():
+        _, said = process.communicate()
+        assert process.returncode == 0, said
+        found[variant] = dict(np.load(folder / f"{variant}.npz"))
+    return found
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_case(case: str, rendered: dict[str, dict[str, np.ndarray]]) -> None:
+    cpu, gpu = (
+        {name.partition("/")[2]: value for name, value in arrays.items() if name.startswith(f"{case}/")}
+        for arrays in rendered.values()
+    )
+    assert cpu and list(cpu) == list(gpu)
+    faults = [f"{name}: {said}" for name in cpu if (said := fault(name, cpu[name], gpu[name], case))]
+    assert not faults
+
+
+def fault(name: str, cpu: np.ndarray, gpu: np.ndarray, case: str = "") -> str:
+    """How two arrays differ more than they may, or nothing.
+
+    Ids and masks: equal but for :data:`SHARE` of the pixels. Depth [m], normals and boxes [px] likewise, where equal
+    means within 1e-4 of the depth, 1e-3, and one pixel. Colours and light: a PSNR of 60 dB, 1 being white. Gradients:
+    within a thousandth of the largest.
+    """
+    if cpu.shape != gpu.shape or cpu.dtype != gpu.dtype:
+        return f"{cpu.dtype}{cpu.shape} and {gpu.dtype}{gpu.shape}"
+    cpu, gpu = np.float64(cpu), np.float64(gpu)
+    if not np.isfinite(gpu).all():
+        return "not finite"
+    apart = np.abs(cpu - gpu)
+    if name.startswith("gradient"):
+        limit = 1e-3 * np.abs(cpu).max()
+        return "" if apart.max() <= limit else f"{apart.max():.3g} > {limit:.3g}"
+    if name == "boxes":
+        return "" if apart.max(initial=0) <= 1 else f"{apart.max():g} px"
+    if name in ("rgb", "captured", "alpha", "light", "highlight", "image"):
+        error = np.mean(np.square(apart / (255 if name == "image" else 1)))
+        least = next((value for start, value in DECIBEL.items() if case.startswith(start)), 60.0)
+        decibel = -10 * np.log10(error) if error else np.inf
+        return "" if decibel >= least else f"{decibel:.1f} dB < {least:g} dB"
+    allowed = {"depth": 1e-4 * cpu, "proxy_depth": 1e-4 * cpu, "normal": 1e-3}.get(name, 0)
+    differ = apart > allowed
+    share = float(np.mean(differ.any(axis=-1) if differ.ndim == 3 else differ))
+    return "" if share <= SHARE else f"{100 * share:.2f} % of the pixels differ"

@@ -1,0 +1,65 @@
+"""Rays that a GPU would leave out: seen in the kernels' code on any machine, and an error where Dr.Jit says so."""
+
+import ctypes
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import drjit as dr
+import pytest
+
+from mitsplat.lost_rays import SIGN, refuse_lost_rays, watch_rays
+
+TEXTS = [
+    "jit_eval(): more than one OptiX pipeline was used within a single kernel, which is not supported. Please split "
+    "your kernel into smaller parts (e.g. using `dr::eval()`). Disabling this ray tracing operation to avoid "
+    "potential undefined behavior.",
+    "jit_eval(): more than one OptiX shader binding table was used within a single kernel, which is not supported. "
+    "Please split your kernel into smaller parts (e.g. using `dr::eval()`). Disabling this ray tracing operation to "
+    "avoid potential undefined behavior.",
+]
+"""As the library of Dr.Jit 1.5 has them."""
+
+LIBRARY = Path(dr.__file__).with_name("libdrjit-core.so")
+
+
+@pytest.fixture
+def log():
+    """Dr.Jit's own log, with the callback in place while the test runs."""
+    function = ctypes.CDLL(str(LIBRARY))["_Z7jit_log8LogLevelPKcz"]
+    function.argtypes, function.restype = (ctypes.c_uint32, ctypes.c_char_p), None
+    level = dr.log_level()
+    watch_rays()
+    yield lambda text: function(dr.LogLevel.Warn.value, text.encode())
+    dr.set_log_level(level)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_lost_rays_are_an_error_once(log, text, capfd):
+    log(text)
+    log(text)
+    with pytest.raises(RuntimeError, match=r"left out rays \(2 times\): jit_eval\(\): more than one OptiX"):
+        refuse_lost_rays()
+    refuse_lost_rays()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_other_messages_are_printed(log, capfd):
+    log("something else")
+    refuse_lost_rays()
+    assert "something else" in capfd.readouterr().err
+
+
+def test_dr_jit_still_says_so():
+    """Another release may word it differently, and nothing else would tell."""
+    library = LIBRARY.read_bytes()
+    for text in TEXTS:
+        assert SIGN in text.encode()
+        assert text.encode() in library
+
+
+def test_a_process_ends_with_the_callback_in_place():
+    code = "import mitsplat.lost_rays as l, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); l.watch_rays(); mi.Float(1)"
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

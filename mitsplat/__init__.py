@@ -37,6 +37,7 @@ _HOME = {
     "render_frame": "frames.frame",
     "render_splats": "render.layers",
     "settle_layout": "physics.settle",
+    "use_device": "device",
     "write_dataset": "dataset.write",
 }
 
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from mitsplat.bake.bake import bake_asset as bake_asset
     from mitsplat.camera import Camera as Camera
     from mitsplat.dataset.write import write_dataset as write_dataset
+    from mitsplat.device import use_device as use_device
     from mitsplat.errors import InputError as InputError
     from mitsplat.frames.frame import Frame as Frame
     from mitsplat.frames.frame import Renderer as Renderer

@@ -54,6 +54,17 @@ def ensure_variant() -> None:
             watch_rays()
 
 
+def choose_variant(variant: str) -> None:
+    """Choose one of :data:`VARIANTS` for this process, whatever was chosen before.
+
+    Raises:
+        MissingResourceError: If it is ``llvm_ad_rgb``, and Dr.Jit has no usable LLVM.
+    """
+    with _turn:
+        mi.set_variant(variant)
+        ensure_variant()
+
+
 def register_plugins(variant: str | None) -> None:
     """Register the plugins under a variant, unless they are those of that variant already."""
     global _registered

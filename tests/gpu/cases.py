@@ -77,7 +77,9 @@ def visible(kind: str) -> dict[str, Any]:
     transform = mi.ScalarTransform4f()
     if kind == "plain":
         diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}}
-        return {"cube": {"type": "cube", "to_world": transform.translate([0.0, -0.1, 0.03]).scale(0.03), "bsdf": diffuse}}
+        return {
+            "cube": {"type": "cube", "to_world": transform.translate([0.0, -0.1, 0.03]).scale(0.03), "bsdf": diffuse}
+        }
     sphere = {"type": "sphere", "to_world": transform.translate([0.02, -0.12, 0.041]).scale(0.04)}
     materials = {"glass": {"type": "dielectric"}, "mirror": {"type": "conductor", "material": "Cu"}}
     return {kind: sphere | {"bsdf": materials[kind]}}
@@ -148,7 +150,7 @@ def drawn_scene(folder: Path, **output: Any) -> ms.Scene:
         "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
         "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.7, "height": 0.6},
         "lights": [{"kind": "area", "position": [0.5, 0, 1]}, {"kind": "environment", "radiance": 0.5}],
-        "randomise": {"iso": [400, 400], "vignetting": [0.1, 0.1]},
+        "randomise": {"iso": [400, 400], "vignetting": [0.1, 0.1], "motion_blur": [2, 2]},
         "settle": {"stepper": "mujoco"},
         "output": output,
         "seed": 7,

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import cv2
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.colour import LUMINANCE, colour_science
-from mitsplat.render.layers import Layers
+from mitsplat.plugins.device import wrapped
+from mitsplat.render.layers import Layers, device_array, host_array
 from mitsplat.scene.spec import Composite, ImageShadow, Sensor
+from mitsplat.variant import one_at_a_time
+
+Tone: TypeAlias = Literal["neutral", "filmic"]
 
 BACKGROUND = 0.18
 """Linear grey where a scene shows nothing."""
@@ -27,16 +34,25 @@ CURVE_WHITE = 16.0
 """Linear input at the end of the table."""
 
 
+@one_at_a_time
 def light_image(layers: Layers, composite: Composite) -> Float32Array:
     """Linear picture (H, W, 3) with the shadows asked for, over a grey background."""
+    return host_array(light_layers(layers, composite), layers.shape)
+
+
+def light_layers(layers: Layers, composite: Composite) -> Any:
+    """The same on the device: flat and row-major, Color3f."""
+    alpha = layers.device_array("alpha")
+    lit = layers.device_array("rgb" if composite.shadow == "traced" else "captured")
     if composite.shadow == "image":
-        factor, shine = shadow_from_image(layers.light @ LUMINANCE, composite.image_shadow)
-        lit = layers.captured * factor[..., None]
+        red, green, blue = layers.device_array("light")
+        luminance = red * LUMINANCE[0] + green * LUMINANCE[1] + blue * LUMINANCE[2]
+        found = shadow_from_image(host_array(luminance, layers.shape), composite.image_shadow)
+        factor, shine = (device_array(values) for values in found)
+        lit = lit * factor
         if composite.highlight:
-            lit += (shine * layers.alpha)[..., None]
-    else:
-        lit = layers.captured if composite.shadow == "none" else layers.rgb
-    return np.asarray(lit + (BACKGROUND * (1 - layers.alpha))[..., None], dtype=np.float32)
+            lit += shine * alpha
+    return lit + BACKGROUND * (1 - alpha)
 
 
 def shadow_from_image(shadow_map: Float32Array, parameters: ImageShadow) -> tuple[Float32Array, Float32Array]:
@@ -57,14 +73,15 @@ def shadow_from_image(shadow_map: Float32Array, parameters: ImageShadow) -> tupl
     return factor.astype(np.float32), shine.astype(np.float32)
 
 
+@one_at_a_time
 def develop(
     linear: Float32Array,
     draws: Mapping[str, float],
     *,
-    tone: Literal["neutral", "filmic"] = "neutral",
+    tone: Tone = "neutral",
     sensor: Sensor = SENSOR,
     seed: int = 0,
-) -> npt.NDArray[np.uint8]:
+) -> ByteImage:
     """Linear picture (H, W, 3) to display-encoded bytes, as a camera would develop it.
 
     Args:
@@ -74,39 +91,98 @@ def develop(
             missing changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
         sensor: What turns ``iso`` into noise.
-        seed: Seed of the noise.
+        seed: Seed of the noise, below 2^64. The noise of a pixel and channel is a function of these three alone.
     """
-    linear = _through_lens(linear, draws)
+    height, width = linear.shape[:2]
+    return develop_layers(device_array(linear), (height, width), draws, tone=tone, sensor=sensor, seed=seed).image()
+
+
+def develop_layers(
+    linear: Any, shape: tuple[int, int], draws: Mapping[str, float], *, tone: Tone, sensor: Sensor, seed: int
+) -> Development:
+    """Begin to :func:`develop` a picture of the device (Color3f, flat and row-major over ``shape``)."""
+    height, width = shape
+    pixel = dr.arange(mi.UInt32, height * width)
+    linear = _through_lens(linear, pixel, shape, draws)
     if "iso" in draws:
-        linear = _sensed(linear, draws["iso"], sensor, seed)
+        linear = _sensed(linear, pixel, draws["iso"], sensor, seed)
     matrix = colour_matrix(
         white_balance=draws.get("white_balance", 6504.0),
         hue=draws.get("hue", 0.0),
         saturation=draws.get("saturation", 1.0),
     )
     if not np.array_equal(matrix, np.eye(3)):
-        linear = linear @ matrix.T.astype(np.float32)
-    position = np.sqrt(np.clip(linear, 0.0, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
-    encoded = tone_curve(tone)[np.rint(position).astype(np.int32)]
-    image = np.asarray(np.rint(np.clip(encoded, 0.0, 1.0) * 255.0), dtype=np.uint8)
-    return _compressed(image, round(draws["jpeg"])) if "jpeg" in draws else image
+        linear = mi.Color3f(*[sum(_opaque(m) * c for m, c in zip(row, linear, strict=True)) for row in matrix])
+    position = dr.sqrt(dr.clip(linear, 0.0, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
+    table, data = _byte_curve(tone, str(mi.variant())), dr.empty(mi.UInt8, 3 * height * width)
+    for c in range(3):
+        value = dr.gather(mi.UInt32, table, mi.UInt32(dr.round(position[c])))
+        dr.scatter(data, mi.UInt8(value), 3 * pixel + c, mode=dr.ReduceMode.Permute)
+    dr.eval(data)
+    return Development(data, shape, round(draws["jpeg"]) if "jpeg" in draws else None)
 
 
-def _through_lens(linear: Float32Array, draws: Mapping[str, float]) -> Float32Array:
+@dataclass(frozen=True, eq=False)
+class Development:
+    """A picture that the device is developing.
+
+    Attributes:
+        data: Its bytes on the device, flat and row-major, red, green, blue.
+        shape: Height and width [px].
+        jpeg: Quality of the JPEG file that it has been, if any.
+    """
+
+    data: Any
+    shape: tuple[int, int]
+    jpeg: int | None
+
+    def image(self) -> ByteImage:
+        """The picture (H, W, 3) on the host, when it is done."""
+        image = self.data.numpy().reshape(*self.shape, 3)
+        return image if self.jpeg is None else _compressed(image, self.jpeg)
+
+
+def _opaque(value: float) -> Any:
+    """A value that differs from frame to frame; as a literal it would be part of the kernel, and compiled anew."""
+    return dr.opaque(mi.Float, float(value))
+
+
+def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mapping[str, float]) -> Any:
     """Exposed, darker towards the corners, and blurred along a straight line by the camera's motion."""
-    height, width = linear.shape[:2]
+    height, width = shape
     if draws.get("exposure", 0.0):
-        linear = linear * np.float32(2.0 ** draws["exposure"])
+        linear = linear * _opaque(2.0 ** draws["exposure"])
     if draws.get("vignetting", 0.0):
-        y, x = np.ogrid[:height, :width]
-        square = (x + 0.5 - width / 2) ** 2 + (y + 0.5 - height / 2) ** 2
-        share = square / (0.25 * (height**2 + width**2))
-        linear = linear * np.exp2(-draws["vignetting"] * share).astype(np.float32)[..., None]
+        row = pixel // width
+        x, y = mi.Float(pixel - row * width) + (0.5 - width / 2), mi.Float(row) + (0.5 - height / 2)
+        share = (x * x + y * y) / (0.25 * (height**2 + width**2))
+        linear = linear * dr.exp2(_opaque(-draws["vignetting"]) * share)
     if draws.get("motion_blur", 0.0):
         kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
-        blurred = cv2.filter2D(np.ascontiguousarray(linear), -1, kernel, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(blurred, dtype=np.float32)
-    return np.asarray(linear, dtype=np.float32)
+        return _blurred(linear, pixel, shape, kernel)
+    return linear
+
+
+def _blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
+    """Correlated with a kernel (K, K); the picture goes on beyond its border as it ends there."""
+    height, width = shape
+    picture = dr.ravel(mi.Vector4f(*linear, 0.0))  # a CPU gathers four neighbours as fast as one
+    rows, columns = np.nonzero(kernel)
+    reach = kernel.shape[0] // 2
+    lines = np.stack([columns - reach, rows - reach, kernel[rows, columns], np.zeros_like(rows)], axis=-1)
+    taps, count = wrapped(mi.Float, lines.astype(np.float32)), dr.opaque(mi.UInt32, len(rows))
+    row = pixel // width
+    x, y = mi.Int32(pixel - row * width), mi.Int32(row)
+    dr.eval(picture, taps)
+
+    def add(number: Any, total: Any) -> tuple[Any, Any]:
+        tap = dr.gather(mi.Vector4f, taps, number)
+        column, line = dr.clip(x + mi.Int32(tap.x), 0, width - 1), dr.clip(y + mi.Int32(tap.y), 0, height - 1)
+        seen = dr.gather(mi.Vector4f, picture, mi.UInt32(line * width + column))
+        return number + 1, total + tap.z * mi.Color3f(seen.x, seen.y, seen.z)
+
+    state = mi.UInt32(0), mi.Color3f(0)
+    return dr.while_loop(state, lambda number, _: number < count, add, label="motion blur")[1]
 
 
 def motion_kernel(length: float, angle: float) -> Float32Array:
@@ -124,18 +200,19 @@ def motion_kernel(length: float, angle: float) -> Float32Array:
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
-def _sensed(linear: Float32Array, iso: float, sensor: Sensor, seed: int) -> Float32Array:
+def _sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> Any:
     """With shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
 
-    Display white fills the wells at ISO 100. The Poisson noise of N is taken as normal.
+    Display white fills the wells at ISO 100. The Poisson noise of N is taken as normal. Its numbers are counted by the
+    pixel (Philox 4x32, Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), in whatever order they come.
     """
-    electrons = np.float32(sensor.full_well * 100.0 / iso)
-    rng = np.random.default_rng(seed)
-    deviation = np.sqrt(np.maximum(linear, 0.0) / electrons + np.float32((sensor.read_noise / electrons) ** 2))
-    return np.asarray(linear + deviation * rng.standard_normal(linear.shape, dtype=np.float32), dtype=np.float32)
+    electrons = sensor.full_well * 100.0 / iso
+    numbers = mi.Philox4x32(dr.opaque(mi.UInt64, seed), pixel).next_float32x4_normal()
+    shot, read = _opaque(1 / electrons), _opaque((sensor.read_noise / electrons) ** 2)
+    return linear + dr.sqrt(dr.maximum(linear, 0.0) * shot + read) * mi.Color3f(numbers.x, numbers.y, numbers.z)
 
 
-def _compressed(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
+def _compressed(image: ByteImage, quality: int) -> ByteImage:
     """The picture after JPEG compression."""
     done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
@@ -175,7 +252,7 @@ def _adaptation(kelvin: float) -> Float64Array:
 
 
 @lru_cache(maxsize=2)
-def tone_curve(tone: Literal["neutral", "filmic"]) -> Float32Array:
+def tone_curve(tone: Tone) -> Float32Array:
     """Display-encoded values of linear inputs ``CURVE_WHITE * (i / (CURVE_STEPS - 1))^2``, by sRGB's transfer.
 
     ``filmic`` is Hable's curve (2010, "Filmic tonemapping operators", Uncharted 2), scaled so that 0.18 stays 0.18.
@@ -192,3 +269,9 @@ def tone_curve(tone: Literal["neutral", "filmic"]) -> Float32Array:
         x = hable(gain * x) / hable(np.array(11.2))
     encoded = colour.cctf_encoding(np.clip(x, 0.0, 1.0), function="sRGB")
     return np.asarray(encoded, dtype=np.float32)
+
+
+@lru_cache(maxsize=4)
+def _byte_curve(tone: Tone, variant: str) -> Any:
+    """The tone curve's values as bytes, on the device."""
+    return wrapped(mi.UInt32, np.rint(255.0 * np.clip(tone_curve(tone), 0.0, 1.0)).astype(np.uint32))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import cv2
@@ -20,15 +20,17 @@ from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
-from mitsplat.frames.camera_response import develop, light_image
+from mitsplat.frames.camera_response import develop_layers, light_layers
 from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.masks import Silhouette
 from mitsplat.physics.settle import settle_layout
 from mitsplat.plugins.device import plain_mesh
 from mitsplat.quality import Quality, resolve_quality
+from mitsplat.render.deferred import Deferred
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import (
     Layers,
+    host_array,
     make_integrator,
     make_splats_shape,
     render_layers,
@@ -48,8 +50,10 @@ NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0,
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(Deferred):
     """A labelled picture of H x W pixels with everything that it was made from. In a notebook it shows itself.
+
+    Layers and linear picture stay on the device, and come to the host when they are first looked at.
 
     Attributes:
         plan: Camera, lights and random draws.
@@ -58,7 +62,7 @@ class Frame:
         rgb: Linear picture before the camera's development, (H, W, 3) float32.
         image: Display-encoded picture, (H, W, 3) uint8.
         labels: Labels of the visible instances.
-        seconds: Time per stage [s].
+        seconds: Time of the host per stage [s]; the device may still work at what a stage began in the next ones.
     """
 
     plan: FramePlan
@@ -144,7 +148,7 @@ def _kept_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -
 def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
-    seconds[name] = time.perf_counter() - start
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 class Renderer:
@@ -211,15 +215,20 @@ class Renderer:
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
-            composite = self.scene.spec.composite
-            rgb = light_image(layers, composite)
-            image = develop(rgb, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed)
+            composite, shape = self.scene.spec.composite, layers.shape
+            linear = light_layers(layers, composite)
+            development = develop_layers(
+                linear, shape, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed
+            )
         with _timed(seconds, "silhouettes"):
             source = self.scene.spec.labels.source
             silhouettes = render_silhouettes(self.integrator, mitsuba_scene, plan.camera, source=source)
         with _timed(seconds, "label"):
             labels = self._label(layers, silhouettes, layout, plan.camera)
-        return Frame(plan, layout, layers, rgb, image, labels, seconds)
+        with _timed(seconds, "composite"):
+            image = development.image()
+        made = {"plan": plan, "layout": layout, "layers": layers, "image": image, "labels": labels, "seconds": seconds}
+        return Frame.later({"rgb": partial(host_array, linear, shape)}, **made)
 
     def _settle(self, index: int) -> Layout:
         """A layout, kept for the next views of it."""

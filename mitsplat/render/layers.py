@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -14,15 +17,20 @@ from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.masks import Silhouette
+from mitsplat.plugins.device import wrapped
 from mitsplat.quality import Quality, resolve_quality
+from mitsplat.render.deferred import Deferred
 from mitsplat.splats import Splats
 from mitsplat.variant import ensure_variant as ensure_variant
 from mitsplat.variant import one_at_a_time
 
 
 @dataclass(frozen=True, eq=False)
-class Layers:
+class Layers(Deferred):
     """What the integrator makes of one view, H x W pixels.
+
+    Layers that were rendered stay on the device as long as this does, and come to the host one by one, when they are
+    first looked at.
 
     Through a thin lens, ``rgb``, ``captured`` and ``alpha`` are means over its aperture; all else is what its centre
     sees.
@@ -52,6 +60,24 @@ class Layers:
     normal: Float32Array
     light: Float32Array
     highlight: Float32Array
+
+    @classmethod
+    def on_device(cls, channels: Mapping[str, Any], shape: tuple[int, int]) -> Layers:
+        """Layers of (H, W) pixels that are flat row-major device arrays, colours of three channels."""
+        fetch = {name: _host_ids if name.endswith("instance") else host_array for name in channels}
+        makers = {name: partial(fetch[name], value, shape) for name, value in channels.items()}
+        return cls.later(makers, _channels=channels, _shape=shape)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width [px]."""
+        height, width = self.__dict__.get("_shape") or self.alpha.shape
+        return height, width
+
+    def device_array(self, name: str) -> Any:
+        """A layer of floats as a flat row-major device array; colours and normals as three of them, Color3f."""
+        channels = self.__dict__.get("_channels")
+        return device_array(getattr(self, name)) if channels is None else channels[name]
 
 
 def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> Any:
@@ -126,7 +152,9 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
     ensure_variant()
     integrator, scene = _alone(splats, str(mi.variant()))
     integrator.quality = resolve_quality(quality)
-    return render_layers(integrator, scene, camera)
+    layers = render_layers(integrator, scene, camera)
+    dr.sync_thread()
+    return layers
 
 
 @lru_cache(maxsize=2)
@@ -137,34 +165,42 @@ def _alone(splats: Splats, variant: str) -> tuple[Any, Any]:
 
 
 def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
-    """Run the integrator and bring its layers to the host."""
+    """Run the integrator; each layer comes to the host when it is first looked at, see :class:`Layers`."""
     layers = integrator.render_layers(scene, make_sensor(camera), seed=seed)
-    shape = camera.height, camera.width
-
-    def host(channel: Any) -> npt.NDArray[Any]:
-        # What is the same everywhere is one value on the device.
-        return np.broadcast_to(np.array(channel), shape[0] * shape[1]).reshape(shape)
-
-    def one(name: str, dtype: type) -> Any:
-        return host(layers[name]).astype(dtype, copy=False)
-
-    def three(name: str) -> Float32Array:
-        return np.stack([host(channel) for channel in layers[name]], axis=-1)
-
-    brought = Layers(
-        rgb=three("rgb"),
-        alpha=one("alpha", np.float32),
-        captured=three("captured"),
-        depth=one("depth", np.float32),
-        instance=one("instance", np.uint16),
-        proxy_depth=one("proxy_depth", np.float32),
-        proxy_instance=one("proxy_instance", np.uint16),
-        normal=three("normal"),
-        light=three("light"),
-        highlight=three("highlight"),
-    )
     refuse_lost_rays()
-    return brought
+    return Layers.on_device(layers, (camera.height, camera.width))
+
+
+def device_array(values: npt.NDArray[Any]) -> Any:
+    """Values (H, W), or (H, W, 3), as flat row-major floats on the device, or three of them, Color3f."""
+    ensure_variant()
+    flat = wrapped(mi.Float, values.astype(np.float32, copy=False))
+    return flat if values.ndim == 2 else dr.unravel(mi.Color3f, flat)
+
+
+def host_array(values: Any, shape: tuple[int, int]) -> Float32Array:
+    """Flat row-major device values on the host by one copy: (H, W), or, of three channels, (H, W, 3).
+
+    Those of one channel are read-only, because on a CPU they are the device's own.
+    """
+    colour = dr.depth_v(values) == 2
+    array = dr.ravel(values).numpy() if colour else values.numpy()
+    size = (*shape, 3) if colour else shape
+    if array.size < math.prod(size):  # what is the same everywhere is one value on the device
+        array = np.broadcast_to(array, size).copy()
+    array.flags.writeable = colour
+    return np.asarray(array.reshape(size), dtype=np.float32)
+
+
+def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
+    """Ids on the host, (H, W): two of them travel as one number of 32 bits, as Dr.Jit has none of 16."""
+    count = dr.width(ids)
+    if count > 1:
+        first = 2 * dr.arange(type(ids), (count + 1) // 2)
+        second = dr.gather(type(ids), ids, first + 1, first + 1 < count)
+        ids = dr.gather(type(ids), ids, first) | (second << 16)
+    halves = ids.numpy().view(np.uint16)[:count]
+    return halves.reshape(shape) if count > 1 else np.full(shape, halves)
 
 
 def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:

@@ -95,7 +95,8 @@ def render_trial(**options: Any) -> Layers:
 def _splats(means: Float64Array, scales: tuple[float, float, float], sh: float) -> Splats:
     count = len(means)
     quats, sizes = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(scales, (count, 1))
-    return Splats(means, quats, sizes, np.full(count, 0.95), np.full((count, 1, 3), sh))
+    parts = means, quats, sizes, np.full(count, 0.95), np.full((count, 1, 3), sh)
+    return Splats(*(part.astype(np.float32) for part in parts))
 
 
 def trial_means(layers: Layers) -> dict[str, Float64Array]:

@@ -22,6 +22,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.dataset.write import write_dataset
 from mitsplat.device import Lack, use_device, visible_gpus
 from mitsplat.errors import MissingResourceError
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.physics.settle import warp_settings
 from mitsplat.scene.scene import Scene, load_scene
 from mitsplat.scene.spec import FORMATS
@@ -53,6 +54,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     mark = item.get_closest_marker("cpu")
     if mark is not None and item.config.getoption("--device") != "cpu":
         pytest.skip(f"holds on the CPU alone: {mark.kwargs['reason']}")
+
+
+@pytest.fixture(autouse=True)
+def no_lost_rays() -> Iterator[None]:
+    """Whatever a test renders on a GPU, and looks at however late, it renders with all rays."""
+    yield
+    refuse_lost_rays()
 
 
 @pytest.fixture(scope="session")

@@ -24,6 +24,7 @@ from ruamel.yaml import YAML
 
 # isort: on
 import mitsplat as ms
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.quality import Quality
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
 from mitsplat.splats import Splats
@@ -188,6 +189,7 @@ def main() -> None:
     variant, out = sys.argv[1:]
     mi.set_variant(variant)
     arrays = {f"{case}/{name}": value for case, make in CASES.items() for name, value in make().items()}
+    refuse_lost_rays()
     np.savez(out, **arrays)
 
 

@@ -24,6 +24,7 @@ from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.cli import app, main
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.write import DatasetSummary
+from mitsplat.device import CPU, Device
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
@@ -103,7 +104,9 @@ def test_render_passes_every_option_on(
     assert scene.spec.output.formats == ("yolo", "coco")
     assert (scene.spec.seed, scene.spec.quality) == (9, "fast")
     write_dataset.kwargs.pop("progress")
-    assert write_dataset.kwargs == {"frames": 3, "shard": None, "workers": 2, "cluster": None, "overwrite": True}
+    assert write_dataset.kwargs == {
+        "frames": 3, "shard": None, "workers": 2, "cluster": None, "overwrite": True, "device": CPU, "any_device": False,
+    }  # fmt: skip
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"dataset: {tmp_path / 'out'} (2 train, 1 val; 9 labelled instances)"
     assert lines[1] == "not labelled: 2 small; marked: 1 occluded"
@@ -117,7 +120,8 @@ def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_d
     assert (scene.spec.output.width, scene.spec.seed, scene.spec.quality) == (64, 7, "balanced")
     write_dataset.kwargs.pop("progress")
     assert write_dataset.kwargs == {
-        "frames": None, "shard": None, "workers": None, "cluster": None, "overwrite": False,
+        "frames": None, "shard": None, "workers": None, "cluster": None, "overwrite": False, "device": CPU,
+        "any_device": False,
     }  # fmt: skip
 
 
@@ -130,7 +134,7 @@ def test_presets_are_measured_on_a_scene_with_files_outside_only_if_allowed(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def load(path: Path, step: chart.Step, frames: int, overrides: Any, allow_outside: bool) -> None:
+    def load(path: Path, step: chart.Step, frames: int, overrides: Any, allow_outside: bool, _device: Device) -> None:
         chart._scene_shooter(path, step.quality or chart.PRESETS["fast"], frames, overrides, allow_outside)
         raise InputError("loaded")
 

@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from pydantic import TypeAdapter
 
@@ -17,6 +18,7 @@ import mitsplat as ms
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.frames.frame import NOTHING
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.quality import PRESETS
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
@@ -243,6 +245,19 @@ def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: i
     elsewhere = replace(camera, cx=camera.cx + 1)
     render_layers(still, scene(0), elsewhere)
     assert still._still[1] is None
+
+
+def test_a_camera_that_stands_still_before_surroundings_without_splats() -> None:
+    """As of a proxy that is not seen, which has none."""
+    integrator = make_integrator(shadow="none")
+    wall = make_splats_shape(NOTHING, proxy=trimesh.creation.box((1, 1, 0.1)))
+    seen = make_splats_shape(make_splats(20, 3), instance=1)
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
+    pictures = [
+        render_layers(integrator, mi.load_dict({"type": "scene", "wall": wall, "seen": seen}), camera).rgb.tobytes()
+        for _ in range(3)
+    ]
+    assert pictures[0] == pictures[1] == pictures[2]
 
 
 def test_views_of_a_layout_share_what_was_uploaded(

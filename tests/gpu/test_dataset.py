@@ -16,6 +16,7 @@ from tests.gpu.cases import drawn_scene
 COMMAND = "from mitsplat.cli import main; main()"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_processes_make_the_same_bytes(device: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """One process, and two that share the device."""

@@ -170,6 +170,7 @@ CASES: dict[str, Callable[[], Arrays]] = {
     "two by two rays": lambda: layers(quality=Quality(samples=2)),
     "dilated": lambda: layers(quality=Quality(kernel="gsplat", response="ewa")),
     "distorted lens": lambda: layers(view=lambda: camera(distortion=(-0.2, 0.05, 0.001, -0.001, 0.01))),
+    "fisheye lens": lambda: layers(view=lambda: camera(lens="fisheye", distortion=(0.05, -0.01, 0.002, 0.0))),
     "thin lens": lambda: layers(
         view=lambda: camera(aperture_radius=0.01, focus_distance=0.5), quality=Quality(lens_rings=1)
     ),

@@ -35,11 +35,9 @@ JsonLog = Annotated[
 
 def take_device(name: str) -> None:
     """Compute on a device from now on; why ``auto`` chose it is said."""
-    from mitsplat.device import find_device, use_device  # imports Mitsuba's variant, which most commands do without
+    from mitsplat.device import use_device  # most commands do without
 
-    device = find_device(name)
-    tell_device(device)
-    use_device(device)
+    tell_device(use_device(name))
 
 
 def tell_device(device: Device) -> None:

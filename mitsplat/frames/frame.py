@@ -160,7 +160,7 @@ class Renderer:
             frames = [renderer.render(index) for index in range(12)]
 
     It takes no device, because that is Mitsuba's variant, of which a process has one (see :mod:`mitsplat.variant`): a
-    second renderer could not keep to another. ``mi.set_variant("cuda_ad_rgb")`` before the first one takes the GPU.
+    second renderer could not keep to another. ``ms.use_device("cuda")`` before the first one takes the GPU.
 
     Attributes:
         scene: The scene.

@@ -186,9 +186,9 @@ def gpu_environment(gpu: Gpu) -> dict[str, str]:
 
 
 @contextmanager
-def starting_on(gpu: Gpu | None) -> Iterator[None]:
-    """Processes that are started meanwhile see this GPU alone, or what this one does if None."""
-    changes = {} if gpu is None else gpu_environment(gpu)
+def starting_on(gpu: Gpu | None, **variables: str) -> Iterator[None]:
+    """Processes that are started meanwhile see this GPU alone, or what this one does if None, and more variables."""
+    changes = variables if gpu is None else variables | gpu_environment(gpu)
     kept = {name: os.environ.get(name) for name in changes}
     os.environ.update(changes)
     try:

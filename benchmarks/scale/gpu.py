@@ -1,13 +1,13 @@
 """Labelled images a second that a GPU makes, files on the disk, and whether they are the CPU's.
 
     python -m benchmarks.scale.gpu [--device cuda:all] [--frames 600] [--workers 14] [--size 1280x720]
-                                   [--compare 12] [--unsettled] [--out FOLDER]
+                                   [--compare 12] [--unsettled] [--turns] [--out FOLDER]
 
 Layouts are settled first, on all cores, unless they are part of what is measured (``--unsettled``); what an earlier
 settling left in mitsplat's cache is used. Then ``mitsplat render`` writes the default scene in YOLO and COCO. The rate
 is that of the middle half of the frames, between starting and running dry, as the median of eight equal parts of it.
-The shares in which GPUs are busy are those of ``nvidia-smi`` meanwhile. At last the dataset is audited, and some frames
-are rendered on both processors as PNG with their ids.
+``--turns`` does without NVIDIA's Multi-Process Service. The shares in which GPUs are busy are those of ``nvidia-smi``
+meanwhile. At last the dataset is audited, and some frames are rendered on both processors as PNG with their ids.
 """
 
 from __future__ import annotations
@@ -66,10 +66,13 @@ def settle(scene: Path) -> None:
     print(f"{count} layouts settled or found in {seconds:.1f} s", flush=True)
 
 
-def render(scene: Path, out: Path, frames: int, device: str, workers: int | None) -> list[tuple[float, int]]:
+def render(
+    scene: Path, out: Path, frames: int, device: str, workers: int | None, turns: bool = False
+) -> list[tuple[float, int]]:
     """Run ``mitsplat render``; returns numbers of finished frames with the time at which they were seen [s]."""
-    command = [sys.executable, "-c", "from mitsplat.cli import main; main()", "render", str(scene), "-o", str(out)]
-    command += ["-n", str(frames), "--device", device, "--allow-outside"]
+    start_up = "import mitsplat.engine.mps as mps; mps.CONTROL = 'nothing'; " if turns else ""
+    command = [sys.executable, "-c", f"{start_up}from mitsplat.cli import main; main()", "render", str(scene)]
+    command += ["-o", str(out), "-n", str(frames), "--device", device, "--allow-outside"]
     if workers is not None:
         command += ["--workers", str(workers)]
     finished, timings, seen = 0, out / "timings.jsonl", []
@@ -135,7 +138,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         settle(scene)
     out = folder / "measured/out"
     with watched_gpus() as samples:
-        seen = render(scene, out, options.frames, options.device, options.workers)
+        seen = render(scene, out, options.frames, options.device, options.workers, options.turns)
     speeds, begin, end = rates(seen, options.frames)
     start, stop = seen[0][0], seen[-1][0]
     first = next(moment for moment, count in seen if count) - start
@@ -216,6 +219,7 @@ def main() -> None:
     parser.add_argument("--size", default="1280x720")
     parser.add_argument("--compare", type=int, default=12, help="frames that are also rendered on the CPU")
     parser.add_argument("--unsettled", action="store_true", help="settle layouts within the run that is measured")
+    parser.add_argument("--turns", action="store_true", help="without NVIDIA's Multi-Process Service")
     parser.add_argument("--out", type=Path, help="where datasets are left; removed if absent")
     options = parser.parse_args()
     with recording("scale.gpu", parser, options, ignore=("out", "compare"), gpu=True):

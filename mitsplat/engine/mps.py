@@ -1,7 +1,7 @@
 """NVIDIA's Multi-Process Service (MPS): processes that compute on a GPU at the same time.
 
-Without it they take turns, in slices of time: ten processes that render on one make 44 images a second, and with it 115
-(``python -m benchmarks.scale.gpu``, with and without ``--turns``). It comes with NVIDIA's driver for Linux, needs no
+Without it they take turns in slices of time, and an H200 is busy for less than half of it, however many they are
+(``python -m benchmarks.scale.gpu``, and the same with ``--turns``). It comes with NVIDIA's driver for Linux, needs no
 rights of an administrator, and is a daemon: started here for as long as it is used, unless one runs already.
 """
 

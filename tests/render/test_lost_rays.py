@@ -29,10 +29,10 @@ TEXTS = [
 LIBRARY = Path(dr.__file__).with_name("libdrjit-core.so")
 
 
-@pytest.fixture
-def log():
-    """Dr.Jit's own log, with the callback in place while the test runs."""
-    function = ctypes.CDLL(str(LIBRARY))["_Z7jit_log8LogLevelPKcz"]
+@pytest.fixture(params=[ctypes.CDLL, ctypes.PyDLL])
+def log(request):
+    """Dr.Jit's own log, without and with Python's lock, and the callback in place while the test runs."""
+    function = request.param(str(LIBRARY))["_Z7jit_log8LogLevelPKcz"]
     function.argtypes, function.restype = (ctypes.c_uint32, ctypes.c_char_p), None
     level = dr.log_level()
     watch_rays()

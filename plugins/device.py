@@ -54,7 +54,7 @@ def ray_scene(contents: Mapping[str, Any]) -> mi.Scene:
 
     Embree loses rays that meet an edge which two triangles share, unless it is told not to; OptiX does not.
     """
-    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents})
+    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents}, parallel=False)
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:

@@ -211,7 +211,8 @@ class Renderer:
             with _timed(seconds, "settle"):
                 layout = self._settle(plan.layout)
         with _timed(seconds, "place"):
-            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights))
+            # Its few parts are made sooner than threads are woken.
+            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights), parallel=False)
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):

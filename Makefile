@@ -6,13 +6,18 @@ PIP_INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-c
 INPUTS := pyproject.toml constraints.txt
 SPHINX := --builder html --fresh-env --fail-on-warning --keep-going --nitpicky --quiet
 
-.PHONY: render test lint docs clean
+.PHONY: render test test-gpu lint docs clean
 
 render: $(STAMPS)/package
 	$(VENV)/bin/mitsplat render scenes/workcell.yaml -o out/workcell --resume
 
 test: $(STAMPS)/tools
 	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile
+
+# What renders, on the GPU; tests/gpu also compares it with the CPU. The tests share the GPU.
+GPU_TESTS := tests/gpu tests/plugins tests/render tests/frames tests/fit tests/bake
+test-gpu: $(STAMPS)/tools
+	$(VENV)/bin/python -m pytest --device cuda --numprocesses 6 --dist loadfile $(GPU_TESTS)
 
 lint: $(STAMPS)/tools
 	$(VENV)/bin/ruff check

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import errno
+import re
+
+_OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory", re.IGNORECASE)
 
 
 class InputError(ValueError):
@@ -17,9 +20,18 @@ class PartialResultError(RuntimeError):
     """A result was written, but it misses a threshold; the sentence says which, and what would help. Exit status 4."""
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether the machine's memory has run out, or a GPU's, which Dr.Jit tells by a text."""
+    if isinstance(error, MissingResourceError | PartialResultError):
+        return False
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and bool(_OUT_OF_MEMORY.search(str(error)))
+    )
+
+
 def exit_status(error: BaseException) -> int | None:
     """Status with which the command line exits for an error that is no bug of ours, else None."""
-    if isinstance(error, MissingResourceError | MemoryError):
+    if isinstance(error, MissingResourceError) or is_out_of_memory(error):
         return 3
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return 3
@@ -34,6 +46,10 @@ def sentence_of(error: BaseException) -> str:
     """What to tell of an error."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    if isinstance(error, MemoryError):
-        return f"memory has run out ({error})" if str(error) else "memory has run out"
+    if is_out_of_memory(error):
+        said = str(error).partition("\n")[0]
+        said = f" ({said})" if said else ""
+        return (
+            f"memory has run out{said}: smaller images and fewer samples take less; if it was a GPU's, use --device cpu"
+        )
     return str(error)

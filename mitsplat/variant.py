@@ -61,6 +61,8 @@ def choose_variant(variant: str) -> None:
         MissingResourceError: If it is ``llvm_ad_rgb``, and Dr.Jit has no usable LLVM.
     """
     with _turn:
+        if variant == VARIANTS[0]:
+            check_llvm()
         mi.set_variant(variant)
         ensure_variant()
 

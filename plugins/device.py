@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
 
@@ -23,6 +23,21 @@ def wrapped(kind: type, values: np.ndarray) -> Any:
     line = memory[start : start + values.nbytes].view(values.dtype)
     line[...] = values
     return kind(line)
+
+
+def concatenated(parts: Sequence[Any]) -> Any:
+    """One device array of several of a type, not yet evaluated.
+
+    ``dr.concat`` writes into its kernels where each part begins, so that other sizes are compiled anew.
+    """
+    whole = dr.empty(type(parts[0]), sum(dr.width(part) for part in parts))
+    start = 0
+    for part in parts:
+        if dr.width(part):
+            place = dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, start)
+            dr.scatter(whole, part, place, mode=dr.ReduceMode.Permute)
+            start += dr.width(part)
+    return whole
 
 
 Columns = TypeVar("Columns")

@@ -159,7 +159,8 @@ def light_factor(
         # Doubled until enough: pixels with the same number of rays go together, so that no lane waits for another.
         done = rays
         while done < accuracy.most:
-            places = dr.gather(mi.UInt32, places, dr.compress(dr.gather(mi.Float, wanted, places) > done))
+            more = dr.gather(mi.Float, wanted, places) > dr.opaque(mi.Float, done)
+            places = dr.gather(mi.UInt32, places, dr.compress(more))
             if not dr.width(places):
                 break
             extra = min(done, accuracy.most - done)

@@ -117,25 +117,29 @@ class LightFilter:
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
         traits = _packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])
-        steps = [s for r in range(1, radius + 1) for s in (-r, r)]
         for direction in ((1, 0), (0, 1)):
-            values = self._average_along(values, traits, [(s * direction[0], s * direction[1]) for s in steps], share)
+            values = self._average_along(values, traits, direction, radius, share)
             dr.eval(values)
         return values
 
     def _average_along(
-        self, values: list[Any], traits: Any, steps: list[tuple[int, int]], share: tuple[Any, Any] | None
+        self, values: list[Any], traits: Any, direction: tuple[int, int], radius: int, share: tuple[Any, Any] | None
     ) -> list[Any]:
-        """Averages over the pixels that are ``steps`` (x, y) away, of which the last ones count half."""
+        """Averages over the pixels up to ``radius`` away along a direction (x, y), of which the last ones count half.
+
+        A loop that is traced once, because a step takes the host as long as the device.
+        """
         here, view, width = self.here, self.view, dr.width(self.index)
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
-        radius = max(abs(sum(step)) for step in steps)
+        along_x, along_y = (dr.opaque(mi.Int32, step) for step in direction)
         images = _packed(values)
         own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_TRAITS, width))[8]
-        weights = own_rays * dr.select(here.known, 1, GUESS_WEIGHT)
-        sums = [mi.Float(0) for _ in values]
-        for step in steps:
-            nx, ny, distance = x + step[0], y + step[1], abs(sum(step))
+        last = dr.opaque(mi.UInt32, radius)
+
+        def add(step: Any, weights: Any, *sums: Any) -> tuple[Any, ...]:
+            distance = (step >> 1) + 1
+            signed = dr.select((step & 1) == 0, -mi.Int32(distance), mi.Int32(distance))
+            nx, ny = x + signed * along_x, y + signed * along_y
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
             place = dr.gather(mi.UInt32, self.place, mi.UInt32(ny * view.width + nx), inside)
             same = inside & (place != NOWHERE)
@@ -144,20 +148,24 @@ class LightFilter:
             trait, known, rays = other[6], other[7] > 0, other[8]
             same &= trait == here.trait
             plane = dr.abs(dr.dot(here.normal, position - here.position))
-            near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * (8 * distance))
+            near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * mi.Float(8 * distance))
             if share is not None:
                 near &= dr.square(other[9] - share[0]) <= NOISE_LIMIT * (share[1] + other[10])
             same &= (near & (known == here.known)) | (known & ~here.known)
             # Halves at the ends: the filter spans one period of the dither, not one pixel more.
-            weight = dr.select(known, 1.0, GUESS_WEIGHT) * (0.5 if distance == radius else 1.0)
+            weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
             weight = dr.select(same, weight * rays, 0)
-            weights += weight
             theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))
             # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
-            sums = [
+            changed = [
                 dr.fma(weight, their - own, total)
                 for their, own, total in zip(theirs[: len(values)], values, sums, strict=True)
             ]
+            return step + 1, weights + weight, *changed
+
+        state = dr.zeros(mi.UInt32, width), own_rays * dr.select(here.known, 1, GUESS_WEIGHT)
+        sums = [dr.zeros(mi.Float, width) for _ in values]
+        _, weights, *sums = dr.while_loop((*state, *sums), lambda step, *_: step < 2 * last, add, label="light filter")
         return [own + total / weights for own, total in zip(values, sums, strict=True)]
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import concatenated, wrapped
 from mitsplat.plugins.gaussian import (
     LOG2_E_HALF,
     RECORD,
@@ -56,6 +56,40 @@ class CloudSet:
     sh: Any
     sh_count: int
     sh_stride: int
+    _numbers: dict[tuple[int, ...], tuple[Any, Any]] = field(default_factory=dict, init=False, repr=False)
+
+    def numbers(self, chosen: Sequence[int]) -> tuple[Any, Any]:
+        """For every Gaussian of some clouds, one after the other: its cloud's place in ``chosen``, and its own number.
+
+        Those of the last two choices are kept: all of a layout's placements, and its objects alone.
+        """
+        key = tuple(chosen)
+        if key not in self._numbers:
+            while len(self._numbers) > 1:
+                del self._numbers[next(iter(self._numbers))]
+            self._numbers[key] = self._count_off(key)
+        return self._numbers[key]
+
+    def _count_off(self, chosen: tuple[int, ...]) -> tuple[Any, Any]:
+        counts = [self.counts[cloud] for cloud in chosen]
+        total = int(sum(counts))
+        number = dr.arange(mi.UInt32, total)
+        if len(chosen) == 1:
+            return dr.zeros(mi.UInt32, total), number + dr.opaque(mi.UInt32, self.first[chosen[0]])
+        begins = np.cumsum(counts) - counts
+        owner = dr.zeros(mi.UInt32, total)
+        # Clouds without Gaussians share a start with the next one: count each start as often as it occurs.
+        starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
+        if len(starts):
+            repeats, starts = (wrapped(mi.UInt32, values.astype(np.uint32)) for values in (repeats, starts))
+            dr.scatter(owner, repeats, starts)
+            owner = dr.cumsum(owner)
+        if total and not counts[0]:  # those without Gaussians before the first that has some
+            owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
+        shift = wrapped(mi.Int32, (np.array([self.first[cloud] for cloud in chosen]) - begins).astype(np.int32))
+        local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, shift, owner))
+        dr.eval(owner, local)
+        return owner, local
 
 
 def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
@@ -65,17 +99,17 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     if len(clouds) == 1:
         (c,) = clouds
         return CloudSet(counts, first, c.geometry, c.scales, c.sh, c.sh_count, c.sh_stride)
-    total = sum(counts)
     stride = max(c.sh_stride for c in clouds)
-    geometry, scales = dr.empty(mi.Float, 8 * total), dr.empty(mi.Float, 4 * total)
-    sh = dr.zeros(mi.Float, stride * total)
-    for start, c in zip(first, clouds, strict=True):
-        if c.count == 0:
-            continue
-        for target, source, width in ((geometry, c.geometry, 8), (scales, c.scales, 4)):
-            dr.scatter(target, source, dr.arange(mi.UInt32, c.count * width) + start * width)
-        i = dr.arange(mi.UInt32, c.count * c.sh_stride)
-        dr.scatter(sh, c.sh, (i // c.sh_stride + start) * stride + i % c.sh_stride)
+    geometry, scales = concatenated([c.geometry for c in clouds]), concatenated([c.scales for c in clouds])
+    if all(c.sh_stride == stride for c in clouds):
+        sh = concatenated([c.sh for c in clouds])
+    else:
+        sh = dr.zeros(mi.Float, stride * sum(counts))
+        for start, c in zip(first, clouds, strict=True):
+            i = dr.arange(mi.UInt32, c.count * c.sh_stride)
+            # Opaque, so that another set of clouds reuses the compiled kernels.
+            row = i // c.sh_stride + dr.opaque(mi.UInt32, start)
+            dr.scatter(sh, c.sh, row * stride + i % c.sh_stride, mode=dr.ReduceMode.Permute)
     dr.eval(geometry, scales, sh)
     return CloudSet(counts, first, geometry, scales, sh, max(c.sh_count for c in clouds), stride)
 
@@ -88,40 +122,19 @@ default would write the number of Gaussians into the kernels, and compile them a
 def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
     """Placement rows on the device, and for every Gaussian of every placement its row and its number in the clouds."""
     rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
-    counts = [clouds.counts[p.cloud] for p in placements]
-    for row, placement in zip(rows, placements, strict=False):
-        matrix = np.asarray(placement.world_from_cloud, dtype=np.float64)
-        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-        camera_from_cloud = view.world_from_camera[:3, :3].T @ (matrix[:3, :3] / scale)
-        centre = np.linalg.solve(matrix[:3, :3], view.world_from_camera[:3, 3] - matrix[:3, 3])
+    if placements:
+        matrix = np.array([p.world_from_cloud for p in placements], dtype=np.float64)
+        turn, shift = matrix[:, :3, :3], matrix[:, :3, 3]
+        scale = np.cbrt(np.linalg.det(turn))
+        pose = view.world_from_camera
+        centre = np.linalg.solve(turn, (pose[:3, 3] - shift)[..., None])[..., 0]
         coarse = centre.astype(np.float32)
-        row[:9] = camera_from_cloud.ravel()
-        row[9] = scale
-        row[10] = placement.instance
-        row[12:15] = coarse
-        row[16:19] = centre - coarse
-    total = int(sum(counts))
-    if len(placements) == 1:
-        local = dr.arange(mi.UInt32, total) + dr.opaque(mi.UInt32, clouds.first[placements[0].cloud])
-        return wrapped(mi.Float, rows), dr.zeros(mi.UInt32, total), local
-    ends = np.cumsum(counts)
-    begins = ends - counts
-    number = dr.arange(mi.UInt32, total)
-    owner = dr.zeros(mi.UInt32, total)
-    shift = np.array([clouds.first[p.cloud] for p in placements], dtype=np.int64) - begins
-    marks = dr.zeros(mi.UInt32, total)
-    inner = [int(b) for b, n in zip(begins, counts, strict=True) if 0 < b < total and n]
-    if inner:
-        # Placements without Gaussians share a start with the next one: count each start as often as it occurs.
-        starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
-        dr.scatter(marks, mi.UInt32(repeats.astype(np.uint32)), mi.UInt32(starts.astype(np.uint32)))
-        owner = dr.cumsum(marks)
-    if total and not counts[0]:  # those without Gaussians before the first that has some
-        owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
-    offsets = wrapped(mi.Int32, shift.astype(np.int32))
-    local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, offsets, owner))
-    dr.eval(owner, local)
-    return wrapped(mi.Float, rows), owner, local
+        rows[:, :9] = (pose[:3, :3].T @ (turn / scale[:, None, None])).reshape(-1, 9)
+        rows[:, 9] = scale
+        rows[:, 10] = [p.instance for p in placements]
+        rows[:, 12:15] = coarse
+        rows[:, 16:19] = centre - coarse
+    return wrapped(mi.Float, rows), *clouds.numbers([p.cloud for p in placements])
 
 
 class Projector:

@@ -175,7 +175,7 @@ class _TraceScene:
         instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
         return cls(
             ray_scene({"mesh": mesh, **others}),
-            mi.ShapePtr(mesh),
+            dr.opaque(mi.ShapePtr, mesh),  # its number would be written into kernels, and changes with every layout
             wrapped(mi.UInt32, instances.astype(np.uint32)),
             positions,
             wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),

@@ -32,6 +32,9 @@ MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Widths of the canvas around the image that are tried, in images. One image on each side is BOP's; where lens
 distortion cannot be inverted that far out, the widest is taken where it can."""
 
+_ROWS_OF_COLUMN = (np.arange(1 << TILE)[:, None] >> np.arange(TILE) & 1).astype(bool)
+"""Which pixels of a column of a tile, from the top, the bits of a number cover."""
+
 _INVERTED = 0.01
 """How near to itself a pixel must come back through the inverted distortion [px]."""
 
@@ -218,23 +221,24 @@ def _assemble(
 ) -> dict[int, Silhouette]:
     """Masks of whole instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE)
-    blocks = np.unpackbits(columns[..., None], axis=2, count=TILE, bitorder="little").swapaxes(
-        1, 2
-    )  # pair, row, column
+    chosen = np.flatnonzero(columns.any(axis=1))
+    chosen = chosen[np.argsort(slot[chosen], kind="stable")]
+    tile, columns = tile[chosen], columns[chosen]
+    blocks = _ROWS_OF_COLUMN[columns].swapaxes(1, 2)  # pair, row, column
     rows, cols = tile // canvas.tiles_x, tile % canvas.tiles_x
     found = {}
-    for number, instance in enumerate(ids):
-        chosen = np.flatnonzero((slot == number) & columns.any(axis=1))
-        if not len(chosen):
+    ends = np.searchsorted(slot[chosen], np.arange(len(ids) + 1))
+    for instance, start, stop in zip(ids.tolist(), ends[:-1], ends[1:], strict=True):
+        if start == stop:
             continue
-        y, x = rows[chosen], cols[chosen]
+        y, x = rows[start:stop], cols[start:stop]
         y0, x0 = int(y.min()), int(x.min())
-        grid = np.zeros((int(y.max()) - y0 + 1, int(x.max()) - x0 + 1, TILE, TILE), dtype=bool)
-        grid[y - y0, x - x0] = blocks[chosen]
-        mask = grid.swapaxes(1, 2).reshape(grid.shape[0] * TILE, grid.shape[1] * TILE)
+        grid = np.zeros((int(y.max()) - y0 + 1, TILE, int(x.max()) - x0 + 1, TILE), dtype=bool)
+        grid[y - y0, :, x - x0] = blocks[start:stop]
+        mask = grid.reshape(grid.shape[0] * TILE, grid.shape[2] * TILE)
         mask = mask[: canvas.height - y0 * TILE, : canvas.width - x0 * TILE]
         if mask.any():
-            found[int(instance)] = Silhouette.cropped(mask, x0 * TILE - left, y0 * TILE - top)
+            found[instance] = Silhouette.cropped(mask, x0 * TILE - left, y0 * TILE - top)
     return found
 
 

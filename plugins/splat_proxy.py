@@ -401,7 +401,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _still_layer(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> StillLayer | None:
         """What is static as seen from here, from the second time that the camera is in the same place."""
         static = [p for p in contents.placements if p.instance == 0]
-        if not static or len(static) == len(contents.placements):
+        bare = contents.clouds is None or not any(contents.clouds.counts[p.cloud] for p in static)
+        if bare or len(static) == len(contents.placements):
             return None
         fixed = [s for s in contents.shapes if getattr(s, "instance", 0) == 0]
         if not self.hide_emitters:

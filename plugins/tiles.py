@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import MissingResourceError
+from mitsplat.plugins.device import concatenated
 from mitsplat.plugins.gaussian import RECORD, conic_touches_rectangle, ellipse_span
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import View
@@ -169,7 +170,7 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
     """
     visible = dr.width(first.records) // RECORD
     both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
-    record, place, level = (dr.concat(parts) for parts in zip(*both, strict=True))
+    record, place, level = (concatenated(parts) for parts in zip(*both, strict=True))
     pairs = _Pairs(record, place, level, None)
     records, near = second.records, second.near
     if near is not None and first.near is not None:
@@ -177,8 +178,8 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
         row, before = dr.arange(mi.UInt32, second.visible) * RECORD, dr.opaque(mi.Float, dr.width(first.near) // RECORD)
         shifted, at_camera = dr.copy(records), dr.gather(mi.Float, records, row + 2) < 0
         dr.scatter(shifted, dr.gather(mi.Float, records, row) + before, row, at_camera)
-        records, near = shifted, dr.concat([first.near, near])
-    records = dr.concat([first.records, records])
+        records, near = shifted, concatenated([first.near, near])
+    records = concatenated([first.records, records])
     near = first.near if near is None else near
     return _listed(records, near, pairs, visible + second.visible, dr.width(tiles), view, None, tiles)
 

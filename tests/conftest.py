@@ -20,6 +20,9 @@ from mitsplat.cache import cache_folder
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.dataset.write import write_dataset
+from mitsplat.device import Lack, use_device, visible_gpus
+from mitsplat.errors import MissingResourceError
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.physics.settle import warp_settings
 from mitsplat.scene.scene import Scene, load_scene
 from mitsplat.scene.spec import FORMATS
@@ -33,6 +36,39 @@ WriteScene = Callable[..., Path]
 # The same examples in every run, however slow: new ones are for benchmarks/scale/fuzz.py.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("suite")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", choices=("cpu", "cuda"), default="cpu", help="What the tests render on.")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--device") != "cpu":
+        try:
+            use_device(config.getoption("--device"))
+        except MissingResourceError as error:
+            raise pytest.UsageError(str(error)) from error
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    mark = item.get_closest_marker("cpu")
+    if mark is not None and item.config.getoption("--device") != "cpu":
+        pytest.skip(f"holds on the CPU alone: {mark.kwargs['reason']}")
+
+
+@pytest.fixture(autouse=True)
+def no_lost_rays() -> Iterator[None]:
+    """Whatever a test renders on a GPU, and looks at however late, it renders with all rays."""
+    yield
+    refuse_lost_rays()
+
+
+@pytest.fixture(scope="session")
+def gpu() -> None:
+    """Skips what needs a GPU where there is none."""
+    gpus = visible_gpus()
+    if isinstance(gpus, Lack):
+        pytest.skip(gpus.what)
 
 
 def box_asset(name: str, size: tuple[float, float, float] = (0.02, 0.03, 0.01), class_name: str | None = None) -> Asset:

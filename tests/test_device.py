@@ -1,6 +1,5 @@
 """Devices by their names: what is refused, what ``auto`` chooses, and which GPU a process takes."""
 
-import ctypes
 import uuid
 
 import mitsuba as mi

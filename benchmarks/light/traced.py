@@ -76,6 +76,7 @@ class Pictures:
         for frame in self.frames:
             start = time.process_time()
             layers.append(render_layers(integrator, *frame, seed=seed))
+            dr.sync_thread()
             seconds.append(time.process_time() - start)
         return layers, seconds
 

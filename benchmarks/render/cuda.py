@@ -1,8 +1,9 @@
 """The renderer on a GPU, stage by stage, beside gsplat and Mitsuba's own splat path on the same splats.
 
-    python -m benchmarks.render.cuda [--captures FOLDER] [--no-volprim]
+    python -m benchmarks.render.cuda [--captures FOLDER] [--no-volprim] [--frames 30]
 
-gsplat and PyTorch are used when they are installed. Times are medians of synchronised repeats.
+gsplat and PyTorch are used when they are installed. Times are medians of synchronised repeats. Stages of whole frames
+are those of one process and one layout of the default scene; ``--frames 0`` leaves them out, and the settling.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ import mitsuba as mi
 import numpy as np
 
 # isort: on
-from benchmarks.record import figure, recording
+from benchmarks.record import ROOT, figure, recording
+from benchmarks.render.frame import time_frames
 from mitsplat.colour import encode_srgb
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.quality import resolve_quality
@@ -73,7 +75,13 @@ def time_ours(splats: Splats) -> None:
         marching, whole = median_ms(run_march, dr.sync_thread), median_ms(run_all, dr.sync_thread)
         print(f"mitsplat {name}: whole {whole:.2f} ms (project, bin, sort {binning:.2f}, march {marching:.2f}), "
               f"{lists.visible} visible, {lists.pairs} pairs")  # fmt: skip
-        for part, milliseconds in {"whole": whole, "bin": binning, "march": marching}.items():
+
+        def run_picture(name=name) -> np.ndarray:
+            return render_splats(splats, CAMERA, quality=name).rgb
+
+        pictured = median_ms(run_picture, dr.sync_thread)
+        print(f"  render_splats with its picture on the host: {pictured:.2f} ms")
+        for part, milliseconds in {"whole": whole, "bin": binning, "march": marching, "picture": pictured}.items():
             figure(milliseconds, "ms", name, part)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
@@ -115,6 +123,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--captures", type=Path, default=CAPTURES)
     parser.add_argument("--no-volprim", action="store_true")
+    parser.add_argument("--frames", type=int, default=30)
     options = parser.parse_args()
     mi.set_variant("cuda_ad_rgb")
     with recording("render.cuda", parser, options, ignore=("captures",), gpu=True):
@@ -127,6 +136,8 @@ def measure(options: argparse.Namespace) -> None:
     figure(len(splats), "", "gaussians")
     print(f"{name}, {CAMERA.width}x{CAMERA.height}")
     time_ours(splats)
+    if options.frames:
+        time_frames(ROOT / "scenes/workcell.yaml", options.frames, {})
     if not options.no_volprim:
         scene = volprim_scene(splats, CAMERA)
         milliseconds = median_ms(lambda: render_volprim(scene), dr.sync_thread, 3)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import ctypes
+import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from mitsplat.cache import cache_folder
+from mitsplat.device import Lack, gpu_environment, visible_gpus
 from mitsplat.engine.resources import unused_memory
 from mitsplat.findings import Finding
 from mitsplat.llvm import OLDEST_USABLE, VARIABLE
@@ -27,18 +29,6 @@ NEEDED_MEMORY = 2.5
 NEEDED_DISK = 0.5
 """Twice a dataset of a thousand frames of 0.25 MB [GiB]. What a first run compiles and keeps is little beside it, see
 ``python -m benchmarks.scale.first_run``."""
-
-
-TRIAL = """
-import hashlib
-import mitsuba as mi, drjit as dr, numpy as np
-mi.set_variant("llvm_ad_rgb")
-scene = mi.cornell_box()
-scene["sensor"]["film"] |= {"width": 16, "height": 16}
-picture = mi.util.convert_to_bitmap(mi.render(mi.load_dict(scene), spp=4))
-print(".".join(map(str, dr.detail.llvm_version())), hashlib.sha256(np.array(picture)).hexdigest()[:16])
-"""
-"""A tiny picture in a process of its own, because an unusable LLVM does not raise: it aborts."""
 
 
 def examine() -> Iterator[Finding]:
@@ -65,12 +55,22 @@ def _package(name: str) -> Finding:
 def _llvm() -> Finding:
     path = os.environ.get(VARIABLE) or "the system's libLLVM"
     remedy = f"pip install karellen-llvm-core, or set {VARIABLE} to a libLLVM of version {OLDEST_USABLE} or newer"
-    trial = subprocess.run([sys.executable, "-c", TRIAL], capture_output=True, text=True, check=False)
-    if trial.returncode == 0:
-        number, digest = trial.stdout.split()[-2:]
-        return Finding("LLVM", True, f"{number} from {path} renders a picture with the SHA-256 {digest}...")
-    said = (trial.stderr.strip().splitlines() or [f"exit status {trial.returncode}"])[-1]
-    return Finding("LLVM", False, f"{path} does not render ({said})", remedy)
+    number, fault = _try("cpu", {})
+    if fault:
+        return Finding("LLVM", False, f"{number or 'LLVM'} from {path} {fault}", remedy)
+    return Finding("LLVM", True, f"{number} from {path} renders the trial scene as it is known")
+
+
+def _try(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
+    """The version of LLVM, and what is wrong with the picture of a trial on a device, if anything is."""
+    command = [sys.executable, "-m", "mitsplat.checks.trial", device]
+    done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        return "", f"does not render ({said})"
+    found = json.loads(done.stdout.splitlines()[-1])
+    faults = "; ".join(found["faults"])
+    return found["llvm"], f"renders the trial scene wrong ({faults})" if faults else ""
 
 
 def _processor() -> Finding:
@@ -89,19 +89,26 @@ def _processor() -> Finding:
 
 
 def _cuda() -> Finding:
-    """A GPU is not needed; half of one is worth a word."""
-    found = {name: _loads(library) for name, library in (("CUDA", "libcuda.so.1"), ("OptiX", "libnvoptix.so.1"))}
-    text = ", ".join(f"{name} {'found' if there else 'absent'}" for name, there in found.items())
-    remedy = "install the whole driver: without libnvoptix.so.1 the variant cuda_ad_rgb cannot trace rays"
-    return Finding("GPU", found["OptiX"] or not found["CUDA"], f"{text} (optional)", remedy)
+    """A GPU is not needed; half of one, or one that renders wrong, is worth a word."""
+    gpus = visible_gpus()
+    if isinstance(gpus, Lack):
+        return Finding("GPU", "OptiX" not in gpus.what, f"{gpus.what} (optional)", gpus.remedy)
+    driver, texts, ok = _driver(), [], True
+    for gpu in gpus:
+        _, fault = _try("cuda", gpu_environment(gpu))
+        texts.append(f"{gpu.name} {fault or 'renders the trial scene as the CPU does'}")
+        ok = ok and not fault
+    remedy = "update NVIDIA's driver; until this line is well, render on the CPU"
+    return Finding("GPU", ok, f"{'; '.join(texts)} (driver {driver} with OptiX; optional)", remedy)
 
 
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
+def _driver() -> str:
+    """The release of NVIDIA's driver."""
+    with suppress(OSError):
+        found = re.search(r" (\d+\.[\d.]+) ", Path("/proc/driver/nvidia/version").read_text())
+        if found:
+            return found[1]
+    return "of an unknown release"
 
 
 def _disk() -> Finding:

@@ -6,6 +6,7 @@ Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -13,6 +14,7 @@ from typing import Annotated
 import typer
 
 from mitsplat.cli import assets, datasets, fault
+from mitsplat.device import LateDeviceError
 from mitsplat.errors import exit_status, sentence_of
 from mitsplat.version import __version__
 
@@ -49,12 +51,16 @@ for _command in (
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line and exit.
 
+    A GPU that another one hides from Dr.Jit is taken by beginning again, with only that one visible.
+
     Args:
         args: Arguments; those of the process if None.
     """
     try:
         app(args)
     except Exception as error:  # noqa: BLE001 - the last one who can tell the user
+        if args is None and isinstance(error, LateDeviceError):
+            os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | error.environment)
         status = exit_status(error)
         typer.echo(f"mitsplat: {fault.tell_fault(error) if status is None else sentence_of(error)}", err=True)
         sys.exit(fault.STATUS if status is None else status)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mitsplat.cli.options import Seed, progress_bar, stage_bar
+from mitsplat.cli.options import DeviceName, Seed, progress_bar, stage_bar, take_device
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
@@ -78,6 +78,7 @@ def bake(
     any_size: Annotated[
         bool, typer.Option("--any-size", help="Bake an object of less than 1 mm or more than 5 m as well.")
     ] = False,
+    device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
     """Turn MESH into an asset.
@@ -96,6 +97,7 @@ def bake(
         raise InputError(f"--seed must be >= 0 (got {seed})")
     settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
     finish = Finish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
+    take_device(device)
     with stage_bar() as progress:
         result = bake_asset(
             mesh,
@@ -154,6 +156,7 @@ def fit(
     exposure: Annotated[
         bool, typer.Option("--exposure/--no-exposure", help="Give each photo a colour correction of its own.")
     ] = False,
+    device: DeviceName = "cpu",
     seed: Seed = 0,
     overwrite: Annotated[
         bool,
@@ -191,6 +194,7 @@ def fit(
         seed=seed,
     )
     loaded = Capture.load(capture)
+    take_device(device)
     maps = None if depths is None else find_maps(depths, loaded.training, depth_kind)
     if depth_model is not None:
         with progress_bar("photos/s") as show:
@@ -310,6 +314,7 @@ def mesh(
     ] = None,
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
     refine: Refine = False,
+    device: DeviceName = "cpu",
 ) -> None:
     """Make an asset of SPLATS that were fitted to CAPTURE.
 
@@ -337,6 +342,7 @@ def mesh(
         settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
     )
+    take_device(device)
     with progress_bar("steps") as progress:
         done = make_asset(capture, splats, out, job, progress=progress)
     _tell_asset(done)
@@ -359,6 +365,7 @@ def asset(
     edge: Edge = 800,
     faces: Faces = 10000,
     refine: Refine = False,
+    device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
     """Make an asset of PHOTOS.
@@ -381,6 +388,7 @@ def asset(
             surface=SurfaceSettings(faces=faces), size=size, refine=MeshRefineSettings(seed=seed) if refine else None
         ),
     )
+    take_device(device)
     with progress_bar("steps") as progress:
         done = make_photo_asset(
             photos,

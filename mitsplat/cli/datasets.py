@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
-from mitsplat.cli.options import JsonLog, command_log, progress_bar
+from mitsplat.cli.options import DeviceName, JsonLog, command_log, progress_bar, take_device, tell_device
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.quality import PresetName
 
@@ -45,8 +45,21 @@ def render(
         float | None,
         typer.Option(help="Choose the cheapest preset within this error (RMSE of encoded colours), as `chart` does."),
     ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Render on the cpu, or on GPUs: cuda, cuda:1, cuda:all, or auto if there is one; cpu if absent.",
+        ),
+    ] = None,
+    any_device: Annotated[
+        bool, typer.Option("--any-device", help="Go on with a dataset that was begun on the other kind of device.")
+    ] = False,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that make images; as many as turn out to pay if absent.")
+        int | None,
+        typer.Option(
+            help="Processes that make images; if absent, as many as turn out to pay, on GPUs as there is room for."
+        ),
     ] = None,
     engine: Annotated[
         Literal["local", "ray"], typer.Option(help="Make images on this machine, or on a Ray cluster.")
@@ -57,7 +70,8 @@ def render(
     resources: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME=AMOUNT,...", help="What a worker on the cluster reserves, such as CPU=4; CPU=2 if absent."
+            metavar="NAME=AMOUNT,...",
+            help="What a worker on the cluster reserves, such as CPU=4; if absent, CPU=2, or CPU=1,GPU=0.125 on cuda.",
         ),
     ] = None,
     shard: Annotated[
@@ -78,16 +92,21 @@ def render(
 
     Options replace what the file says. A Mitsuba scene (.xml) gives one picture.
     """
+    from mitsplat.device import find_device
+
     with command_log(json_log, "render") as progress_bars:
         overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
         if out is None:
             out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
+        chosen = find_device(device or "cpu") if engine == "local" else None
+        if chosen is not None and not json_log:
+            tell_device(chosen)
         if scene.suffix == ".xml":
             if overrides or frames is not None or tolerance is not None or shard is not None:
                 raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
             from mitsplat.frames.mitsuba_xml import render_apart
 
-            typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside)}")
+            typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")
             return
         from mitsplat.dataset.folder import Shard
         from mitsplat.dataset.write import write_dataset
@@ -97,7 +116,10 @@ def render(
         part = None if shard is None else Shard.parse(shard)
         if engine != "ray" and (address is not None or resources is not None):
             raise InputError("--address and --resources are of a cluster: give --engine ray as well")
-        cluster = Cluster(address, Cluster.parse_resources(resources or "CPU=2")) if engine == "ray" else None
+        cluster = None
+        if engine == "ray":
+            cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
+            cluster.on_device(device)  # refuses what contradicts it
         loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
         if tolerance is not None:
             if quality is not None:
@@ -108,7 +130,12 @@ def render(
             refuse(loaded, run_faults(loaded))
             with progress_bars() as progress:
                 best = choose_preset(
-                    scene, tolerance, overrides=overrides, allow_outside=allow_outside, progress=progress
+                    scene,
+                    tolerance,
+                    overrides=overrides,
+                    allow_outside=allow_outside,
+                    progress=progress,
+                    device=chosen,
                 )
             typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
             loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
@@ -122,6 +149,8 @@ def render(
                 cluster=cluster,
                 overwrite=overwrite,
                 progress=progress,
+                device=device if chosen is None else chosen,
+                any_device=any_device,
             )
         _tell_dataset(summary, whole=part is None)
 
@@ -169,23 +198,33 @@ def chart(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Chart to write (.png); a .csv of the same name goes beside it.")
     ] = Path("chart.png"),
+    device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
     """Chart speed against accuracy for SCENE.
 
-    Every preset, and cheaper models of light, beside the preset exact. Times are those of this machine, now.
+    Every preset, and cheaper models of light, beside the preset exact. Times are those of this machine, now; memory is
+    the machine's, not a GPU's.
     """
     from rich.console import Console
     from rich.table import Table
 
+    from mitsplat.device import find_device
     from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
     check_tolerance(tolerance)
+    chosen = find_device(device)
+    tell_device(chosen)
     with progress_bar() as progress:
         rows = measure_steps(
-            scene, frames=frames, overrides=_overrides(size=size), allow_outside=allow_outside, progress=progress
+            scene,
+            frames=frames,
+            overrides=_overrides(size=size),
+            allow_outside=allow_outside,
+            progress=progress,
+            device=chosen,
         )
     best = cheapest(rows, tolerance)
     table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "SSIM", "mask IoU", "peak [GiB]")
@@ -243,6 +282,7 @@ def preview(
     layers: Annotated[
         bool, typer.Option("--layers/--no-layers", help="Show ids, depth, light and highlight beside the picture.")
     ] = True,
+    device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
     """Render one frame of SCENE to a picture, with its layers side by side."""
@@ -259,6 +299,7 @@ def preview(
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
     refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
+    take_device(device)
     rendered = render_frame(loaded, frame)
     Image.fromarray(layer_sheet(rendered) if layers else rendered.image).save(out)
     typer.echo(f"picture: {out}")

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,12 +15,35 @@ from mitsplat.cli import fault
 from mitsplat.errors import exit_status, sentence_of
 from mitsplat.progress import Progress
 
+if TYPE_CHECKING:
+    from mitsplat.device import Device
+
+DeviceName = Annotated[
+    str,
+    typer.Option(
+        "--device", metavar="NAME", help="Render on the cpu, or on a GPU: cuda, cuda:1, or auto if there is one."
+    ),
+]
+
 Seed = Annotated[int, typer.Option(help="Decides everything that is random.")]
 
 JsonLog = Annotated[
     bool,
     typer.Option("--json", help="Log to stderr for machines: an event a line, as a JSON object, instead of a bar."),
 ]
+
+
+def take_device(name: str) -> None:
+    """Compute on a device from now on; why ``auto`` chose it is said."""
+    from mitsplat.device import use_device  # most commands do without
+
+    tell_device(use_device(name))
+
+
+def tell_device(device: Device) -> None:
+    """Say in one line which device ``auto`` chose, and why."""
+    if device.reason:
+        typer.echo(f"device: {device}, as {device.reason}", err=True)
 
 
 @contextmanager

@@ -25,9 +25,12 @@ from mitsplat.formats.registry import TABLE, Catalogue, CollectionWriter
 from mitsplat.version import __version__
 
 if TYPE_CHECKING:
+    from mitsplat.device import Kind
     from mitsplat.scene.scene import Scene
 
 CONTENT = "dataset.json"
+IMPLIED = {FORMAT_VERSION: 1, "device": "cpu"}
+"""What it means where it does not say so."""
 MANIFEST = "manifest.jsonl"
 TIMINGS = "timings.jsonl"
 RUNS = "runs.jsonl"
@@ -96,6 +99,7 @@ def open_folder(
     *,
     resume: bool,
     overwrite: bool,
+    any_device: bool = False,
 ) -> Iterator[Manifest]:
     """Lock and prepare the folder of a dataset; its manifest, without the frames that miss a file.
 
@@ -106,6 +110,7 @@ def open_folder(
         shard: For ``shard.json``, or None.
         resume: Whether a dataset may be there already.
         overwrite: Remove it first.
+        any_device: Whether it may have been begun on another device.
 
     Raises:
         InputError: If the folder cannot be written, is in use, or holds something else.
@@ -126,7 +131,7 @@ def open_folder(
                 lock.flush()
                 if overwrite:
                     _remove_dataset(out)
-                _check_resumable(out, content, shard, resume=resume)
+                _check_resumable(out, content, shard, resume=resume, any_device=any_device)
                 _prepare(out, scene_file, content, shard)
                 yield Manifest(out / MANIFEST, keep=lambda record: missing_file(out, record) is None)
         finally:
@@ -217,16 +222,24 @@ def _check_own(out: Path) -> None:
     check_format_version(present, FORMAT_VERSIONS[CONTENT], out / CONTENT)
 
 
-def _check_resumable(out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool) -> None:
-    """Refuse to continue a dataset against the caller's will, or one that another scene began."""
+def _check_resumable(
+    out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool, any_device: bool
+) -> None:
+    """Refuse to continue a dataset against the caller's will, or one that another scene or device began."""
     if not (out / CONTENT).exists():
         return
     if not resume:
         raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
-    present = {FORMAT_VERSION: 1, **json.loads((out / CONTENT).read_bytes())}
-    if difference := first_difference({**present, "libraries": None}, {**content, "libraries": None}):
+    present = {**IMPLIED, **json.loads((out / CONTENT).read_bytes())}
+    elsewhere: dict[str, Any] = {"libraries": None, "device": None}
+    if difference := first_difference({**present, **elsewhere}, {**content, **elsewhere}):
         key, before, now = difference
         raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
+    if present["device"] != content["device"] and not any_device:
+        raise InputError(
+            f"{out} cannot be resumed on the device {content['device']}: it was begun on {present['device']}, whose "
+            f"pictures differ a little; give --device {present['device']}, or --any-device for frames of both"
+        )
     stored = read_shard(out)
     if stored != shard:
         before, now = (f"shard {part['shard']}/{part['of']}" if part else "a whole dataset" for part in (stored, shard))
@@ -282,11 +295,12 @@ def _remove_partial(out: Path) -> None:
                 (Path(folder) / name).unlink(missing_ok=True)
 
 
-def content_of(scene: Scene, catalogue: Catalogue) -> dict[str, Any]:
+def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, Any]:
     """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
+        "device": device,
         "mitsplat": __version__,
         "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
         "classes": list(scene.class_names),

@@ -54,6 +54,7 @@ class _Content(_Stored):
     keypoints: list[list[str]]
     assets: list[str]
     libraries: dict[str, str]
+    device: Literal["cpu", "cuda"] = "cpu"
 
 
 class _Camera(_Stored):

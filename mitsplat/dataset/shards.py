@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mitsplat.dataset.folder import (
+    IMPLIED,
     RUNS,
     TIMINGS,
     finish_folder,
@@ -25,7 +26,6 @@ from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
 from mitsplat.files import Record, file_inside, link_file, write_file
-from mitsplat.format_version import FORMAT_VERSION
 from mitsplat.formats.registry import Catalogue
 from mitsplat.progress import Progress
 
@@ -87,7 +87,7 @@ def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
     contents: list[dict[str, Any]] = []
     for folder in folders:
         read_content(folder)  # checks what the file itself, read next, says
-        contents.append({FORMAT_VERSION: 1, **json.loads((folder / "dataset.json").read_bytes())})
+        contents.append({**IMPLIED, **json.loads((folder / "dataset.json").read_bytes())})
         if difference := first_difference(contents[0], contents[-1]):
             key, one, other = difference
             raise InputError(

@@ -6,8 +6,8 @@
     annotations/instances_train.json, instances_val.json    data.yaml    contact_sheet.jpg
     manifest.jsonl    one line per frame: files and their SHA-256, camera, draws, labels with masks and poses
     timings.jsonl     seconds per stage; apart, so that equal datasets have equal manifests
-    runs.jsonl        the command of every run that made frames
-    dataset.json      what decides the content: effective scene, hashes of its inputs, version
+    runs.jsonl        the command of every run that made frames, and its device
+    dataset.json      what decides the content: effective scene, hashes of its inputs, kind of device, version
     shard.json        which part of the dataset this is, if it is one of several
     scene/            the scene file as it was given
     layouts/0000.json where the objects came to rest
@@ -32,6 +32,7 @@ from mitsplat.dataset.folder import RUNS, SHEET, TIMINGS, Shard, content_of, fin
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.prospects import refuse, run_faults
+from mitsplat.device import Device, current_device, find_device
 from mitsplat.engine.pool import run_frames
 from mitsplat.engine.ray import Cluster, run_on_ray
 from mitsplat.engine.resources import TYPICAL
@@ -85,12 +86,14 @@ def write_dataset(
     progress: Progress | None = None,
     render: Render | None = None,
     settle: Settle | None = None,
+    device: str | Device | None = None,
+    any_device: bool = False,
 ) -> DatasetSummary:
     """Render the first ``frames`` frames of a scene (default: all) into the dataset folder ``out``.
 
     Frames that are already there are kept if ``resume`` is set and they come from the same scene. The bytes of images,
     labels and manifest do not depend on ``workers``, ``cluster`` or interruptions, and those of all shards merged not
-    on their number.
+    on their number. They do on the kind of the device: pictures of a GPU differ a little from those of a CPU.
 
     Args:
         scene: What to render; sizes, formats and the seed are in ``scene.spec``.
@@ -105,12 +108,15 @@ def write_dataset(
         progress: Hears of every finished frame and of slow steps.
         render: What to use instead of :func:`mitsplat.frames.frame.render_frame`.
         settle: What to use instead of :func:`mitsplat.physics.settle.settle_layout`.
+        device: What frames are rendered on, as :mod:`mitsplat.device` names them; layouts are settled on CPUs. That of
+            this process if None, see :func:`mitsplat.use_device`, and on a cluster what its resources say.
+        any_device: Continue a dataset that was begun on the other kind of device.
 
     Raises:
         InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
             :mod:`mitsplat.dataset.prospects`), the folder cannot be written, is in use, holds something else, or holds
             a dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else.
-        MissingResourceError: If the disk is full.
+        MissingResourceError: If the disk is full, the device is not here, or memory does not suffice for one frame.
         PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
     """
     out = Path(out)
@@ -126,9 +132,15 @@ def write_dataset(
     wanted = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
     if render is None and settle is None:
         refuse(scene, run_faults(scene, wanted, out=out, workers=workers, elsewhere=cluster is not None))
-    content = content_of(scene, catalogue)
+    if cluster is not None:
+        chosen, cluster = cluster.on_device(device)
+    else:
+        chosen = current_device() if device is None else find_device(device)
+    content = content_of(scene, catalogue, chosen.kind)
     part = None if shard is None else shard.to_json(count)
-    with open_folder(out, content, scene.path, part, resume=resume, overwrite=overwrite) as manifest:
+    with open_folder(
+        out, content, scene.path, part, resume=resume, overwrite=overwrite, any_device=any_device
+    ) as manifest:
         layouts: dict[int, list[int]] = {}
         for index in wanted:
             if index not in manifest:
@@ -139,11 +151,14 @@ def write_dataset(
                 progress(len(manifest), max(len(wanted), len(manifest)), text)
 
         note("starting")
+        if chosen.reason:
+            note(f"device {chosen}: {chosen.reason}")
         if layouts:
             command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-            append_line(out / RUNS, {"command": command, "python": platform.python_version(), "workers": workers})
+            run = {"command": command, "python": platform.python_version(), "workers": workers, "device": chosen.kind}
+            append_line(out / RUNS, run | ({"gpus": [gpu.name for gpu in chosen.gpus]} if chosen.gpus else {}))
         make = FrameMaker(scene, catalogue, out, render or render_frame, settle or settle_layout)
-        with closing(_results(make, layouts, workers, cluster, note)) as results:
+        with closing(_results(make, layouts, workers, cluster, chosen, note)) as results:
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
@@ -154,12 +169,17 @@ def write_dataset(
 
 
 def _results(
-    make: FrameMaker, layouts: dict[int, list[int]], workers: int | None, cluster: Cluster | None, note: Note
+    make: FrameMaker,
+    layouts: dict[int, list[int]],
+    workers: int | None,
+    cluster: Cluster | None,
+    device: Device,
+    note: Note,
 ) -> Generator[tuple[Record, dict[str, float]]]:
     """Records of frames whose files are in the folder, and the seconds of their stages."""
     if cluster is None:
         memory = TYPICAL if workers is not None else worker_memory(make.scene)
-        with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory)) as made:
+        with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory, device=device)) as made:
             yield from made
         return
     with closing(run_on_ray(RemoteFrames(make), layouts, cluster, workers=workers, note=note)) as parcels:

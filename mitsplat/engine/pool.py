@@ -23,9 +23,18 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
+from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
+from mitsplat.engine.mps import SharedGpu, end_service
 from mitsplat.engine.resources import TYPICAL, WorkerMemory, unused_memory
 from mitsplat.engine.shared_arrays import SharedArrays
-from mitsplat.errors import InputError, MissingResourceError, PartialResultError, exit_status, sentence_of
+from mitsplat.errors import (
+    InputError,
+    MissingResourceError,
+    PartialResultError,
+    exit_status,
+    is_out_of_memory,
+    sentence_of,
+)
 from mitsplat.progress import Note
 
 Made = TypeVar("Made", covariant=True)
@@ -80,12 +89,14 @@ class Failure:
 
     Attributes:
         sentence: The class, if it is one whose message is for the user.
+        exhausted: Whether memory has run out.
     """
 
     sentence: type[Exception] | None
     kind: str
     message: str
     trace: str
+    exhausted: bool = False
 
     @classmethod
     def of(cls, error: Exception) -> Failure:
@@ -93,7 +104,7 @@ class Failure:
         sentence = next((kind for kind in _SENTENCES if isinstance(error, kind)), None)
         if sentence is None:  # what ends the command line with the same status
             sentence = {2: InputError, 3: MissingResourceError}.get(exit_status(error) or 0)
-        return cls(sentence, type(error).__name__, sentence_of(error), traceback.format_exc())
+        return cls(sentence, type(error).__name__, sentence_of(error), traceback.format_exc(), is_out_of_memory(error))
 
     def error(self, frame: int) -> Exception:
         """The exception to raise for it where the frames are wanted."""
@@ -143,6 +154,7 @@ def run_frames(
     workers: int | None = 1,
     note: Note,
     memory: WorkerMemory = TYPICAL,
+    device: Device | None = None,
 ) -> Generator[Result]:
     """Results of ``make`` for every frame, in the order in which they are finished.
 
@@ -150,12 +162,16 @@ def run_frames(
         make: Makes one frame. With workers it is sent to each of them once, by spawning: a script that gets here must
             guard its main part by ``if __name__ == "__main__"``.
         layouts: The frames to make, by layout.
-        workers: Processes to use; 1 makes the frames in this process, None as many as turn out to pay.
+        workers: Processes to use; 1 makes the frames in this process if that can compute on the device. None is as many
+            as turn out to pay on CPUs, and at once as many as there are cores and memory for on GPUs.
         note: Hears what is being done.
         memory: What a worker takes, by which their number is limited if it is left to the engine.
+        device: What frames are computed on; each worker takes it first, one of the GPUs in turn. None for work that
+            does without.
 
     Raises:
         InputError: If a frame finds its input at fault.
+        MissingResourceError: If a frame does not fit into memory that a worker has for itself.
         FrameError: If a frame fails otherwise in a worker.
         LostWorkersError: If :data:`MOST_LOSSES` workers died of one frame. Workers are stopped before anything is
             raised, and when the iterator is closed.
@@ -163,30 +179,50 @@ def run_frames(
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1 (got {workers})")
     total = sum(map(len, layouts.values()))
-    most = affordable_workers(memory) if workers is None else workers
-    if min(most, total) <= 1 or (workers is None and total <= _FEW):
+    most = affordable_workers(memory, device) if workers is None else workers
+    few = min(most, total) <= 1 or (workers is None and total <= _FEW)
+    if few and (device is None or device.is_here):
+        if device is not None and device != current_device():
+            use_device(device)
         for frames in layouts.values():
             for index in frames:
-                yield make(index, note)
+                try:
+                    made = make(index, note)
+                except (RuntimeError, MemoryError) as error:
+                    if is_out_of_memory(error):
+                        raise _too_large(index, sentence_of(error)) from error
+                    raise
+                yield made
         return
-    with closing(_Processes(make)) as pool, closing(run_pool(pool, layouts, most, note, grow=workers is None)) as found:
+    # Starting workers one by one would take longer on a GPU than most runs do.
+    grow = workers is None and (device is None or not device.gpus)
+    shared = SharedGpu() if device is not None and 0 < len(device.gpus) < most else None
+    if shared is not None and shared.lack:
+        note(f"workers take turns on the GPU, because {shared.lack}")
+    with (
+        closing(_Processes(make, device, shared)) as pool,
+        closing(run_pool(pool, layouts, most, note, grow=grow)) as found,
+    ):
         yield from found
 
 
-def run_apart(make: MakeFrame[Result]) -> Generator[Result]:
+def run_apart(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:
     """The result of ``make`` for frame 0, in a process of its own.
 
     Raises:
-        InputError, FrameError, LostWorkersError: As :func:`run_frames`.
+        InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
-    with closing(_Processes(make)) as pool:
+    with closing(_Processes(make, device)) as pool:
         yield from run_pool(pool, {0: [0]}, 1, lambda text: None)
 
 
-def affordable_workers(memory: WorkerMemory) -> int:
-    """Most worker processes that this machine has cores and unused memory for, at least 1."""
+def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:
+    """Most worker processes that this machine has cores and unused memory for, and its GPUs memory, at least 1."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own)))
+    most = min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own))
+    if device is not None and device.gpus:
+        most = min(most, len(device.gpus) * int(min(gpu.memory for gpu in device.gpus) / memory.gpu))
+    return max(1, most)
 
 
 def run_pool(
@@ -195,7 +231,8 @@ def run_pool(
     """Results of the pool's workers for every frame, in the order in which they are finished.
 
     A worker gets its next frame when it has finished one, so results do not pile up while the caller is busy. A lost
-    one is replaced only if it was the last, because memory is what it most likely died of, or where machines join.
+    one is replaced only if it was the last, because memory is what it most likely died of, or where machines join. One
+    that says that memory has run out is replaced only if another one has gone since it began the frame.
 
     Args:
         pool: Starts and hears the workers.
@@ -205,15 +242,18 @@ def run_pool(
         grow: Begin with one worker, and start the next only when the last one made the run faster.
 
     Raises:
-        InputError, FrameError, LostWorkersError: As :func:`run_frames`.
+        InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
     plan = _Plan(layouts)
     most = min(most, plan.left)
     growth = _Growth(most)
     losses: Counter[int] = Counter()
     at_work: dict[int, int] = {}
+    gone = 0
+    staff: dict[int, int] = {}  # and how many others had gone when each was given its frame
 
     def assign(worker: int) -> None:
+        staff[worker] = gone
         if (task := plan.take(worker)) is not None:
             at_work[worker] = task[1]
             pool.give(worker, task[1], task[0])
@@ -226,11 +266,28 @@ def run_pool(
                 note(answer.text)
                 continue
             if worker not in at_work:
+                staff.pop(worker, None)  # died while there was nothing to do for it
                 continue
             frame = at_work.pop(worker)
-            if isinstance(answer, Failure):
+            if isinstance(answer, Failure) and not answer.exhausted:
                 raise answer.error(frame)
+            if isinstance(answer, Failure):
+                plan.put_back(worker, frame)
+                pool.stop(worker)
+                grow = False
+                if staff.pop(worker) < gone:  # what it lacked may be free by now
+                    assign(pool.start())
+                    continue
+                if not staff:
+                    raise _too_large(frame, answer.message)
+                gone += 1
+                note(f"memory has run out for frame {frame}: it is made again with {len(staff)} workers")
+                if not at_work:
+                    assign(next(iter(staff)))
+                continue
             if isinstance(answer, Lost):
+                del staff[worker]
+                gone += 1
                 losses[frame] += 1
                 if losses[frame] == MOST_LOSSES:
                     raise LostWorkersError(
@@ -251,6 +308,7 @@ def run_pool(
                         grow = False
                         plan.leave(worker)
                         pool.stop(worker)
+                        del staff[worker]
                         yield answer.result
                         continue
                     case "stay":
@@ -260,6 +318,10 @@ def run_pool(
         for _ in range(pool.openings()):
             if plan.left:
                 assign(pool.start())
+
+
+def _too_large(frame: int, why: str) -> MissingResourceError:
+    return MissingResourceError(f"frame {frame} cannot be made: {why}; finished frames are kept")
 
 
 class _Plan:
@@ -377,8 +439,12 @@ class _Growth:
 class _Processes(Generic[Result]):
     """Workers that are processes of this machine."""
 
-    def __init__(self, make: MakeFrame[Result]) -> None:
+    def __init__(self, make: MakeFrame[Result], device: Device | None, shared: SharedGpu | None = None) -> None:
         self._make = SharedArrays(make)
+        self._shared = shared
+        self._kind = None if device is None else device.kind
+        self._gpus = () if device is None else device.gpus
+        self._taken: dict[int, Gpu] = {}
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: dict[int, tuple[BaseProcess, Connection]] = {}
         self._count = 0
@@ -386,20 +452,27 @@ class _Processes(Generic[Result]):
     def start(self) -> int:
         pipe, far_end = self._spawn.Pipe()
         worker, self._count = self._count, self._count + 1
-        process = self._spawn.Process(target=_work, args=(far_end, self._make), name=f"mitsplat-{worker}", daemon=True)
+        arguments = far_end, self._kind, self._make
+        process = self._spawn.Process(target=_work, args=arguments, name=f"mitsplat-{worker}", daemon=True)
+        load = Counter(self._taken.values())
+        gpu = min(self._gpus, key=load.__getitem__, default=None)
         resource_tracker.ensure_running()  # starting it with the first worker would unblock what is blocked here
         # Ctrl-C goes to all processes of a terminal, but is for this one only: workers inherit what is blocked.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            process.start()
+            with starting_on(gpu, **(self._shared.environment if self._shared else {})):
+                process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         far_end.close()  # so that the death of the worker ends the pipe
         self._workers[worker] = process, pipe
+        if gpu is not None:
+            self._taken[worker] = gpu
         return worker
 
     def stop(self, worker: int) -> None:
         process, pipe = self._workers.pop(worker)
+        self._taken.pop(worker, None)
         process.terminate()
         process.join()
         pipe.close()
@@ -430,16 +503,21 @@ class _Processes(Generic[Result]):
             process.terminate()
         for worker in list(self._workers):
             self.stop(worker)
+        if self._shared is not None:
+            self._shared.close()
         self._make.close()
 
 
-def _work(pipe: Connection, make: MakeFrame[Result]) -> None:
+def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> None:
     """Main function of a worker: frames come in, notes and results go out, until it is stopped."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError):
         while True:
             index = pipe.recv()
             try:
+                if device is not None:
+                    use_share(device)
+                    device = None
                 pipe.send(Finished(make(index, lambda text: pipe.send(Status(text)))))
             except Exception as error:  # noqa: BLE001 - the parent raises it
                 pipe.send(Failure.of(error))
@@ -450,4 +528,5 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
+        end_service()
         os._exit(1)

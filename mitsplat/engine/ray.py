@@ -14,15 +14,19 @@ import time
 from collections import OrderedDict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+from mitsplat.device import Device, Kind, use_share
 from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, run_pool
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.progress import Note
 
 Result = TypeVar("Result")
 Made = TypeVar("Made", covariant=True)
+
+GPU_SHARE = {"CPU": 1.0, "GPU": 0.125}
+"""What a worker on a GPU reserves: eight of them, with 3 GiB each, share one of 24 GiB."""
 
 _LOOK = 3.0
 """How often to look for machines that joined, at most [s]."""
@@ -54,11 +58,12 @@ class Cluster:
     Attributes:
         address: As of ``ray.init``: None starts Ray on this machine, "auto" finds the one that runs here.
         resources: Amounts that each worker reserves, by Ray's names: CPU, GPU, memory [bytes] or a resource that some
-            nodes declare. A worker with a GPU renders on it (``cuda_ad_rgb``), any other on its CPUs.
+            nodes declare. A worker with a GPU, or a part of one, renders on it, any other on its CPUs. If None, two
+            CPUs, or on GPUs :data:`GPU_SHARE`.
     """
 
     address: str | None = None
-    resources: Mapping[str, float] = field(default_factory=lambda: {"CPU": 2.0})
+    resources: Mapping[str, float] | None = None
 
     @staticmethod
     def parse_resources(text: str) -> dict[str, float]:
@@ -77,6 +82,27 @@ class Cluster:
             if not name or not 0 < found[name] < float("inf"):
                 raise InputError(f"resources must be NAME=AMOUNT,..., such as CPU=4,GPU=1 (got {text})")
         return found
+
+    def on_device(self, device: str | Device | None) -> tuple[Device, Cluster]:
+        """The device that workers render on, and the cluster with what each of them reserves for that.
+
+        Args:
+            device: ``cpu``, ``cuda``, or None for what the resources say.
+
+        Raises:
+            InputError: If it is another one, or the resources contradict it.
+        """
+        kind = device.kind if isinstance(device, Device) else device
+        if kind not in (None, "cpu", "cuda"):
+            raise InputError(f"on a cluster, where Ray assigns the GPUs, the device must be cpu or cuda (got {kind})")
+        resources = self.resources
+        if resources is None:
+            resources = GPU_SHARE if kind == "cuda" else {"CPU": 2.0}
+        elif kind is not None and (kind == "cuda") != ("GPU" in resources):
+            lack = "a GPU too, such as GPU=0.125" if kind == "cuda" else "no GPU"
+            wanted = ",".join(f"{name}={amount:g}" for name, amount in resources.items())
+            raise InputError(f"resources of a worker on the device {kind} must name {lack} (got {wanted})")
+        return Device("cuda" if "GPU" in resources else "cpu"), replace(self, resources=resources)
 
 
 def run_on_ray(
@@ -131,7 +157,8 @@ class _Actors(Generic[Result]):
                 raise MissingResourceError(
                     f"no Ray cluster at {cluster.address!r}: {str(error).splitlines()[0]}"
                 ) from error
-        self._wanted, self._most = cluster.resources, sys.maxsize if most is None else most
+        device, cluster = cluster.on_device(None)
+        self._wanted, self._most = cluster.resources or {}, sys.maxsize if most is None else most
         self._actors: dict[int, Any] = {}
         room = self._room()
         self._nodes, self.room = set(room), min(self._most, sum(room.values()))
@@ -139,12 +166,12 @@ class _Actors(Generic[Result]):
         if not self.room:
             self.close()
             raise MissingResourceError(self._no_room())
-        amounts = dict(cluster.resources)
+        amounts = dict(self._wanted)
         options: dict[str, Any] = {"num_cpus": amounts.pop("CPU", 0), "num_gpus": amounts.pop("GPU", 0)}
         if "memory" in amounts:
             options["memory"] = amounts.pop("memory")
         self._actor = ray.remote(_Actor).options(**options, resources=amounts, max_restarts=0)
-        self._gpu = bool(options["num_gpus"])
+        self._kind = device.kind
         self._job = job
         self._stored = ray.put(job)
         self._answers: dict[Any, tuple[int, int, int]] = {}
@@ -178,7 +205,7 @@ class _Actors(Generic[Result]):
 
     def start(self) -> int:
         worker, self._count = self._count, self._count + 1
-        self._actors[worker] = self._actor.remote([self._stored], self._gpu)
+        self._actors[worker] = self._actor.remote([self._stored], self._kind)
         return worker
 
     def stop(self, worker: int) -> None:
@@ -220,16 +247,10 @@ class _Actors(Generic[Result]):
 class _Actor:
     """A worker on the cluster."""
 
-    def __init__(self, stored: list[Any], gpu: bool) -> None:
+    def __init__(self, stored: list[Any], kind: Kind) -> None:
         import ray  # optional: the extra [cluster]
 
-        import mitsplat  # before Mitsuba, as it says which LLVM to load
-
-        if gpu:
-            import mitsuba as mi  # after mitsplat
-
-            mi.set_variant("cuda_ad_rgb")
-        self._version = mitsplat.__version__
+        self._kind: Kind | None = kind
         self._job = ray.get(stored[0])
 
     def settle(self, layout: int) -> Failure | str:
@@ -242,6 +263,9 @@ class _Actor:
         if isinstance(layout, Failure):
             return layout
         try:
+            if self._kind is not None:
+                use_share(self._kind)
+                self._kind = None
             return Finished(self._job.make(frame, layout))
         except Exception as error:  # noqa: BLE001 - the caller raises it
             return Failure.of(error)

@@ -17,10 +17,12 @@ class WorkerMemory:
     Attributes:
         own: Each of them.
         shared: All of them together, once.
+        gpu: Each of those that compute on a GPU, of its memory.
     """
 
     own: float
     shared: float = 0.0
+    gpu: float = 3.0 * 2**30
 
 
 TYPICAL = WorkerMemory(4.0 * 2**30)

@@ -80,7 +80,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         "lights": [light.model_dump(mode="json") for light in plan.lights],
         "camera": frame.camera.to_json(),
         "labels": frame.labels.to_json(),
-        "rest": frame.layout.to_json()["certificate"],
+        "rest": frame.layout.certificate.to_json(),
     }
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"
     files = FrameFiles(root, frame, catalogue, record, image, ids)

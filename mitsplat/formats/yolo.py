@@ -83,8 +83,8 @@ def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> st
     size = np.array((labels.width, labels.height), dtype=np.float64)
     lines = []
     for label in labels.instances:
-        points = (TASKS[task].numbers(label).reshape(-1, 2) / size).ravel()
-        text = [str(label.class_index), *(f"{value:.6f}" for value in points)]
+        points = (TASKS[task].numbers(label).reshape(-1, 2) / size).ravel().tolist()
+        text = [str(label.class_index), " ".join(["%.6f"] * len(points)) % tuple(points)]
         if task == "yolo-pose":
             missing = np.zeros((num_keypoints - len(label.keypoints), 3))
             for x, y, visibility in np.concatenate([label.keypoints, missing]):

@@ -1,7 +1,8 @@
 """How much memory a process that makes frames of a scene takes at most, by which their number is chosen.
 
 ``python -m benchmarks.scale.workers budget`` measured the coefficients, and sets them beside peaks; they hold for the
-variant ``llvm_ad_rgb``, where the device's memory is the process's own.
+variant ``llvm_ad_rgb``, where the device's memory is the process's own. As long as nobody has measured it on a GPU, a
+worker there is taken to need as much of the GPU's memory, and as much of the machine's.
 """
 
 from __future__ import annotations
@@ -68,15 +69,15 @@ def worker_memory(scene: Scene) -> WorkerMemory:
         + sum(number * _pairs(one, camera, samples, at=middle) for one, number in placed)
         for camera in cameras
     )
-    return WorkerMemory(
-        own=BASE
+    own = (
+        BASE
         + COPIES * stored
         + PER_PLACED * count
         + PER_PAIR * min(pairs, PAIRS_MAX)
         + PER_RAY * pixels * samples**2
-        + (PER_OBJECT + PER_SEEN * pixels) * sum(most),
-        shared=stored,
+        + (PER_OBJECT + PER_SEEN * pixels) * sum(most)
     )
+    return WorkerMemory(own, shared=stored, gpu=max(own, WorkerMemory.gpu))
 
 
 def _pairs(splats: Splats, camera: Camera, samples: int, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:

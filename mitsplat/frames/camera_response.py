@@ -91,7 +91,7 @@ def develop(
             missing changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
         sensor: What turns ``iso`` into noise.
-        seed: Seed of the noise, below 2^64. The noise of a pixel and channel is a function of these three alone.
+        seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
     """
     height, width = linear.shape[:2]
     return develop_layers(device_array(linear), (height, width), draws, tone=tone, sensor=sensor, seed=seed).image()
@@ -105,7 +105,7 @@ def develop_layers(
     pixel = dr.arange(mi.UInt32, height * width)
     linear = _through_lens(linear, pixel, shape, draws)
     if "iso" in draws:
-        linear = _sensed(linear, pixel, draws["iso"], sensor, seed)
+        linear = sensed(linear, pixel, draws["iso"], sensor, seed)
     matrix = colour_matrix(
         white_balance=draws.get("white_balance", 6504.0),
         hue=draws.get("hue", 0.0),
@@ -116,7 +116,8 @@ def develop_layers(
     position = dr.sqrt(dr.clip(linear, 0.0, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
     table, data = _byte_curve(tone, str(mi.variant())), dr.empty(mi.UInt8, 3 * height * width)
     for c in range(3):
-        value = dr.gather(mi.UInt32, table, mi.UInt32(dr.round(position[c])))
+        entry = dr.minimum(mi.UInt32(dr.round(position[c])), CURVE_STEPS - 1)  # also where that is no number
+        value = dr.gather(mi.UInt32, table, entry)
         dr.scatter(data, mi.UInt8(value), 3 * pixel + c, mode=dr.ReduceMode.Permute)
     dr.eval(data)
     return Development(data, shape, round(draws["jpeg"]) if "jpeg" in draws else None)
@@ -159,11 +160,11 @@ def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mappin
         linear = linear * dr.exp2(_opaque(-draws["vignetting"]) * share)
     if draws.get("motion_blur", 0.0):
         kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
-        return _blurred(linear, pixel, shape, kernel)
+        return blurred(linear, pixel, shape, kernel)
     return linear
 
 
-def _blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
+def blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
     """Correlated with a kernel (K, K); the picture goes on beyond its border as it ends there."""
     height, width = shape
     picture = dr.ravel(mi.Vector4f(*linear, 0.0))  # a CPU gathers four neighbours as fast as one
@@ -200,7 +201,7 @@ def motion_kernel(length: float, angle: float) -> Float32Array:
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
-def _sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> Any:
+def sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> Any:
     """With shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
 
     Display white fills the wells at ISO 100. The Poisson noise of N is taken as normal. Its numbers are counted by the

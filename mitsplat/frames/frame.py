@@ -240,10 +240,12 @@ class Renderer:
 
     def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera) -> Labels:
         scene, rules = self.scene, self.scene.spec.labels
-        maps = [(layers.instance, layers.depth), (layers.proxy_instance, layers.proxy_depth)]
-        (ids, depth), (second, _) = maps if rules.source == "splats" else reversed(maps)
+        if rules.source == "splats":  # the depth that is not looked at stays on the device
+            truth = Truth(layers.instance, layers.proxy_instance, silhouettes, layers.depth)
+        else:
+            truth = Truth(layers.proxy_instance, layers.instance, silhouettes, layers.proxy_depth)
         return label_instances(
-            Truth(ids, second, silhouettes, depth),
+            truth,
             layout.instances,
             scene.class_names,
             rules,

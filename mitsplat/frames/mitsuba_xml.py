@@ -15,6 +15,7 @@ import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.colour import decode_srgb
+from mitsplat.device import Device
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
@@ -106,14 +107,15 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     return picture
 
 
-def render_apart(path: Path, out: Path, *, allow_outside: bool = False) -> Path:
+def render_apart(path: Path, out: Path, *, allow_outside: bool = False, device: Device | None = None) -> Path:
     """As :func:`render_xml`, in a process of its own: a damaged mesh or image can end the one that Mitsuba runs in.
 
     Raises:
         InputError: Also if that process is ended.
+        MissingResourceError: If the device cannot be used, or its memory does not suffice.
     """
     job = _RenderOne(path, out, allow_outside)
-    with closing(run_apart(job)) as results:
+    with closing(run_apart(job, device)) as results:
         try:
             return next(results)
         except LostWorkersError as error:

@@ -26,6 +26,7 @@ import numpy.typing as npt
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
+from mitsplat.device import Device, Kind, current_device, starting_on, use_device
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.frame import render_frame
 from mitsplat.frames.volprim import render_volprim, volprim_scene
@@ -110,6 +111,7 @@ def measure_steps(
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
     progress: Progress | None = None,
+    device: Device | None = None,
 ) -> list[Row]:
     """Measure steps against the preset ``exact``.
 
@@ -120,6 +122,7 @@ def measure_steps(
         overrides: Changes to the scene file by key, such as ``output.width``.
         allow_outside: Whether the scene may name files outside of its folder.
         progress: Hears (steps done, steps, name of the next).
+        device: Where; that of :func:`mitsplat.device.current_device` if None.
 
     Raises:
         InputError: If the file is not as it should be, or ``frames`` is below 1.
@@ -137,7 +140,8 @@ def measure_steps(
     for i, step in enumerate(plan):
         if progress is not None:
             progress(i, len(plan), step.name)
-        shots = _run_alone(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
+        changes = {**(overrides or {}), **step.overrides}
+        shots = _run_alone(path, step, frames, changes, allow_outside, device or current_device())
         truth = truth or shots
         rows[step.name] = _compare(step.name, shots, truth)
     return [rows[step.name] for step in steps]
@@ -171,6 +175,7 @@ def choose_preset(
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
     progress: Progress | None = None,
+    device: Device | None = None,
 ) -> Row:
     """The cheapest preset for a scene, from two of its frames; see :func:`measure_steps`.
 
@@ -179,7 +184,9 @@ def choose_preset(
     """
     check_tolerance(tolerance)
     steps = STEPS[: len(PRESETS)]
-    rows = measure_steps(path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, progress=progress)
+    rows = measure_steps(
+        path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, progress=progress, device=device
+    )
     return cheapest(rows, tolerance)
 
 
@@ -187,16 +194,23 @@ def _is_splats(path: Path) -> bool:
     return path.suffix.lower() not in (".yaml", ".yml")
 
 
-def _run_alone(path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool) -> _Shots:
+def _run_alone(
+    path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool, device: Device
+) -> _Shots:
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
-            return pool.submit(_shoot, path, step.quality, frames, dict(overrides), allow_outside).result()
+            with starting_on(next(iter(device.gpus), None)):
+                shots = pool.submit(_shoot, path, step.quality, frames, dict(overrides), allow_outside, device.kind)
+            return shots.result()
         except BrokenProcessPool as error:
             raise MissingResourceError(f"{path}: the process of '{step.name}' died; is there enough memory?") from error
 
 
-def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool) -> _Shots:
+def _shoot(
+    path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool, device: Kind
+) -> _Shots:
     """Make the pictures; the first one twice, because it compiles or loads kernels."""
+    use_device(device)
     if quality is None:
         shoot = _volprim_shooter(path, frames, overrides)
     elif _is_splats(path):

@@ -25,11 +25,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
-from scipy import ndimage
 
-from mitsplat.arrays import BoolArray, Float64Array, Int32Array
+from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.labels.polygons import fill_polygon, outline
-from mitsplat.masks import BOUNDARY_TOLERANCE, Box, Silhouette, boundary_f1, encode_mask, without_fragments
+from mitsplat.masks import (
+    BOUNDARY_TOLERANCE,
+    Box,
+    Silhouette,
+    boundary_f1,
+    bounds_of_ids,
+    encode_mask,
+    without_fragments,
+)
 from mitsplat.scene.spec import LabelRules as LabelRules
 
 if TYPE_CHECKING:
@@ -240,11 +247,8 @@ def label_instances(
         if ids.ndim != 2 or not np.issubdtype(ids.dtype, np.integer) or ids.shape != truth.instance.shape:
             raise ValueError(f"id maps must be 2-D integer arrays of one shape (got {ids.dtype}, {ids.shape})")
     height, width = truth.instance.shape
-    ids, second = truth.instance.astype(np.int32), truth.second.astype(np.int32)
-    found, found_second = (
-        {i: bounds for i, bounds in enumerate(ndimage.find_objects(image), start=1) if bounds is not None}
-        for image in (ids, second)
-    )
+    ids, second = truth.instance, truth.second
+    found, found_second = bounds_of_ids(ids), bounds_of_ids(second)
     if unknown := (found.keys() | found_second.keys()) - {instance.id for instance in instances}:
         raise ValueError(f"the id map holds {min(unknown)}, which is the id of no instance")
 
@@ -255,13 +259,13 @@ def label_instances(
         if instance.id not in found:
             dropped["outside" if alone is None or alone.inside(width, height) is None else "hidden"] += 1
             continue
-        rows, columns = found[instance.id]
-        mask, fragments = without_fragments(ids[rows, columns] == instance.id, rules.min_fragment)
+        x0, y0, x1, y1 = found[instance.id]
+        mask, fragments = without_fragments(ids[y0:y1, x0:x1] == instance.id, rules.min_fragment)
         dropped["fragments"] += fragments
         if np.count_nonzero(mask) < rules.min_pixels:
             dropped["small"] += 1
             continue
-        seen = Silhouette.cropped(mask, columns.start, rows.start)
+        seen = Silhouette.cropped(mask, x0, y0)
         amodal, box, area = _amodal(alone, seen, rules.min_fragment, (width, height))
         agreement, boundary = _agreement(seen, second, instance.id, found_second.get(instance.id))
         marks = tuple(
@@ -317,6 +321,8 @@ def _amodal(
         canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
     # Fragments are judged in the image, as those of the visible mask are, and again beyond it.
     whole = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
+    if min(whole.box[:2]) >= 0 and whole.box[2] <= size[0] and whole.box[3] <= size[1]:
+        return whole, whole.box, whole.area
     inside = whole.inside(*size)
     kept = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
     if inside is None or kept is None or not kept.any():
@@ -325,15 +331,14 @@ def _amodal(
 
 
 def _agreement(
-    seen: Silhouette, second: Int32Array, number: int, bounds: tuple[slice, slice] | None
+    seen: Silhouette, second: npt.NDArray[np.integer[Any]], number: int, bounds: Box | None
 ) -> tuple[float, float]:
     """IoU and boundary F1 of an instance's mask and its mask in the other id map, which is within ``bounds``."""
     height, width = second.shape
     x0, y0, x1, y1 = seen.box
     if bounds is not None:
-        rows, columns = bounds
-        x0, x1 = min(x0, columns.start), max(x1, columns.stop)
-        y0, y1 = min(y0, rows.start), max(y1, rows.stop)
+        left, top, right, bottom = bounds
+        x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
     room = 1 + BOUNDARY_TOLERANCE
     x0, y0, x1, y1 = max(x0 - room, 0), max(y0 - room, 0), min(x1 + room, width), min(y1 + room, height)
     other = second[y0:y1, x0:x1] == number

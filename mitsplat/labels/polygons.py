@@ -37,12 +37,12 @@ def outline(mask: BoolArray) -> Float64Array:
         for ring in cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     ]
     polygon: Float64Array = _corners(_joined(rings, (height, width))) + np.float64(0.5)
-    xs, ys = (np.flatnonzero(mask.any(axis=axis)) for axis in (0, 1))
-    for axis, edge in ((0, xs.min()), (0, xs.max() + 1), (1, ys.min()), (1, ys.max() + 1)):
+    (left, top), (right, bottom) = polygon.min(axis=0) - 0.5, polygon.max(axis=0) + 0.5
+    for axis, edge in ((0, left), (0, right), (1, top), (1, bottom)):
         at = int(np.abs(polygon[:, axis] - edge).argmin())
         spike = polygon[[at, at]]
         spike[0, axis] = edge - np.sign(edge - spike[0, axis]) * _LEAN
-        polygon = np.insert(polygon, at + 1, spike, axis=0)
+        polygon = np.concatenate([polygon[: at + 1], spike, polygon[at + 1 :]])
     return polygon
 
 
@@ -88,16 +88,25 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
     position = pixels @ (1, shape[1])
     order = np.argsort(position, kind="stable")
     shared = np.flatnonzero(np.diff(position[order]) == 0)  # walls one pixel thick belong to the rings of both sides
-    neighbours = [
-        (order[shared], order[shared + 1]),
-        (near[:, :-1], near[:, 1:]),
-        (near[:-1], near[1:]),
-        (near[:-1, :-1], near[1:, 1:]),
-        (near[:-1, 1:], near[1:, :-1]),
-    ]
-    a, b = (np.concatenate([pair[side].ravel() for pair in neighbours]) for side in (0, 1))
-    a, b = a[ring_of[a] != ring_of[b]], b[ring_of[a] != ring_of[b]]
+    here, beside = order[shared], order[shared + 1]
+    apart = ring_of[here] != ring_of[beside]
+    pairs = [(here[apart], beside[apart])]
+    ring_near = ring_of[near]
+    everything, ahead, behind = slice(None), slice(1, None), slice(-1)
+    for one, other in (
+        ((everything, behind), (everything, ahead)),
+        ((behind, everything), (ahead, everything)),
+        ((behind, behind), (ahead, ahead)),
+        ((behind, ahead), (ahead, behind)),
+    ):
+        border = ring_near[one] != ring_near[other]
+        pairs.append((near[one][border], near[other][border]))
+    a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     length = np.abs(pixels[a] - pixels[b]).max(axis=1)
+    if len(rings) == 2:  # most often: one part with one hole
+        shortest = length.argmin()
+        start, end = (a, b) if ring_of[a[shortest]] == 0 else (b, a)
+        return [(pixels[start[shortest]], rings[1], int(end[shortest]) - len(rings[0]))]
     low, high = np.minimum(ring_of[a], ring_of[b]), np.maximum(ring_of[a], ring_of[b])
     shortest = np.lexsort((length, low * len(rings) + high))
     _, first = np.unique((low * len(rings) + high)[shortest], return_index=True)
@@ -117,7 +126,12 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
 
 def _corners(walk: Int64Array) -> Int64Array:
     """The closed ``walk`` without standing still and without pixels between two steps of one direction."""
-    walk = walk[np.any(walk != np.roll(walk, 1, axis=0), axis=1)] if len(walk) > 1 else walk
-    arriving = walk - np.roll(walk, 1, axis=0)
-    leaving = np.roll(walk, -1, axis=0) - walk
-    return walk[np.any(arriving != leaving, axis=1)] if len(walk) > 1 else walk
+    if len(walk) == 1:
+        return walk
+    x, y = (walk - np.concatenate([walk[-1:], walk[:-1]])).T
+    walk = walk[(x != 0) | (y != 0)]
+    if len(walk) == 1:
+        return walk
+    arriving = walk - np.concatenate([walk[-1:], walk[:-1]])
+    x, y = (arriving - np.concatenate([arriving[1:], arriving[:1]])).T
+    return walk[(x != 0) | (y != 0)]

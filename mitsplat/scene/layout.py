@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,10 @@ class RestCertificate:
     attempts: int
     refused: tuple[str, ...] = ()
 
+    def to_json(self) -> dict[str, Any]:
+        """The certificate as JSON values."""
+        return {**vars(self), "refused": list(self.refused)}
+
 
 NOTHING_TO_REST = RestCertificate(
     rested=True,
@@ -95,7 +99,7 @@ class Layout:
                 {**vars(instance), "world_from_object": instance.world_from_object.tolist()}
                 for instance in self.instances
             ],
-            "certificate": {**asdict(self.certificate), "refused": list(self.certificate.refused)},
+            "certificate": self.certificate.to_json(),
         }
 
     @classmethod

@@ -6,17 +6,23 @@ import os
 import shutil
 import socket
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
+import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
 from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
+from mitsplat import device as devices
 from mitsplat.dataset import folder, manifest
 from mitsplat.dataset.manifest import Manifest
+from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import write_dataset
+from mitsplat.device import Device, Gpu
+from mitsplat.engine import pool
 from mitsplat.engine.pool import FrameError
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.files import SPLITS
@@ -386,6 +392,90 @@ class TestRefusals:
     def test_a_number_of_frames_that_is_not_there(self, scene, tmp_path, frames):
         self.refuse(scene, tmp_path / "out", rf"frames must be between 1 and 12, .* \(got {frames}\)", frames=frames)
         assert not (tmp_path / "out").exists()
+
+
+class TestDevice:
+    def test_is_recorded(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        write(scene, tmp_path / "out", frames=2, device="cpu")
+        assert json.loads((tmp_path / "out/dataset.json").read_bytes())["device"] == "cpu"
+        runs = [json.loads(line) for line in (tmp_path / "out/runs.jsonl").read_text().splitlines()]
+        assert [(run["device"], run.get("gpus")) for run in runs] == [("cpu", None)] * 2
+
+    def test_a_gpu_is_recorded_with_its_name(self, scene, tmp_path, monkeypatch):
+        """Without one: what renders is drawn, and the process is told that it has one already."""
+        gpus = tuple(Gpu(name, 80 * 2**30, number, "", "") for number, name in enumerate(("One", "Two")))
+        monkeypatch.setattr(pool, "current_device", lambda: Device("cuda", gpus))
+        write(scene, tmp_path / "out", frames=1, device=Device("cuda", gpus))
+        assert json.loads((tmp_path / "out/dataset.json").read_bytes())["device"] == "cuda"
+        (run,) = map(json.loads, (tmp_path / "out/runs.jsonl").read_text().splitlines())
+        assert (run["device"], run["gpus"]) == ("cuda", ["One", "Two"])
+        assert read_content(tmp_path / "out")["device"] == "cuda"
+
+    def begun_on(self, out, device):
+        """What is in a folder is from now on of a device, or of a version that named none."""
+        content = json.loads((out / "dataset.json").read_bytes())
+        del content["device"]
+        (out / "dataset.json").write_text(json.dumps(content | ({"device": device} if device else {}), indent=1))
+
+    def test_the_other_one_is_refused_unless_allowed(self, scene, tmp_path, undisturbed):
+        out = tmp_path / "out"
+        write(scene, out, frames=2)
+        self.begun_on(out, "cuda")
+        with pytest.raises(InputError) as refused:
+            write(scene, out, render=never_render)
+        assert str(refused.value) == (
+            f"{out} cannot be resumed on the device cpu: it was begun on cuda, whose pictures differ a little; give "
+            "--device cuda, or --any-device for frames of both"
+        )
+        assert write(scene, out, any_device=True).rendered == 10
+        assert json.loads((out / "dataset.json").read_bytes())["device"] == "cuda"  # how it was begun
+        assert {**contents(out), "dataset.json": ""} == {**undisturbed, "dataset.json": ""}
+
+    def test_a_dataset_that_names_none_is_of_the_cpu(self, scene, tmp_path):
+        out = tmp_path / "out"
+        write(scene, out, frames=2)
+        self.begun_on(out, None)
+        assert read_content(out)["scene"]["seed"] == 7
+        assert write(scene, out).rendered == 10
+
+    def test_one_that_there_is_not_is_refused_by_readers(self, scene, tmp_path):
+        write(scene, tmp_path / "out", frames=1)
+        self.begun_on(tmp_path / "out", "tpu")
+        with pytest.raises(InputError, match=r"must be a dataset of this version of mitsplat \(dataset.json: device: "):
+            read_content(tmp_path / "out")
+
+    def test_workers_take_that_of_their_caller(self, scene, tmp_path):
+        """A worker says what it renders on; before, one fell back to LLVM whatever its caller had chosen."""
+        write(scene, tmp_path / "out", render=Told(tmp_path), workers=2, device="cpu")
+        assert {path.read_text() for path in tmp_path.glob("variant-*")} == {"llvm_ad_rgb"}
+
+    @pytest.mark.parametrize("device", ["cuda", "cuda:all", "tpu"])
+    def test_one_that_is_not_here_is_refused_before_work(self, scene, tmp_path, device, monkeypatch):
+        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
+        words = (
+            "device must be cpu, cuda" if device == "tpu" else f"{device} cannot be used, as there is none: buy one, or"
+        )
+        with pytest.raises((InputError, MissingResourceError), match=words):
+            write(scene, tmp_path / "out", render=never_render, device=device)
+        assert not (tmp_path / "out").exists()
+
+    def test_auto_says_what_it_chose(self, scene, tmp_path, monkeypatch):
+        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
+        told = []
+        write(scene, tmp_path / "out", frames=1, device="auto", progress=lambda *event: told.append(event[2]))
+        assert told[1] == "device cpu: there is none"
+
+
+@dataclass(frozen=True)
+class Told:
+    """Renders as :func:`render`, and leaves Mitsuba's variant in a file."""
+
+    folder: Path
+
+    def __call__(self, scene, index, *, layout):
+        (self.folder / f"variant-{index}").write_text(str(mi.variant()))
+        return render(scene, index, layout=layout)
 
 
 class TestPictures:

@@ -13,9 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mitsplat.device import CPU, Device, Gpu, Lack, visible_gpus
 from mitsplat.engine import pool as engine
-from mitsplat.engine.pool import Finished, FrameError, LostWorkersError, run_frames, run_pool
-from mitsplat.errors import InputError
+from mitsplat.engine.pool import Failure, Finished, FrameError, LostWorkersError, run_frames, run_pool
+from mitsplat.engine.resources import TYPICAL
+from mitsplat.errors import InputError, MissingResourceError
 
 LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
 
@@ -120,6 +122,143 @@ class KillOnce:
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return index
+
+
+@dataclass(frozen=True)
+class Greedy:
+    """Memory runs out, as Dr.Jit says it, while more processes live than there is room for, and at one frame always."""
+
+    folder: Path
+    room: int
+    too_large: int = -1
+
+    def __call__(self, index, note, /):
+        (self.folder / str(os.getpid())).touch()
+        if index == self.too_large or sum(not ended(path.name) for path in self.folder.iterdir()) > self.room:
+            raise RuntimeError("jit_malloc(): out of memory! Could not allocate 4 GiB of device memory.\n(and more)")
+        time.sleep(0.1)  # the others are at work meanwhile
+        return index, os.getpid()
+
+
+def test_fewer_workers_where_memory_runs_out(tmp_path):
+    notes = []
+    made = run(Greedy(tmp_path, room=2), 5, layouts={0: range(20), 1: range(20, 40)}, note=notes.append)
+    assert sorted(index for index, _ in made) == list(range(40))
+    assert 1 <= len({process for _, process in made[-10:]}) <= 2
+    assert notes[0].startswith("memory has run out for frame ") and notes[0].endswith("is made again with 4 workers")
+    assert all(ended(path.name) for path in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_frame_that_does_not_fit_even_alone(tmp_path, workers):
+    results, made = run_frames(Greedy(tmp_path, 99, too_large=7), LAYOUTS, workers=workers, note=lambda text: None), []
+    with closing(results), pytest.raises(MissingResourceError) as caught:
+        made.extend(results)
+    assert str(caught.value) == (
+        "frame 7 cannot be made: memory has run out (jit_malloc(): out of memory! Could not allocate 4 GiB of device "
+        "memory.): smaller images and fewer samples take less; if it was a GPU's, use --device cpu; finished frames "
+        "are kept"
+    )
+
+
+def test_the_last_frame_goes_to_an_idle_worker():
+    """The last frame only fits alone: who has nothing to do takes it over, one after the other, until one is left."""
+    pool = Short(lambda frame, alive: frame < 2 or alive == 1)
+    assert list(run_pool(pool, {0: range(3)}, 3, print)) == [0, 1, 2]
+    assert (pool.stopped, pool.alive) == ([2, 0], {1})
+
+
+def test_who_runs_out_beside_another_tries_again():
+    """Four run out at once: one is dismissed, and the others, made anew, fit beside what is left."""
+    pool = Short(lambda frame, alive: alive <= 3)
+    assert sorted(run_pool(pool, {0: range(8)}, 4, print)) == list(range(8))
+    assert (len(pool.alive), pool.hired) == (3, 4 + 3)
+
+
+class Short:
+    """A pool without processes, whose workers answer all at once; a frame may not fit beside others that are alive."""
+
+    def __init__(self, fits):
+        self.fits, self.hired = fits, 0
+        self.alive, self.given, self.stopped = set(), {}, []
+
+    def start(self):
+        self.hired += 1
+        self.alive.add(self.hired - 1)
+        return self.hired - 1
+
+    def stop(self, worker):
+        self.alive.remove(worker)
+        self.stopped.append(worker)
+
+    def give(self, worker, frame, layout):
+        self.given[worker] = frame
+
+    def wait(self):
+        given, self.given, alive = self.given, {}, len(self.alive)
+        for worker, frame in given.items():
+            yield worker, Finished(frame) if self.fits(frame, alive) else EXHAUSTED
+
+    def openings(self):
+        return 0
+
+
+EXHAUSTED = Failure(MissingResourceError, "RuntimeError", "memory has run out", "", exhausted=True)
+
+
+def test_workers_take_the_device_before_anything_else(monkeypatch):
+    """The variant is told by the worker; GPUs are given in turn, each alone visible to its workers."""
+    with closing(run_frames(Variant(), LAYOUTS, workers=2, note=print, device=CPU)) as results:
+        assert {variant for _, variant, _ in results} == {"llvm_ad_rgb"}
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    gpus = tuple(Gpu(name, 80 * 2**30, number, "", f"GPU-{name}") for number, name in enumerate("ab"))
+    monkeypatch.setattr(engine, "use_share", print)
+    pool = engine._Processes(Variant(), Device("cuda", gpus))
+    pool._kind = None  # there is none to take
+    with closing(pool):
+        workers = [pool.start() for _ in range(4)]
+        pool.stop(workers[2])
+        workers[2] = pool.start()
+        seen = []
+        for worker in workers:
+            pool.give(worker, 0, 0)
+            while not (answers := list(pool.wait())):
+                pass
+            seen.append(answers[0][1].result[2])
+    assert seen == ["GPU-a", "GPU-b", "GPU-a", "GPU-b"]
+    assert "CUDA_VISIBLE_DEVICES" not in os.environ
+
+
+def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
+    """What a worker finds when it takes its device is told as what its frame found."""
+    lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
+    if isinstance(visible_gpus(), Lack):
+        with pytest.raises(MissingResourceError, match=r"^cuda cannot be used, as .*, or use the device cpu$"):
+            list(run_frames(Variant(), {0: [0]}, note=print, device=lost))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Tells of Mitsuba's variant, and of what GPU is visible."""
+
+    def __call__(self, index, note, /):
+        import mitsuba as mi
+
+        return index, mi.variant(), os.environ.get("CUDA_VISIBLE_DEVICES")
+
+
+@pytest.mark.parametrize(("gigabytes", "count"), [((80, 80), 8), ((80, 7), 4), ((7,), 2), ((1,), 1)])
+def test_as_many_workers_at_once_as_gpus_hold(monkeypatch, gigabytes, count):
+    """All of them from the start; on a GPU of 7 GiB there are two of 3."""
+    monkeypatch.setattr(engine, "unused_memory", lambda: 32.0)
+    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
+    device = Device("cuda", tuple(Gpu("one", size * 2**30, 0, "", "") for size in gigabytes))
+    assert engine.affordable_workers(TYPICAL, device) == count
+    began = []
+    monkeypatch.setattr(engine, "use_device", began.append)
+    monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append((args[2], how)) or (i for i in ()))
+    list(run_frames(Variant(), {0: range(100)}, workers=None, note=print, device=device))
+    assert began == ([(count, {"grow": False})] if count > 1 else [device])
 
 
 def test_workers_end_with_their_parent(tmp_path):

@@ -3,8 +3,10 @@
 import json
 import os
 import pickle
+import re
 import shutil
 import sys
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -142,6 +144,13 @@ class TestRefusals:
         write(other, shards[1], shard=Shard(2, 3), overwrite=True)
         self.refuse(shards, tmp_path / "out", r"are not of one dataset: scene\.seed is 0 in the first, 8 in the second")
 
+    def test_another_device(self, shards, tmp_path):
+        file = shards[1] / "dataset.json"
+        file.write_text(file.read_text().replace('"device": "cpu"', '"device": "cuda"'))
+        self.refuse(
+            shards, tmp_path / "out", 'are not of one dataset: device is "cpu" in the first, "cuda" in the second'
+        )
+
     def test_another_division(self, scene, shards, tmp_path):
         write(scene, tmp_path / "whole")
         self.refuse([*shards, tmp_path / "whole"], tmp_path / "out", "must be of one division of one dataset")
@@ -216,6 +225,20 @@ class TestRay:
         assert told[-1][:2] == (12, 12)
         assert contents(tmp_path / "out") == whole
 
+    def test_where_memory_runs_out(self, scene, tmp_path, whole):
+        """A worker says so, as Dr.Jit does of a GPU: its frame is made by another, and it is not replaced."""
+        told = []
+        write(
+            scene,
+            tmp_path / "out",
+            cluster=Cluster(resources={"CPU": 1}),
+            workers=None,
+            render=ExhaustedOnce(tmp_path, 6),
+            progress=lambda *event: told.append(event[2]),
+        )
+        assert "memory has run out for frame 6: it is made again with 3 workers" in told
+        assert contents(tmp_path / "out") == whole
+
     def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
         with pytest.raises(InputError, match=r"^no frame 5$"):
             write(scene, tmp_path / "out", cluster=Cluster(), workers=1, render=refuse_5)
@@ -225,6 +248,56 @@ class TestRay:
         assert summary.rendered == 2
         with pytest.raises(MissingResourceError, match=r"no node of the Ray cluster has CPU=1, camera=2 for a worker"):
             write(scene, tmp_path / "other", cluster=Cluster(resources={"CPU": 1, "camera": 2}))
+
+
+@dataclass(frozen=True)
+class ExhaustedOnce:
+    """Renders, but memory runs out at a frame, unless it has done so."""
+
+    folder: Path
+    index: int
+
+    def __call__(self, scene, index, *, layout):
+        mark = self.folder / "exhausted"
+        if index == self.index and not mark.exists():
+            mark.touch()
+            raise RuntimeError("jit_malloc(): out of memory! Could not allocate 4 GiB of device memory.")
+        return render(scene, index, layout=layout)
+
+
+@pytest.mark.parametrize(
+    ("resources", "device", "kind", "reserved"),
+    [
+        (None, None, "cpu", {"CPU": 2}),
+        (None, "cpu", "cpu", {"CPU": 2}),
+        (None, "cuda", "cuda", {"CPU": 1, "GPU": 0.125}),
+        ({"CPU": 4}, None, "cpu", {"CPU": 4}),
+        ({"GPU": 1}, None, "cuda", {"GPU": 1}),
+        ({"GPU": 1}, "cuda", "cuda", {"GPU": 1}),
+        ({"CPU": 4}, "cpu", "cpu", {"CPU": 4}),
+    ],
+)
+def test_the_device_of_a_cluster(resources, device, kind, reserved):
+    found, cluster = Cluster(resources=resources).on_device(device)
+    assert (found.kind, cluster.resources) == (kind, reserved)
+
+
+@pytest.mark.parametrize(
+    ("resources", "device", "words"),
+    [
+        ({"CPU": 4.0}, "cuda", r"on the device cuda must name a GPU too, such as GPU=0\.125 \(got CPU=4\)"),
+        ({"CPU": 4, "GPU": 1}, "cpu", r"on the device cpu must name no GPU \(got CPU=4,GPU=1\)"),
+        (None, "cuda:1", r"where Ray assigns the GPUs, the device must be cpu or cuda \(got cuda:1\)"),
+        (None, "auto", r"must be cpu or cuda \(got auto\)"),
+    ],
+)
+def test_devices_that_a_cluster_does_not_have(scene, tmp_path, capsys, resources, device, words):
+    with pytest.raises(InputError, match=words):
+        write(scene, tmp_path / "out", cluster=Cluster(resources=resources), device=device)
+    options = ["--resources", ",".join(f"{name}={amount}" for name, amount in resources.items())] if resources else []
+    assert run("render", scene.path, "-o", tmp_path / "out", "--engine", "ray", "--device", device, *options) == 2
+    assert re.search(words, capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
 
 
 class FakeRay:

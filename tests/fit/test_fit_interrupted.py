@@ -178,6 +178,7 @@ def test_an_asset_whose_fit_was_interrupted_goes_on(
     assert fits.is_new(tmp_path / "fit")
 
 
+@pytest.mark.cpu(reason="the processes that are ended fit on the CPU, and their fit goes on in this one")
 @pytest.mark.parametrize(("place", "how"), [(1, "SIGINT"), (10, "SIGKILL")])
 def test_processes_that_are_ended(fits: Fits, tmp_path: Path, place: int, how: str) -> None:
     """As by Ctrl-C, or by the kernel when memory runs out; what they leave is what any process can go on with."""

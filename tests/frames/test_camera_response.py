@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
+import cv2
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import stats
 
 from mitsplat.colour import black_body_colour
 from mitsplat.frames.camera_response import (
+    SENSOR,
+    blurred,
     colour_matrix,
     develop,
     light_image,
     motion_kernel,
+    sensed,
     shadow_from_image,
     tone_curve,
 )
-from mitsplat.render.layers import Layers
+from mitsplat.render.layers import Layers, device_array, host_array
 from mitsplat.scene.spec import Composite, ImageShadow, Sensor
 
 
@@ -53,6 +62,16 @@ def test_white_balance_for_a_warm_light_makes_white_cooler() -> None:
     np.testing.assert_allclose(colour_matrix(white_balance=6504.0), np.eye(3))
 
 
+def test_pixels_without_a_number_harm_no_others() -> None:
+    linear = np.full((4, 8, 3), 0.2, np.float32)
+    linear[1, 2:5] = [[np.inf], [np.nan], [-np.inf]]
+    for draws in ({}, {"iso": 100.0, "hue": 3.0}):
+        image, clean = develop(linear, draws), develop(np.full_like(linear, 0.2), draws)
+        clean[1, 2:5] = image[1, 2:5]
+        np.testing.assert_array_equal(image, clean)
+    assert develop(linear, {})[1, [2, 4]].tolist() == [[255] * 3, [0] * 3]
+
+
 @pytest.mark.parametrize("tone", ["neutral", "filmic"])
 def test_tone_curves_rise_from_black_to_white(tone: str) -> None:
     curve = tone_curve(tone)
@@ -82,6 +101,100 @@ def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float
     expected = np.sqrt(np.average((encoded - middle) ** 2, weights=weight) + 1 / (12 * 255**2))
     assert np.std(a / 255.0) == pytest.approx(expected, rel=0.03)
     assert np.mean(a / 255.0) == pytest.approx(middle, abs=1e-3)
+
+
+def noise(shape: tuple[int, int], level: float, iso: float, seed: int, sensor: Sensor = SENSOR) -> np.ndarray:
+    """What a sensor adds to an even linear picture of some level, (H, W, 3)."""
+    linear = device_array(np.full((*shape, 3), level, np.float32))
+    pixel = dr.arange(mi.UInt32, shape[0] * shape[1])
+    return host_array(sensed(linear, pixel, iso, sensor, seed), shape).astype(np.float64) - level
+
+
+@pytest.mark.parametrize(("level", "iso"), [(0.0, 3200.0), (0.18, 100.0), (0.6, 1600.0)])
+def test_noise_is_normal_and_without_correlation(level: float, iso: float) -> None:
+    """Mean 0 and variance N + read_noise^2 of N electrons; each statistic within 5 of its standard errors."""
+    shape = 400, 500
+    sensor = Sensor(full_well=10000, read_noise=5)
+    white = 10000 * 100 / iso
+    deviation = np.sqrt(level * white + 25) / white
+    frames = [noise(shape, level, iso, seed, sensor) / deviation for seed in (7, 8, 7 + 2**32)]
+    count = frames[0].size
+    for frame in frames:
+        assert abs(frame.mean()) < 5 / np.sqrt(count)
+        assert abs(frame.var() - 1) < 5 * np.sqrt(2 / count)
+        assert abs(stats.skew(frame.ravel())) < 5 * np.sqrt(6 / count)
+        assert abs(stats.kurtosis(frame.ravel())) < 5 * np.sqrt(24 / count)
+        assert stats.kstest(frame.ravel(), "norm").pvalue > 1e-4
+    first, second, far = frames
+    pairs = [(first[..., a], first[..., b]) for a, b in ((0, 1), (0, 2), (1, 2))]
+    pairs += [(first[:, 1:], first[:, :-1]), (first[1:], first[:-1]), (first[1:, 1:], first[:-1, :-1])]
+    pairs += [(first, second), (first, far), (first[:, 1:], second[:, :-1])]
+    for a, b in pairs:
+        assert abs(np.mean(a * b)) < 5 / np.sqrt(a.size)
+        # Of what two numbers share, their sizes would show what their products do not.
+        assert abs(np.mean((a**2 - 1) * (b**2 - 1))) < 5 * 2 / np.sqrt(a.size)
+
+
+def test_noise_of_a_pixel_depends_on_no_other_and_on_no_thread() -> None:
+    linear = np.random.default_rng(3).random((300, 217, 3)).astype(np.float32)
+    draws = {"iso": 1600.0, "exposure": 0.5}
+    whole = develop(linear, draws, seed=5)
+    np.testing.assert_array_equal(develop(linear[:41], draws, seed=5), whole[:41])
+    threads = dr.thread_count()
+    try:
+        for count in (1, 2, 5):
+            dr.set_thread_count(count)
+            np.testing.assert_array_equal(develop(linear, draws, seed=5), whole)
+    finally:
+        dr.set_thread_count(threads)
+
+
+def developed_slowly(linear: np.ndarray, draws: Mapping[str, float]) -> np.ndarray:
+    """A picture developed without noise, in double precision and without a table, (H, W, 3) in [0, 255]."""
+    height, width = linear.shape[:2]
+    linear = linear.astype(np.float64) * 2 ** draws["exposure"]
+    for y, x in np.ndindex(height, width):
+        square = (x + 0.5 - width / 2) ** 2 + (y + 0.5 - height / 2) ** 2
+        linear[y, x] *= 2 ** (-draws["vignetting"] * square / ((height / 2) ** 2 + (width / 2) ** 2))
+    kernel = motion_kernel(draws["motion_blur"], draws["motion_angle"]).astype(np.float64)
+    linear = cv2.filter2D(linear, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+    colours = {name: draws[name] for name in ("white_balance", "hue", "saturation")}
+    return 255 * np.clip(encode(linear @ colour_matrix(**colours).T), 0, 1)
+
+
+def test_development_follows_its_steps_in_their_order() -> None:
+    linear = np.random.default_rng(0).random((37, 53, 3)).astype(np.float32)
+    draws = {"exposure": -0.4, "vignetting": 1.5, "motion_blur": 5.0, "motion_angle": 130.0}
+    draws |= {"white_balance": 5200.0, "hue": 6.0, "saturation": 1.2}
+    # Half a step of rounding, and what the table's entries are apart.
+    assert np.abs(develop(linear, draws) - developed_slowly(linear, draws)).max() < 0.5 + 0.05
+
+
+@pytest.mark.parametrize("angle", [0.0, 75.0, 200.0])
+@pytest.mark.parametrize("length", [0.7, 4.0, 19.0])
+def test_motion_blur_is_a_correlation_beyond_replicated_borders(length: float, angle: float) -> None:
+    shape = 23, 31
+    linear = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
+    kernel = motion_kernel(length, angle)
+    got = host_array(blurred(device_array(linear), dr.arange(mi.UInt32, 23 * 31), shape, kernel), shape)
+    expected = cv2.filter2D(linear.astype(np.float64), -1, kernel.astype(np.float64), borderType=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+
+
+def test_other_draws_compile_nothing() -> None:
+    linear = np.random.default_rng(2).random((30, 40, 3)).astype(np.float32)
+    names = ("exposure", "vignetting", "motion_blur", "motion_angle", "iso", "white_balance", "hue", "saturation")
+    drawn = [(0.3, 0.5, 3.0, 20.0, 200.0, 5000.0, 3.0, 1.1), (-0.2, 0.9, 11.0, 80.0, 900.0, 7000.0, -5.0, 0.9)]
+
+    def kernels(draws: tuple[float, ...], seed: int) -> set[Any]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            sensor = Sensor(full_well=5000 + seed, read_noise=seed)
+            develop(linear, dict(zip(names, draws, strict=True)), sensor=sensor, seed=seed)
+            return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+    first, second = kernels(drawn[0], 1), kernels(drawn[1], 2)
+    assert first and second == first
 
 
 def test_vignetting_takes_its_stops_in_the_corner_and_none_in_the_middle() -> None:

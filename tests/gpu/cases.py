@@ -24,6 +24,7 @@ from ruamel.yaml import YAML
 
 # isort: on
 import mitsplat as ms
+from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.quality import Quality
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
 from mitsplat.splats import Splats
@@ -77,7 +78,9 @@ def visible(kind: str) -> dict[str, Any]:
     transform = mi.ScalarTransform4f()
     if kind == "plain":
         diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}}
-        return {"cube": {"type": "cube", "to_world": transform.translate([0.0, -0.1, 0.03]).scale(0.03), "bsdf": diffuse}}
+        return {
+            "cube": {"type": "cube", "to_world": transform.translate([0.0, -0.1, 0.03]).scale(0.03), "bsdf": diffuse}
+        }
     sphere = {"type": "sphere", "to_world": transform.translate([0.02, -0.12, 0.041]).scale(0.04)}
     materials = {"glass": {"type": "dielectric"}, "mirror": {"type": "conductor", "material": "Cu"}}
     return {kind: sphere | {"bsdf": materials[kind]}}
@@ -148,7 +151,7 @@ def drawn_scene(folder: Path, **output: Any) -> ms.Scene:
         "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
         "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.7, "height": 0.6},
         "lights": [{"kind": "area", "position": [0.5, 0, 1]}, {"kind": "environment", "radiance": 0.5}],
-        "randomise": {"iso": [400, 400], "vignetting": [0.1, 0.1]},
+        "randomise": {"iso": [400, 400], "vignetting": [0.1, 0.1], "motion_blur": [2, 2]},
         "settle": {"stepper": "mujoco"},
         "output": output,
         "seed": 7,
@@ -167,6 +170,7 @@ CASES: dict[str, Callable[[], Arrays]] = {
     "two by two rays": lambda: layers(quality=Quality(samples=2)),
     "dilated": lambda: layers(quality=Quality(kernel="gsplat", response="ewa")),
     "distorted lens": lambda: layers(view=lambda: camera(distortion=(-0.2, 0.05, 0.001, -0.001, 0.01))),
+    "fisheye lens": lambda: layers(view=lambda: camera(lens="fisheye", distortion=(0.05, -0.01, 0.002, 0.0))),
     "thin lens": lambda: layers(
         view=lambda: camera(aperture_radius=0.01, focus_distance=0.5), quality=Quality(lens_rings=1)
     ),
@@ -186,6 +190,7 @@ def main() -> None:
     variant, out = sys.argv[1:]
     mi.set_variant(variant)
     arrays = {f"{case}/{name}": value for case, make in CASES.items() for name, value in make().items()}
+    refuse_lost_rays()
     np.savez(out, **arrays)
 
 

@@ -40,4 +40,8 @@ def test_depth_and_gradients_are_relative() -> None:
     assert fault("depth", depth, depth * np.float32(1.0005)) == "100.00 % of the pixels differ"
     assert not fault("gradient_means", PICTURE, PICTURE + np.float32(9e-4))
     assert fault("gradient_means", PICTURE, PICTURE + np.float32(2e-3))
-    assert fault("depth", depth, depth[1:]).startswith("float64(100, 100)") or fault("depth", depth, depth[1:])
+
+
+def test_shapes_and_types_are_compared() -> None:
+    assert fault("rgb", PICTURE, PICTURE[1:]) == "float32(100, 100, 3) and float32(99, 100, 3)"
+    assert fault("rgb", PICTURE, np.float64(PICTURE))

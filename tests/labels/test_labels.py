@@ -11,12 +11,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from pycocotools import mask as coco_mask
+from scipy import ndimage
 
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.formats.yolo import yolo_lines
 from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
 from mitsplat.labels.polygons import fill_polygon, outline
-from mitsplat.masks import Silhouette, encode_mask
+from mitsplat.masks import Silhouette, bounds_of_ids, encode_mask, without_fragments
 
 
 @dataclass(frozen=True)
@@ -334,6 +335,32 @@ def test_run_lengths_are_those_of_pycocotools(box, share):
     canvas = np.zeros((30, 40), dtype=np.uint8, order="F")
     canvas[y0:y1, x0:x1] = mask
     assert encode_mask(mask, box, (40, 30)) == coco_mask.encode(canvas)["counts"].decode()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 25), st.integers(1, 25), st.integers(1, 5))
+@settings(max_examples=60, deadline=None)
+def test_bounds_of_ids_are_those_of_scipy(seed, height, width, count):
+    ids = np.random.default_rng(seed).integers(0, count + 1, (height, width)).astype(np.uint16)
+    ids[ids == count] = 40000  # not every id is there
+    expected = {
+        number: (columns.start, rows.start, columns.stop, rows.stop)
+        for number, bounds in enumerate(ndimage.find_objects(ids.astype(np.int32)), start=1)
+        if bounds is not None
+        for rows, columns in [bounds]
+    }
+    assert bounds_of_ids(ids) == expected
+    assert list(bounds_of_ids(ids)) == sorted(expected)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.5, 0.8]), st.integers(0, 40))
+@settings(max_examples=60, deadline=None)
+def test_fragments_are_the_small_parts(seed, share, least):
+    mask = np.random.default_rng(seed).random((9, 12)) < share
+    kept, removed = without_fragments(mask, least)
+    parts, count = ndimage.label(mask, structure=np.ones((3, 3)))
+    large = [number for number in range(1, count + 1) if (parts == number).sum() >= least]
+    assert np.array_equal(kept, np.isin(parts, large) & mask)
+    assert removed == count - len(large)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (300, 2), (41, 700)])

@@ -1,0 +1,135 @@
+"""A tiny scene whose picture is known: what a device renders wrong shows in it.
+
+    python -m mitsplat.checks.trial cpu|cuda
+
+prints as JSON what is wrong, and the version of LLVM. In a process of its own, because an unusable LLVM does not raise:
+it aborts; and because a process has one device.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import Float64Array
+from mitsplat.camera import Camera
+from mitsplat.device import use_device
+from mitsplat.render.layers import Layers, make_integrator, make_splats_shape, render_layers
+from mitsplat.splats import Splats
+
+BLOCK = 8
+"""Edge of the squares whose means are compared [px]."""
+
+TOLERANCE = 0.02
+"""Most by which a mean may be off, 1 being white or unshadowed: one pixel at an edge moves it by 0.016."""
+
+# fmt: off
+KNOWN = {
+    "picture": [
+        [0.577, 0.542, 0.558, 0.560, 0.495, 0.576, 0.625, 0.640],
+        [0.341, 0.333, 0.311, 0.134, 0.093, 0.115, 0.311, 0.336],
+        [0.336, 0.314, 0.290, 0.066, 0.072, 0.085, 0.269, 0.334],
+        [0.334, 0.290, 0.193, 0.108, 0.070, 0.149, 0.308, 0.329],
+        [0.331, 0.309, 0.261, 0.254, 0.279, 0.301, 0.322, 0.329],
+        [0.335, 0.329, 0.327, 0.325, 0.324, 0.324, 0.327, 0.330],
+    ],
+    "light": [
+        [1.000, 1.000, 0.993, 0.990, 0.913, 0.976, 1.000, 1.000],
+        [1.000, 0.993, 0.937, 0.758, 0.847, 0.842, 0.974, 0.997],
+        [1.000, 0.936, 0.903, 0.547, 0.635, 0.765, 0.918, 0.993],
+        [0.993, 0.862, 0.573, 0.479, 0.501, 0.699, 0.935, 0.979],
+        [0.988, 0.919, 0.775, 0.753, 0.830, 0.896, 0.958, 0.980],
+        [0.997, 0.980, 0.974, 0.968, 0.965, 0.964, 0.974, 0.982],
+    ],
+    "instance": [
+        [0.000, 0.000, 0.000, 0.016, 0.234, 0.062, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.750, 1.000, 0.891, 0.047, 0.000],
+        [0.000, 0.000, 0.000, 0.984, 1.000, 1.000, 0.203, 0.000],
+        [0.000, 0.000, 0.000, 0.453, 0.859, 0.578, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000],
+    ],
+    "proxy": [
+        [0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.203, 0.734, 0.312, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.531, 1.000, 0.719, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.094, 0.484, 0.141, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000],
+        [0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000, 0.000],
+    ],
+}
+# fmt: on
+"""What :func:`trial_means` gives in the variant llvm_ad_rgb. After a change of the renderer that is meant, its new
+values are taken over once light and picture have been looked at."""
+
+
+def render_trial(**options: Any) -> Layers:
+    """A ball before a wall on a floor, under a lamp and a sky: what is captured and what is added stop the light."""
+    integrator = make_integrator(quality="fast", **options)
+    import mitsuba as mi  # after the variant
+
+    x, y = (values.ravel() for values in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 30)]))
+    floor = _splats(np.column_stack([x, y, np.zeros_like(x)]), (0.03, 0.03, 0.001), 0.4)
+    slab = trimesh.creation.box(bounds=[[-0.5, -0.5, -0.05], [0.5, 0.5, 0]])
+    wall = trimesh.creation.box(bounds=[[-0.2, -0.3, 0], [-0.18, 0.3, 0.15]])
+    ball = trimesh.creation.icosphere(2, 0.1)
+    ball.apply_translation((0.05, 0, 0.1))
+    lamp = mi.ScalarTransform4f().look_at(origin=[0.8, 0.4, 1.0], target=[0, 0, 0], up=[0, 0, 1]).scale(0.1)
+    scene = {
+        "type": "scene",
+        "floor": make_splats_shape(floor, proxy=trimesh.util.concatenate([slab, wall])),
+        "ball": make_splats_shape(
+            _splats(ball.vertices, (0.02, 0.02, 0.02), -0.5), proxy=ball, instance=1, capture_light="uniform"
+        ),
+        "lamp": {"type": "rectangle", "to_world": lamp, "emitter": {"type": "area", "radiance": 30.0}},
+        "sky": {"type": "constant", "radiance": 0.3},
+    }
+    camera = Camera.look_at((0.1, -0.8, 0.6), (0, 0, 0.03), width=8 * BLOCK, height=6 * BLOCK, fov_x=40)
+    return render_layers(integrator, mi.load_dict(scene), camera)
+
+
+def _splats(means: Float64Array, scales: tuple[float, float, float], sh: float) -> Splats:
+    count = len(means)
+    quats, sizes = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(scales, (count, 1))
+    parts = means, quats, sizes, np.full(count, 0.95), np.full((count, 1, 3), sh)
+    return Splats(*(part.astype(np.float32) for part in parts))
+
+
+def trial_means(layers: Layers) -> dict[str, Float64Array]:
+    """Picture, light, and the shares of the ball's splats and proxy: means over squares, shape (6, 8)."""
+    maps = {
+        "picture": layers.rgb.mean(axis=-1),
+        "light": layers.light.mean(axis=-1),
+        "instance": layers.instance == 1,
+        "proxy": layers.proxy_instance == 1,
+    }
+    height, width = layers.alpha.shape
+    shape = height // BLOCK, BLOCK, width // BLOCK, BLOCK
+    return {name: np.float64(values).reshape(shape).mean(axis=(1, 3)) for name, values in maps.items()}
+
+
+def trial_faults(layers: Layers) -> list[str]:
+    """What differs from the known picture."""
+    faults = []
+    for name, means in trial_means(layers).items():
+        worst = float(np.abs(means - KNOWN[name]).max())
+        if not worst <= TOLERANCE:
+            faults.append(f"{name} is off by {worst:.2f}")
+    return faults
+
+
+def main() -> None:
+    """Render in the device that is named, and print."""
+    use_device(sys.argv[1])
+    faults = trial_faults(render_trial())
+    import drjit as dr  # after LLVM was chosen
+
+    sys.stdout.write(json.dumps({"faults": faults, "llvm": ".".join(map(str, dr.detail.llvm_version()))}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Kernels are compiled once: what changes from frame to frame is no part of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.frames.frame import Renderer
+from mitsplat.render.layers import render_layers, render_silhouettes
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.scene import load_scene, plan_frame
+
+WORKCELL = Path(__file__).parents[2] / "scenes/workcell.yaml"
+
+
+def strewn(index: int, assets: list[int]) -> Layout:
+    """A layout of the workcell that nothing has settled: objects side by side over the mat."""
+    instances = []
+    for number, asset in enumerate(assets, start=1):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.06 * (number % 3 - 1), -0.08 + 0.06 * (number // 3 - 1), 0.02
+        instances.append(Instance(number, asset, 0, pose))
+    return Layout(index, tuple(instances), NOTHING_TO_REST)
+
+
+def compiled(renderer: Renderer, index: int, layout: Layout) -> tuple[int, int]:
+    """Kernels that a frame runs, and how many of them no frame before has run."""
+    plan = plan_frame(renderer.scene, index)
+    camera = plan.camera.resized(96, 54)
+    dr.kernel_history_clear()
+    scene = mi.load_dict(renderer.describe(layout, plan.lights))
+    render_layers(renderer.integrator, scene, camera, seed=plan.seed)
+    render_silhouettes(renderer.integrator, scene, camera)
+    run = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+    return len(run), sum(not entry["cache_hit"] or entry["cache_disk"] for entry in run)
+
+
+def test_another_layout_compiles_nothing() -> None:
+    scene = load_scene(WORKCELL)
+    with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.flush_kernel_cache()
+        first = strewn(0, [0, 1, 2, 3, 3])
+        # The first view of a layout makes what its other views share.
+        assert compiled(renderer, 0, first)[1] > 50
+        compiled(renderer, 1, first)
+        for index, layout in (
+            (2, first),
+            (12, strewn(1, [4, 5, 6, 7, 8])),
+            (13, strewn(1, [4, 5, 6, 7, 8])),
+            (24, strewn(2, [9, 2, 10, 11, 5, 4, 3])),
+        ):
+            run, new = compiled(renderer, index, layout)
+            assert run > 50
+            assert new == 0, f"frame {index}: {new} of {run} kernels"

@@ -93,27 +93,36 @@ def bin_gaussians(
     """
     tiles = view.tiles_x * view.tiles_y
     table, owner, local = placement_table(clouds, placements, view)
-    total = dr.width(local)
-    if total == 0:
+    if dr.width(local) == 0:
         return _empty(tiles)
     source = Projector(clouds, table, view, quality, at_camera)
 
     visible, near = source.cull(owner, local)
     index = dr.compress(visible)
-    count = dr.width(index)
-    if count == 0:
+    if dr.width(index) == 0:
         return _empty(tiles)
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     near = dr.gather(mi.Bool, near, index)
     dr.eval(owner, local, near)
 
     records, near_rows, least, box = source.records(owner, local, near)
+    ids = {placement.instance for placement in placements}
+    return bin_records(records, near_rows, least, box, view, quality, ids.pop() if len(ids) == 1 else None)
+
+
+def bin_records(
+    records: Any, near: Any, least: Any, box: Any, view: View, quality: Quality, only: int | None
+) -> TileLists:
+    """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
+
+    Raises:
+        CrowdedError: If there are too many pairs to hold.
+    """
+    tiles = view.tiles_x * view.tiles_y
     pairs = _pair(dr.detach(records), least, box, view, quality)
     if pairs is None:
         return _empty(tiles, records)
-    ids = {placement.instance for placement in placements}
-    only = ids.pop() if len(ids) == 1 else None
-    return _listed(records, near_rows, pairs, count, tiles, view, only)
+    return _listed(records, near, pairs, dr.width(least), tiles, view, only)
 
 
 def _listed(

@@ -129,8 +129,8 @@ def _listed(
     records: Any, near: Any, pairs: _Pairs, visible: int, tiles: int, view: View, only: int | None, own: Any = None
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
-    slots = _sorted(pairs.level, DEPTH_BITS)
-    slots = _sorted(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
+    slots = stable_order(pairs.level, DEPTH_BITS)
+    slots = stable_order(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
     entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
     begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
     start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
@@ -320,7 +320,7 @@ def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any
     return distorted if view.distortion else straight
 
 
-def _sorted(key: Any, bits: int, order: Any | None = None) -> Any:
+def stable_order(key: Any, bits: int, order: Any | None = None) -> Any:
     """Stable order of keys of so many bits: positions in ``key``, which is taken in ``order`` if that is given.
 
     A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.

@@ -106,6 +106,8 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     else:
         sh = dr.zeros(mi.Float, stride * sum(counts))
         for start, c in zip(first, clouds, strict=True):
+            if c.count == 0:  # Dr.Jit adds nothing to arrays of no elements
+                continue
             i = dr.arange(mi.UInt32, c.count * c.sh_stride)
             # Opaque, so that another set of clouds reuses the compiled kernels.
             row = i // c.sh_stride + dr.opaque(mi.UInt32, start)

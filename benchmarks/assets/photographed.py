@@ -19,7 +19,7 @@ from mitsplat.spherical_harmonics import SH_C0
 
 VIEWS, POINTS = 72, 6000
 _NOISE = 0.002
-"""Standard deviation of points, in units of the asset's size; thrice as far behind what a photo shows they are hidden."""
+"""Standard deviation of points in units of the asset's size; thrice as deep behind a photo, they are hidden."""
 _BUSY = 0.3
 
 

@@ -26,6 +26,7 @@ from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians, bin_records
 from mitsplat.plugins.walk import Lanes
 from mitsplat.quality import KERNELS, Quality
+from mitsplat.recorded import Table, recorded
 
 LN_2 = 0.6931471805599453
 
@@ -176,15 +177,65 @@ class Rendering:
 
     def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
         self._lists, self._view, self._quality = lists, view, quality
-        # The way back needs them again, and to undo a lens's distortion takes longer than a march.
-        self._slopes = Lanes(lists, view).centre_slopes()
-        self._image = march(lists, view, quality, slopes=self._slopes)
-        self.rgb, self.alpha = self._image.rgb, self._image.alpha
-        dr.eval(self.rgb, self.alpha)
+        tiles = Table(lists.entries), lists.records, lists.start, lists.stop
+        self.rgb, self.alpha, self._slopes = _image(view.kind, view.numbers, quality, *tiles)
 
     def gradient(self, colour: list[Any], alpha: Any) -> Any:
         """Gradient of the records, flat as they are, from evaluated ones of colour and alpha."""
-        return march_backward(self._lists, self._view, self._quality, self._image, [*colour, alpha], self._slopes)
+        lists, view, seen = self._lists, self._view, [*self.rgb, self.alpha]
+        gradient = [*colour, alpha]
+        if not 0 < lists.pairs <= PAIRS_AT_ONCE:
+            return march_backward(lists, view, self._quality, seen, gradient, self._slopes)
+        tiles = Table(lists.entries), Table(lists.slots), lists.first, lists.records, lists.start, lists.stop
+        room = _room(lists.pairs)
+        return _way_back(view.kind, view.numbers, self._quality, room, *tiles, seen, gradient, self._slopes)
+
+
+def _room(pairs: int) -> int:
+    """A number of pairs that holds for those of many views, at most a quarter more."""
+    step = max(1024, 1 << max(0, pairs.bit_length() - 3))
+    return -(-pairs // step) * step
+
+
+@recorded
+def _image(
+    kind: tuple[Any, ...], numbers: dict[str, Any], quality: Quality, entries: Any, records: Any, start: Any, stop: Any
+) -> tuple[list[Any], Any, Any]:
+    """Colours and alpha of the rays of a view, and their slopes if its lens distorts them."""
+    view = View.of_numbers(kind, numbers)
+    lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
+    # The way back needs them again, and to undo a lens's distortion takes longer than a march.
+    slopes = Lanes(lists, view).centre_slopes()
+    image = march(lists, view, quality, slopes=slopes)
+    return image.rgb, image.alpha, slopes if view.distortion else None
+
+
+@recorded
+def _way_back(
+    kind: tuple[Any, ...],
+    numbers: dict[str, Any],
+    quality: Quality,
+    room: int,
+    entries: Any,
+    slots: Any,
+    first: Any,
+    records: Any,
+    start: Any,
+    stop: Any,
+    seen: list[Any],
+    gradient: list[Any],
+    slopes: Any,
+) -> Any:
+    """Gradient of the view records from those of colours and alpha, with room for so many pairs."""
+    view = View.of_numbers(kind, numbers)
+    lists = _bare_lists(entries, slots, first, records, start, stop, room)
+    return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
+
+
+def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, stop: Any, pairs: int) -> TileLists:
+    """Tile lists of one instance for the order per tile."""
+    visible = dr.width(records) // RECORD
+    return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACE.instance, None)
 
 
 class DepthRendering(Rendering):
@@ -270,19 +321,29 @@ def march_backward(
     lists: TileLists,
     view: View,
     quality: Quality,
-    image: Any,
+    seen: list[Any],
     gradient: list[Any],
-    slopes: tuple[list[Any], list[Any]],
+    slopes: tuple[list[Any], list[Any]] | None,
 ) -> Any:
-    """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha."""
+    """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha.
+
+    Args:
+        lists: Records per tile.
+        view: Camera.
+        quality: Cut-offs.
+        seen: Red, green, blue and alpha.
+        gradient: Of these.
+        slopes: Of the rays, where they are known.
+    """
     if lists.pairs == 0:
         return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
+    slopes = slopes or Lanes(lists, view).centre_slopes()
     if lists.pairs <= PAIRS_AT_ONCE:
-        return _gradient(lists, view, quality, image, gradient, slopes)
+        return _gradient(lists, view, quality, seen, gradient, slopes)
     total = dr.zeros(mi.Float, RECORD * lists.visible)
     for part, lane in _parts(lists):
         us, vs = ([dr.gather(mi.Float, values, lane) for values in axis] for axis in slopes)
-        total += _gradient(part, view, quality, image, gradient, (us, vs))
+        total += _gradient(part, view, quality, seen, gradient, (us, vs))
         dr.eval(total)
     return total
 
@@ -322,11 +383,11 @@ def _gradient(
     lists: TileLists,
     view: View,
     quality: Quality,
-    image: Any,
+    seen: list[Any],
     gradient: list[Any],
     slopes: tuple[list[Any], list[Any]],
 ) -> Any:
-    """The gradient that comes from the tiles of some lists."""
+    """The gradient that comes from the tiles of some lists; they may say that there are more pairs than there are."""
     lanes = Lanes(lists, view)
     us, vs = slopes
     column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE
@@ -338,11 +399,11 @@ def _gradient(
         return [dr.gather(mi.Float, values, p, m) for p, m in zip(lanes.pixel, lanes.inside, strict=True)]
 
     d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
-    whole = list(zip(*(load(c) for c in image.rgb), strict=True))
+    whole = list(zip(*(load(c) for c in seen[:3]), strict=True))
     # What lies behind, weighted with the gradient, less the gradient that reaches alpha through the end of the ray.
     behind = [
         sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
-        for cs, ds, a, d_alpha in zip(whole, d_colour, load(image.alpha), load(gradient[3]), strict=True)
+        for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
     ]
 
     def body(i: Any, light: list[Any], rest: list[Any]) -> tuple[Any, list[Any], list[Any]]:

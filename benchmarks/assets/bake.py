@@ -90,7 +90,8 @@ def measure(arguments: argparse.Namespace) -> None:
         truth = result.asset.mesh if result.surface is None else result.surface
         gap = 1e3 * standoff(Surface(truth), result.asset.pieces)
         print(
-            f"{name}: {len(result.asset.splats)} Gaussians, {seconds:.1f} CPU s, {passed:.1f} s, {result.psnr:.2f} dB (object "
+            f"{name}: {len(result.asset.splats)} Gaussians, {seconds:.1f} CPU s, {passed:.1f} s, "
+            f"{result.psnr:.2f} dB (object "
             f"{result.psnr_object:.2f} dB), {len(result.asset.pieces)} pieces within {gap:.2f} mm, "
             f"mitsplat {mitsplat.__version__}"
         )

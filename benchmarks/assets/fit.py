@@ -29,8 +29,8 @@ import numpy as np
 # isort: on
 from benchmarks.assets.photographed import photograph_asset
 from benchmarks.record import ROOT, figure, recording
+from mitsplat import recorded
 from mitsplat.capture.capture import Capture
-from mitsplat.fit import recorded
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture

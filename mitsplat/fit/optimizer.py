@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray
-from mitsplat.fit.recorded import number, on_device, recorded
 from mitsplat.plugins.backward import Eye, Rendering, gather_gradients, pack_cloud, project_cloud, render_records
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.gaussian import Cloud
 from mitsplat.quality import Quality
+from mitsplat.recorded import recorded
 from mitsplat.splats import Splats
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15

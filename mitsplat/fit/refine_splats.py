@@ -14,11 +14,11 @@ from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.fit.recorded import number, on_device, recorded
 from mitsplat.plugins.backward import Eye
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
+from mitsplat.recorded import recorded
 from mitsplat.render.layers import ensure_variant, make_sensor
 from mitsplat.splats import Splats
 

@@ -21,9 +21,9 @@ from scipy.special import comb
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.fit.recorded import number, on_device, recorded
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.gaussian import rotation_axes
+from mitsplat.recorded import recorded
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 

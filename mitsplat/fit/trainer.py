@@ -27,14 +27,14 @@ from mitsplat.fit.folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.optimizer import Adam, GaussianModel
-from mitsplat.fit.recorded import number, on_device, recorded
 from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, TrainingView, unpacked
 from mitsplat.plugins.backward import DepthRendering
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.photometric import photometric_loss
 from mitsplat.quality import Quality
+from mitsplat.recorded import recorded
 from mitsplat.render.layers import ensure_variant
 from mitsplat.version import __version__
 

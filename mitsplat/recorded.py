@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import wraps
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-
-from mitsplat.plugins.device import wrapped
 
 REPLAY = True
 """Whether recordings are used; without, every call is traced, to the same result."""
@@ -29,10 +27,11 @@ Result = TypeVar("Result")
 def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """A function of arrays on the device whose launches are recorded, and repeated when it is called again.
 
-    What is no array must be hashable, and decides which recording is used, as the widths of all arrays do. Dr.Jit can
-    keep several recordings of a function too, but guesses other widths, and takes some numbers for others. The function
-    must read nothing from the device, compress nothing, take evaluated arrays without gradients, and use nothing that
-    changes but its arguments, which come by position. What it returns is evaluated.
+    What is no array must be hashable, and decides which recording is used, as the widths of arrays do, but for those in
+    a :class:`Table`, in place of which the function gets the array itself. Dr.Jit can keep several recordings of a
+    function too, but guesses other widths, and takes some numbers for others. The function must read nothing from the
+    device, compress nothing, take evaluated arrays without gradients, and use nothing that changes but its arguments,
+    which come by position. What it returns is evaluated.
     """
     recordings: OrderedDict[Any, Callable[[list[Any]], Any]] = OrderedDict()
 
@@ -60,11 +59,18 @@ def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     return call
 
 
+@dataclass(frozen=True, eq=False)
+class Table:
+    """An array of any width that a recorded function only gathers from, in kernels that also take a number."""
+
+    values: Any
+
+
 class _Array(NamedTuple):
-    """Stands for an array."""
+    """Stands for an array; of no width if that may be any."""
 
     kind: type
-    width: int
+    width: int | None
 
 
 class _Keyed(NamedTuple):
@@ -86,6 +92,9 @@ def _form(values: Any, arrays: list[Any]) -> Any:
     if isinstance(values, dr.ArrayBase):
         arrays.append(values)
         return _Array(type(values), dr.width(values))
+    if isinstance(values, Table):
+        arrays.append(values.values)
+        return _Array(type(values.values), None)
     if isinstance(values, dict):
         return _Keyed(tuple(values), tuple([_form(value, arrays) for value in values.values()]))
     if isinstance(values, (list, tuple)) and not hasattr(values, "_fields"):
@@ -102,13 +111,3 @@ def _filled(form: Any, arrays: Iterator[Any]) -> Any:
     if isinstance(form, _Listed):
         return form.kind(_filled(part, arrays) for part in form.parts)
     return form
-
-
-def on_device(*numbers: float) -> Any:
-    """A few numbers that change from step to step, in one array: one copy, and kernels that do not contain them."""
-    return wrapped(mi.Float, np.array(numbers, dtype=np.float32))
-
-
-def number(values: Any, place: int) -> Any:
-    """One of the numbers of :func:`on_device`."""
-    return dr.gather(mi.Float, values, place)

@@ -13,7 +13,8 @@ import subprocess
 import sys
 import tempfile
 from contextlib import suppress
-from pathlib import Path
+
+from mitsplat.device import VISIBLE
 
 CONTROL = "nvidia-cuda-mps-control"
 """The program that starts the service and ends it."""
@@ -33,12 +34,19 @@ assert hit[0]
 """
 """A ray traced by a process of its own: whether the service serves is known when it has."""
 
+_KEEPER = """
+read nothing
+echo quit -t 5 | {control}
+rm -rf {folder}
+"""
+"""Ends the service when its input ends: when that is closed, or this process is gone, however it went."""
+
 _PATIENCE = 60.0
 """How long a trial may take [s]."""
 
 
 class SharedGpu:
-    """The service, started if it can be had; :meth:`close` ends it.
+    """The service, started if it can be had; :meth:`close` ends it, and so does the end of this process.
 
     Attributes:
         environment: Variables with which processes start that use it; none if they take turns, or find it by
@@ -49,6 +57,7 @@ class SharedGpu:
     def __init__(self) -> None:
         self.environment: dict[str, str] = {}
         self.lack = ""
+        self._keeper: subprocess.Popen[bytes] | None = None
         if shutil.which(CONTROL) is None:
             self.lack = f"{CONTROL} of NVIDIA's driver is absent"
         elif _control("get_server_list"):
@@ -58,10 +67,19 @@ class SharedGpu:
 
     def _start(self) -> None:
         folder = tempfile.mkdtemp(prefix="mitsplat-mps-", dir="/tmp")  # a socket's path must be short
-        self.environment = {PIPES: folder, _LOGS: folder}
+        service = {PIPES: folder, _LOGS: folder}
+        self.environment = service | _renumbered(os.environ.get(VISIBLE, ""))
         try:
+            self._keeper = subprocess.Popen(
+                ["/bin/sh", "-c", _KEEPER.format(control=CONTROL, folder=folder)],
+                env=os.environ | service,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C in a terminal is not for it
+            )
             started = subprocess.run(
-                [CONTROL, "-d"], env=os.environ | self.environment, capture_output=True, text=True, check=False
+                [CONTROL, "-d"], env=os.environ | service, capture_output=True, text=True, check=False
             )
             if started.returncode:
                 raise OSError(_last_line(started.stdout + started.stderr))
@@ -81,25 +99,24 @@ class SharedGpu:
 
     def close(self) -> None:
         """End the service, when the processes that use it have ended."""
-        if self.environment:
-            end_service(self.environment)
-            shutil.rmtree(self.environment[PIPES], ignore_errors=True)
-            self.environment = {}
+        keeper, self._keeper, self.environment = self._keeper, None, {}
+        if keeper is not None:
+            with suppress(subprocess.TimeoutExpired):
+                keeper.communicate(timeout=_PATIENCE)
 
 
-def end_service(environment: dict[str, str] | os._Environ[str] = os.environ) -> None:
-    """End the service that an environment names, if :class:`SharedGpu` started it."""
-    if Path(environment.get(PIPES, "")).name.startswith("mitsplat-mps-"):
-        _control("quit -t 5", dict(environment))
+def _renumbered(visible: str) -> dict[str, str]:
+    """GPUs that are made visible by their numbers, as clients must call them: the service counts those it sees anew."""
+    names = visible.split(",")
+    return {VISIBLE: ",".join(map(str, range(len(names))))} if all(name.strip().isdigit() for name in names) else {}
 
 
-def _control(command: str, environment: dict[str, str] | None = None) -> bool:
+def _control(command: str) -> bool:
     """Whether the service is there and does as it is told."""
     with suppress(OSError, subprocess.TimeoutExpired):
         done = subprocess.run(
             [CONTROL],
             input=f"{command}\n",
-            env=os.environ | (environment or {}),
             capture_output=True,
             text=True,
             check=False,

@@ -15,7 +15,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
@@ -24,7 +24,7 @@ from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
 from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
-from mitsplat.engine.mps import SharedGpu, end_service
+from mitsplat.engine.mps import SharedGpu
 from mitsplat.engine.resources import TYPICAL, WorkerMemory, unused_memory
 from mitsplat.engine.shared_arrays import SharedArrays
 from mitsplat.errors import (
@@ -194,16 +194,19 @@ def run_frames(
                     raise
                 yield made
         return
+    if few:
+        most = 1
     # Starting workers one by one would take longer on a GPU than most runs do.
     grow = workers is None and (device is None or not device.gpus)
-    shared = SharedGpu() if device is not None and 0 < len(device.gpus) < most else None
-    if shared is not None and shared.lack:
-        note(f"workers take turns on the GPU, because {shared.lack}")
-    with (
-        closing(_Processes(make, device, shared)) as pool,
-        closing(run_pool(pool, layouts, most, note, grow=grow)) as found,
-    ):
-        yield from found
+    shares = device is not None and 0 < len(device.gpus) < min(most, total)
+    with closing(SharedGpu()) if shares else nullcontext() as shared:
+        if shared is not None and shared.lack:
+            note(f"workers take turns on the GPU, because {shared.lack}")
+        with (
+            closing(_Processes(make, device, {} if shared is None else shared.environment)) as pool,
+            closing(run_pool(pool, layouts, most, note, grow=grow)) as found,
+        ):
+            yield from found
 
 
 def run_apart(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:
@@ -439,9 +442,11 @@ class _Growth:
 class _Processes(Generic[Result]):
     """Workers that are processes of this machine."""
 
-    def __init__(self, make: MakeFrame[Result], device: Device | None, shared: SharedGpu | None = None) -> None:
+    def __init__(
+        self, make: MakeFrame[Result], device: Device | None, environment: Mapping[str, str] | None = None
+    ) -> None:
         self._make = SharedArrays(make)
-        self._shared = shared
+        self._environment = environment or {}
         self._kind = None if device is None else device.kind
         self._gpus = () if device is None else device.gpus
         self._taken: dict[int, Gpu] = {}
@@ -460,7 +465,7 @@ class _Processes(Generic[Result]):
         # Ctrl-C goes to all processes of a terminal, but is for this one only: workers inherit what is blocked.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with starting_on(gpu, **(self._shared.environment if self._shared else {})):
+            with starting_on(gpu, **self._environment):
                 process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
@@ -503,8 +508,6 @@ class _Processes(Generic[Result]):
             process.terminate()
         for worker in list(self._workers):
             self.stop(worker)
-        if self._shared is not None:
-            self._shared.close()
         self._make.close()
 
 
@@ -528,5 +531,4 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
-        end_service()
         os._exit(1)

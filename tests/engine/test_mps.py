@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from mitsplat.device import VISIBLE
 from mitsplat.engine import mps
-from mitsplat.engine.mps import CONTROL, PIPES, SharedGpu, end_service
+from mitsplat.engine.mps import CONTROL, PIPES, SharedGpu
 
 SERVICE = """#!/bin/sh
 # Notes what it is told; serves once it was started, where its environment says.
@@ -24,6 +29,7 @@ echo "$command" >> {log}
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the service was told."""
     monkeypatch.delenv(PIPES, raising=False)
+    monkeypatch.delenv(VISIBLE, raising=False)
     monkeypatch.setattr(mps, "_TRIAL", "pass")
     return tmp_path / "log"
 
@@ -63,7 +69,6 @@ def test_one_that_runs_already_is_used_and_left_alone(
     shared = SharedGpu()
     assert (shared.environment, shared.lack) == ({}, "")
     shared.close()
-    end_service()
     assert told(log) == ["get_server_list"]
 
 
@@ -88,3 +93,39 @@ def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.M
     assert shared.environment == {}
     assert shared.lack == "nvidia-cuda-mps-control does not serve (CUDA_ERROR_MPS_SERVER_NOT_READY)"
     assert told(log)[-1] == "quit -t 5"
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_it_ends_with_the_process_that_started_it(log: Path, monkeypatch: pytest.MonkeyPatch, how: int) -> None:
+    """However that ends: nobody else would end it."""
+    install(log, monkeypatch)
+    code = (
+        "import time, mitsplat.engine.mps as mps; mps._TRIAL = 'pass'; shared = mps.SharedGpu(); "
+        "print(shared.environment[mps.PIPES], flush=True); time.sleep(300)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    with process:
+        assert process.stdout is not None
+        folder = Path(process.stdout.readline().decode().strip())
+        assert (folder / "control").exists()
+        os.killpg(process.pid, how)  # as a terminal does
+    end = time.monotonic() + 60
+    while folder.exists():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert told(log) == ["get_server_list", "-d", "quit -t 5"]
+
+
+@pytest.mark.parametrize(("visible", "own"), [("1", "0"), ("2,3", "0,1"), ("GPU-5e0b", None), ("", None)])
+def test_gpus_count_as_the_service_counts_them(
+    log: Path, monkeypatch: pytest.MonkeyPatch, visible: str, own: str | None
+) -> None:
+    """It sees those that are visible here, from 0: of the second GPU alone, clients would ask for a second one."""
+    monkeypatch.setenv(VISIBLE, visible)
+    install(log, monkeypatch, start=f'[ "$CUDA_VISIBLE_DEVICES" = "{visible}" ] && touch {log.parent}/started; exit')
+    shared = SharedGpu()
+    assert (log.parent / "started").exists()
+    assert shared.environment.get(VISIBLE) == own
+    shared.close()

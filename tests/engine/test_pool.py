@@ -261,6 +261,17 @@ def test_as_many_workers_at_once_as_gpus_hold(monkeypatch, gigabytes, count):
     assert began == ([(count, {"grow": False})] if count > 1 else [device])
 
 
+def test_few_frames_on_another_gpu_take_one_process(monkeypatch):
+    """A process of its own has to see that GPU; more of them would start for as long as the frames take."""
+    began = []
+    monkeypatch.setattr(engine, "affordable_workers", lambda memory, device: 8)
+    monkeypatch.setattr(engine, "SharedGpu", None)
+    monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append(args[2]) or (i for i in ()))
+    device = Device("cuda", (Gpu("other", 2**40, 1, "", "GPU-other"),))
+    list(run_frames(Variant(), {0: range(12)}, workers=None, note=print, device=device))
+    assert began == [1]
+
+
 def test_workers_end_with_their_parent(tmp_path):
     """A parent that is killed leaves no process behind that could still write."""
     script = (

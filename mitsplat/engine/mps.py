@@ -93,8 +93,10 @@ class SharedGpu:
             )
             if trial.returncode:
                 raise OSError(_last_line(trial.stderr))
-        except (OSError, subprocess.TimeoutExpired) as error:
+        except BaseException as error:
             self.close()
+            if not isinstance(error, OSError | subprocess.TimeoutExpired):
+                raise
             self.lack = f"{CONTROL} does not serve ({error})"
 
     def close(self) -> None:

@@ -149,6 +149,9 @@ class FitProgress:
 QUALITY = Quality(transmittance_min=1e-3)
 _EVERY = 25
 """Steps between reports: reading a loss waits for the device."""
+_READERS = 16
+"""Most photos that are read at a time, which takes less than a GPU does to fit them: of 24 megapixels, each takes up to
+0.6 GB meanwhile, as floats twice."""
 _EXTENT = 1.1
 _CHECKPOINT_SECONDS = 60.0
 _LOOK_EVERY = 0.05
@@ -242,7 +245,7 @@ class _Fit:
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        with ThreadPoolExecutor(os.cpu_count()) as threads:  # one by one takes longer than a GPU fits them
+        with ThreadPoolExecutor(min(_READERS, os.cpu_count() or 1)) as threads:
             self.photos = list(
                 threads.map(lambda photo: _training_view(photo, settings, maps.get(photo.name)), training)
             )

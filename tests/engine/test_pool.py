@@ -237,6 +237,20 @@ def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
             list(run_frames(Variant(), {0: [0]}, note=print, device=lost))
 
 
+@pytest.mark.parametrize(("own", "seen"), [("", "0"), ("GPU-a", "GPU-a")])
+def test_workers_share_a_gpu_as_the_service_says(monkeypatch, own, seen):
+    """Its variables are the workers' alone, and a GPU that is one of several has its own name."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
+    gpu = Gpu("a", 80 * 2**30, 0, "", own)
+    with closing(engine._Processes(Variant(), Device("cuda", (gpu,)), {"CUDA_VISIBLE_DEVICES": "0"})) as pool:
+        pool._kind = None  # there is none to take
+        pool.give(pool.start(), 0, 0)
+        while not (answers := list(pool.wait())):
+            pass
+    assert answers[0][1].result[2] == seen
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
+
+
 @dataclass(frozen=True)
 class Variant:
     """Tells of Mitsuba's variant, and of what GPU is visible."""

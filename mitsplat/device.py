@@ -1,8 +1,9 @@
 """Which processor computes: the CPU by ``llvm_ad_rgb``, an NVIDIA GPU by ``cuda_ad_rgb``.
 
-Devices are named ``cpu``, ``cuda`` (the first GPU), ``cuda:N`` (one of several, from 0), ``cuda:all`` (all of them,
-where several processes make a dataset) and ``auto`` (``cuda`` if the driver and OptiX are whole, else ``cpu``). GPUs
-count as in ``CUDA_VISIBLE_DEVICES``; without it in the order of their PCI buses, as in ``nvidia-smi``.
+Devices are named ``cpu``, ``cuda`` (the GPU that CUDA counts first), ``cuda:N`` (one of several, from 0), ``cuda:all``
+(all of them, where several processes make a dataset) and ``auto`` (``cuda`` if the driver and OptiX are whole, else
+``cpu``). N counts as in ``CUDA_VISIBLE_DEVICES``; without it in the order of PCI buses, as in ``nvidia-smi``, where
+CUDA itself begins with the fastest.
 
 A process computes on the first GPU that is visible to it, which is settled when Mitsuba is imported: Dr.Jit starts CUDA
 then. Another one is for a process that starts with :func:`gpu_environment`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -11,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from mitsplat.device import VISIBLE
+from mitsplat.device import VISIBLE, Device, Gpu
 from mitsplat.engine import mps
 from mitsplat.engine.mps import CONTROL, PIPES, SharedGpu
+from mitsplat.engine.pool import run_frames
 
 SERVICE = """#!/bin/sh
 # Notes what it is told; serves once it was started, where its environment says.
@@ -93,6 +95,14 @@ def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.M
     assert shared.environment == {}
     assert shared.lack == "nvidia-cuda-mps-control does not serve (CUDA_ERROR_MPS_SERVER_NOT_READY)"
     assert told(log)[-1] == "quit -t 5"
+
+
+def test_it_is_ended_where_workers_cannot_start(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(log, monkeypatch)
+    device = Device("cuda", (Gpu("One", 2**40, 0, "", ""),))
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        list(run_frames(lambda index, note: index, {0: range(4)}, workers=2, note=print, device=device))
+    assert told(log) == ["get_server_list", "-d", "quit -t 5"]
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])

@@ -22,6 +22,9 @@ CONTROL = "nvidia-cuda-mps-control"
 PIPES = "CUDA_MPS_PIPE_DIRECTORY"
 """Environment variable: where the service is found by processes that are to use it."""
 
+MOST_CLIENTS = 48
+"""Processes that may share a GPU: another one is refused by the service (NVIDIA, "Multi-Process Service")."""
+
 _LOGS = "CUDA_MPS_LOG_DIRECTORY"
 
 _TRIAL = """

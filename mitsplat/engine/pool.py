@@ -24,7 +24,7 @@ from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
 from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
-from mitsplat.engine.mps import SharedGpu
+from mitsplat.engine.mps import MOST_CLIENTS, SharedGpu
 from mitsplat.engine.resources import TYPICAL, WorkerMemory, unused_memory
 from mitsplat.engine.shared_arrays import SharedArrays
 from mitsplat.errors import (
@@ -224,7 +224,8 @@ def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> in
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     most = min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own))
     if device is not None and device.gpus:
-        most = min(most, len(device.gpus) * int(min(gpu.memory for gpu in device.gpus) / memory.gpu))
+        held = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
+        most = min(most, len(device.gpus) * min(held, MOST_CLIENTS))
     return max(1, most)
 
 

@@ -275,6 +275,13 @@ def test_as_many_workers_at_once_as_gpus_hold(monkeypatch, gigabytes, count):
     assert began == ([(count, {"grow": False})] if count > 1 else [device])
 
 
+def test_no_more_workers_than_a_gpu_serves(monkeypatch):
+    monkeypatch.setattr(engine, "unused_memory", lambda: 4096.0)
+    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(256)), raising=False)
+    gpus = tuple(Gpu("large", 288 * 2**30, number, "", "") for number in range(2))
+    assert [engine.affordable_workers(TYPICAL, Device("cuda", gpus[:count])) for count in (1, 2)] == [48, 96]
+
+
 def test_few_frames_on_another_gpu_take_one_process(monkeypatch):
     """A process of its own has to see that GPU; more of them would start for as long as the frames take."""
     began = []

@@ -30,7 +30,7 @@ class Layers(Deferred):
     """What the integrator makes of one view, H x W pixels.
 
     Layers that were rendered stay on the device as long as this does, and come to the host one by one, when they are
-    first looked at.
+    first looked at. Those of one channel may not be written to: copy them.
 
     Through a thin lens, ``rgb``, ``captured`` and ``alpha`` are means over its aperture; all else is what its centre
     sees.

@@ -105,8 +105,8 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
     length = np.abs(pixels[a] - pixels[b]).max(axis=1)
     if len(rings) == 2:  # most often: one part with one hole
         shortest = length.argmin()
-        start, end = (a, b) if ring_of[a[shortest]] == 0 else (b, a)
-        return [(pixels[start[shortest]], rings[1], int(end[shortest]) - len(rings[0]))]
+        outer, inner = (a, b) if ring_of[a[shortest]] == 0 else (b, a)
+        return [(pixels[outer[shortest]], rings[1], int(inner[shortest]) - len(rings[0]))]
     low, high = np.minimum(ring_of[a], ring_of[b]), np.maximum(ring_of[a], ring_of[b])
     shortest = np.lexsort((length, low * len(rings) + high))
     _, first = np.unique((low * len(rings) + high)[shortest], return_index=True)
@@ -134,4 +134,5 @@ def _corners(walk: Int64Array) -> Int64Array:
         return walk
     arriving = walk - np.concatenate([walk[-1:], walk[:-1]])
     x, y = (arriving - np.concatenate([arriving[1:], arriving[:1]])).T
-    return walk[(x != 0) | (y != 0)]
+    turning: Int64Array = walk[(x != 0) | (y != 0)]
+    return turning

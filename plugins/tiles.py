@@ -93,35 +93,44 @@ def bin_gaussians(
     """
     tiles = view.tiles_x * view.tiles_y
     table, owner, local = placement_table(clouds, placements, view)
-    total = dr.width(local)
-    if total == 0:
+    if dr.width(local) == 0:
         return _empty(tiles)
     source = Projector(clouds, table, view, quality, at_camera)
 
     visible, near = source.cull(owner, local)
     index = dr.compress(visible)
-    count = dr.width(index)
-    if count == 0:
+    if dr.width(index) == 0:
         return _empty(tiles)
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     near = dr.gather(mi.Bool, near, index)
     dr.eval(owner, local, near)
 
     records, near_rows, least, box = source.records(owner, local, near)
+    ids = {placement.instance for placement in placements}
+    return bin_records(records, near_rows, least, box, view, quality, ids.pop() if len(ids) == 1 else None)
+
+
+def bin_records(
+    records: Any, near: Any, least: Any, box: Any, view: View, quality: Quality, only: int | None
+) -> TileLists:
+    """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
+
+    Raises:
+        CrowdedError: If there are too many pairs to hold.
+    """
+    tiles = view.tiles_x * view.tiles_y
     pairs = _pair(dr.detach(records), least, box, view, quality)
     if pairs is None:
         return _empty(tiles, records)
-    ids = {placement.instance for placement in placements}
-    only = ids.pop() if len(ids) == 1 else None
-    return _listed(records, near_rows, pairs, count, tiles, view, only)
+    return _listed(records, near, pairs, dr.width(least), tiles, view, only)
 
 
 def _listed(
     records: Any, near: Any, pairs: _Pairs, visible: int, tiles: int, view: View, only: int | None, own: Any = None
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
-    slots = _sorted(pairs.level, DEPTH_BITS)
-    slots = _sorted(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
+    slots = stable_order(pairs.level, DEPTH_BITS)
+    slots = stable_order(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
     entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
     begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
     start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
@@ -311,7 +320,7 @@ def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any
     return distorted if view.distortion else straight
 
 
-def _sorted(key: Any, bits: int, order: Any | None = None) -> Any:
+def stable_order(key: Any, bits: int, order: Any | None = None) -> Any:
     """Stable order of keys of so many bits: positions in ``key``, which is taken in ``order`` if that is given.
 
     A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.

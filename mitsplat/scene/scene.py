@@ -26,7 +26,9 @@ from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.contents import split_of
+from mitsplat.scene.primitives import make_primitives
 from mitsplat.scene.spec import (
+    PRIMITIVES,
     SCHEMA_VERSION,
     CameraHemisphere,
     CameraOrbit,
@@ -173,8 +175,10 @@ def _read_named(spec: SceneSpec, path: Path) -> _Named:
     if spec.environment is not None:
         with _blaming(path, "environment"):
             environment = Asset.load(folder / spec.environment)
-    for keys, name, _ in _object_assets(spec):
-        if name not in assets:
+    for keys, name, entry in _object_assets(spec):
+        if entry.pool == PRIMITIVES:
+            assets |= {} if name in assets else dict(zip(entry.names, make_primitives(spec.seed), strict=True))
+        elif name not in assets:
             with _blaming(path, *keys):
                 assets[name] = Asset.load(folder / name)
     for position, shape in enumerate(spec.shapes):
@@ -238,7 +242,7 @@ def _matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
     """
     objects = list(spec.objects)
     for position, entry in enumerate(objects):
-        if isinstance(entry.pool, str):
+        if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
             with _blaming(path, "objects", position, "pool"):
                 names = _matches(path.parent, entry.pool, allow_outside=allow_outside)
             try:

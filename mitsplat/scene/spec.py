@@ -167,6 +167,11 @@ class ObjectPose(StrictModel):
     rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
 
 
+PRIMITIVES = "primitives"
+"""The pool that needs no folder, see :mod:`mitsplat.scene.primitives`."""
+
+NUM_PRIMITIVES = 15
+
 SIZES = 5
 """How many sizes a range of scales has, evenly spaced in ratio: each is a rigid model of its own in every format."""
 
@@ -179,7 +184,9 @@ class ObjectSpec(StrictModel):
         None,
         exclude_if=lambda pool: pool is None,
         description="Asset folders that every object of the entry is drawn from, or a pattern such as ``assets/*`` "
-        "that takes the objects among the folders that it matches, by name.",
+        "that takes the objects among the folders that it matches, by name. Or ``primitives``: "
+        f"{NUM_PRIMITIVES} boxes, cylinders, spheres, capsules and cones of 25 to 60 mm in random materials, which the "
+        "seed decides and no folder holds.",
     )
     count: CountRange = Field((1, 1), description="How many in each layout: a number or an inclusive range.")
     weights: tuple[Positive, ...] = Field(
@@ -218,8 +225,10 @@ class ObjectSpec(StrictModel):
         for key in ("weights", "balance"):
             if self.pool is None and getattr(self, key):
                 raise FieldError(key, "needs a pool")
-        if isinstance(self.pool, tuple):
-            self.check_weights(len(self.pool))
+        if isinstance(self.pool, tuple) or self.pool == PRIMITIVES:
+            self.check_weights(len(self.names))
+        if self.pool == PRIMITIVES and self.size is not None:
+            raise FieldError("size", "must not be given for primitives, which take a scale")
         if self.poses:
             for key in ("count", "pool"):
                 if key in self.model_fields_set:
@@ -240,9 +249,11 @@ class ObjectSpec(StrictModel):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Asset folders that it draws from; a pattern was replaced by what it matches when the scene was loaded."""
+        """Asset folders, or primitives, that it draws from; a loaded scene has no pattern, but what it matched."""
         if self.asset is not None:
             return (self.asset,)
+        if self.pool == PRIMITIVES:
+            return tuple(f"{PRIMITIVES} {number}" for number in range(NUM_PRIMITIVES))
         return self.pool if isinstance(self.pool, tuple) else ()
 
     @property

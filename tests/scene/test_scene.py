@@ -230,6 +230,15 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
             {"objects__0": {"asset": "assets/nut", "scale": [1, 2], "poses": [{"position": [0, 0, 1]}]}},
             "objects[0].scale: must be one number together with poses",
         ),
+        (
+            {"objects__0": {"pool": "primitives", "weights": [1, 2]}},
+            "objects[0].weights: must be as many as the pool has assets, 15 (got 2)",
+        ),
+        (
+            {"objects__0": {"pool": "primitives", "size": 0.1}},
+            "objects[0].size: must not be given for primitives, which take a scale",
+        ),
+        ({"objects__0": {"pool": "primitives", "scale": 30}}, "objects[0].pool[0]: asset 'box_0' must fit into"),
         ({"empty": 1.5}, "empty: must be <= 1 (got 1.5)"),
         ({"environment": "assets/gone"}, "environment: "),
         ({"shapes__0": {"name": "a", "mesh": "gone.ply"}}, "gone.ply: no such file"),

@@ -7,6 +7,7 @@ specular reflectance. Nothing is traced: uniform light shows what hides nothing 
 from __future__ import annotations
 
 import colorsys
+from dataclasses import replace
 
 import numpy as np
 import trimesh
@@ -25,6 +26,7 @@ _KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
 _EXTENT = (0.025, 0.06)  # longest [m]
 _SURFELS = 1200
 _OPACITY = 0.98
+_LINING = 0.97  # size of the second layer
 
 
 def make_primitives(seed: int) -> tuple[Asset, ...]:
@@ -35,8 +37,9 @@ def make_primitives(seed: int) -> tuple[Asset, ...]:
 def _make(number: int, rng: np.random.Generator) -> Asset:
     kind = _KINDS[number % len(_KINDS)]
     mesh = _solid(kind, rng)
+    mesh.apply_translation(-mesh.center_mass)
     mesh.apply_scale(rng.uniform(*_EXTENT) / mesh.extents.max())
-    surfels = place_surfels(mesh, 1.0, _SURFELS, rng)
+    surfels = _lined(place_surfels(mesh, 1.0, _SURFELS, rng))
     colours = [colorsys.hsv_to_rgb(rng.random(), rng.random(), rng.uniform(0.25, 0.95)) for _ in range(2)]
     second = _pattern(surfels.points / mesh.extents.max(), rng)
     polished = rng.random() < 0.3
@@ -62,8 +65,25 @@ def _solid(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
     if kind == "sphere":
         return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     if kind == "capsule":
-        return trimesh.creation.capsule(height=2 * slim, radius=0.5, count=(16, 32))
+        ends = trimesh.creation.icosphere(subdivisions=3, radius=0.5).vertices
+        return trimesh.convex.convex_hull(np.concatenate([ends - (0, 0, slim), ends + (0, 0, slim)]))
     return trimesh.creation.cone(radius=0.5, height=0.5 + slim, sections=32)
+
+
+def _lined(surfels: Surfels) -> Surfels:
+    """Surfels and a second layer of them a little inside, through whose gaps nothing of the far side is seen.
+
+    Half a turn about z, which takes every solid to itself, puts other surfels behind the gaps.
+    """
+    turn = np.diag([-1.0, -1.0, 1.0])
+    return replace(
+        surfels,
+        points=np.concatenate([surfels.points, _LINING * surfels.points @ turn]),
+        frames=np.concatenate([surfels.frames, turn @ surfels.frames]),
+        scales=np.tile(surfels.scales, (2, 1)),
+        faces=np.tile(surfels.faces, 2),
+        barycentric=np.tile(surfels.barycentric, (2, 1)),
+    )
 
 
 def _pattern(points: Float64Array, rng: np.random.Generator) -> BoolArray:

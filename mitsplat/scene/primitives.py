@@ -66,7 +66,8 @@ def _solid(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
         return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     if kind == "capsule":
         ends = trimesh.creation.icosphere(subdivisions=3, radius=0.5).vertices
-        return trimesh.convex.convex_hull(np.concatenate([ends - (0, 0, slim), ends + (0, 0, slim)]))
+        lift = np.array([0.0, 0.0, slim])
+        return trimesh.convex.convex_hull(np.concatenate([ends - lift, ends + lift]))
     return trimesh.creation.cone(radius=0.5, height=0.5 + slim, sections=32)
 
 

@@ -14,8 +14,10 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-REPLAY = True
-"""Whether recordings are used; without, every call is traced, to the same result."""
+REPLAY: bool | None = None
+"""Whether recordings are used; without, every call is traced, to the same result. None is on CPUs only, as long as no
+recorded fit was compared with a traced one on a GPU (``python -m benchmarks.assets.fit --synthetic spur_gear --device
+cuda --replay on``, and ``off``): Dr.Jit's recordings have replayed wrong values there before."""
 
 _KEPT = 64
 """Recordings of one function: there is one per size of a picture, number of Gaussians and degree of their colours."""
@@ -43,7 +45,7 @@ def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
         def run(arrays: list[Any]) -> Result:
             return function(*_filled(form, iter(arrays)))  # type: ignore[call-arg]
 
-        if not REPLAY:
+        if not (mi.variant().startswith("llvm") if REPLAY is None else REPLAY):
             result = run(arrays)
         else:
             key = mi.variant(), form

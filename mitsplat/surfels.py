@@ -322,11 +322,13 @@ def _closed(
 ) -> Float64Array:
     """``scales`` (N, 3), grown up to ``widest`` (N, 2) until little light passes between discs at ``probes`` (P, 3)."""
     _, index = _query(KDTree(centres), probes, k=min(12, len(centres)))
-    local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], frames[index][..., :2])
-    facing = np.einsum("pkj,pj->pk", frames[index][..., 2], normals) > 0.7
+    own = frames[index]
+    local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], own[..., :2])
+    facing = np.einsum("pkj,pj->pk", own[..., 2], normals) > 0.7
     scales = scales.copy()
     for _ in range(_CLOSING_ROUNDS):
-        response = np.exp(-0.5 * ((local / scales[index][..., :2]) ** 2).sum(axis=2)) * facing
+        across, along = ((local[..., axis] / scales[index, axis]) ** 2 for axis in range(2))
+        response = np.exp(-0.5 * (across + along)) * facing
         leaking = np.prod(1.0 - response, axis=1) > _LEAK
         if not leaking.any():
             break

@@ -50,7 +50,7 @@ def photograph_asset(folder: Path, out: Path, edge: int, *, seed: int = 0) -> Ca
         picture = picture + _BUSY * rng.random(picture.shape) * (1 - alpha)
         files = out / f"{number:03}.png", out / f"mask_{number:03}.png"
         for file, values in zip(files, (picture, layers.alpha), strict=True):
-            Image.fromarray(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).save(file)
+            Image.fromarray(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).save(file, compress_level=1)
         pixels, depth = camera.project(points)
         column, line = np.clip(pixels.astype(int), 0, edge - 1).T
         seen = (layers.alpha[line, column] > 0.9) & (depth < layers.depth[line, column] + 3 * _NOISE * size)

@@ -7,8 +7,10 @@ see :mod:`mitsplat.fit.folder`.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -240,8 +242,13 @@ class _Fit:
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        self.photos = [_training_view(photo, settings, maps.get(photo.name)) for photo in training]
-        self.validation = [_training_view(photo, settings) for photo in validation]
+        with ThreadPoolExecutor(os.cpu_count()) as threads:  # one by one takes longer than a GPU fits them
+            self.photos = list(
+                threads.map(lambda photo: _training_view(photo, settings, maps.get(photo.name)), training)
+            )
+            if settings.coarse > 0:
+                list(threads.map(lambda sight: sight.half, self.photos))
+            self.validation = list(threads.map(lambda photo: _training_view(photo, settings), validation))
         centres = np.array([photo.camera.centre for photo in training])
         self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
         rng = np.random.default_rng([settings.seed, 0])

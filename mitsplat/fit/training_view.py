@@ -60,7 +60,6 @@ class TrainingView:
         camera: Its camera at that size.
         masked: Whether it has a mask that is used.
         inverse_depth: Of its pixels [1/m], (H, W), NaN where unknown; or None.
-        packed: Its pixels on the device, flat, red in the lowest byte, the mask in the highest; see :func:`unpacked`.
     """
 
     def __init__(self, photo: Photo, scale: float, *, masked: bool, inverse_depth: DepthMap | None = None) -> None:
@@ -70,21 +69,35 @@ class TrainingView:
         self.masked = masked and mask is not None
         cover = mask if self.masked and mask is not None else np.ones((height, width), np.float32)
         pixels = np.rint(np.concatenate([rgb, cover[..., None]], axis=2) * 255).astype(np.uint8)
-        # Four bytes per pixel, so that hundreds of photos fit in the device's memory; made to floats in the kernels.
-        self.packed = wrapped(mi.UInt32, pixels.view(np.uint32))
+        self._pixels: npt.NDArray[np.uint8] | None = pixels
         self._photo, self._scale, self._mask_used = photo, scale, masked
         self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
         self._depths: tuple[Any, Any] | None = None
+        self._half: TrainingView | None = None
 
-    @cached_property
+    @property
     def half(self) -> TrainingView:
-        """The same photo at half the size."""
-        return TrainingView(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
+        """The same photo at half the size, read when it is first asked for."""
+        if self._half is None:  # a cached_property of Python 3.11 would let threads take turns
+            self._half = TrainingView(
+                self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth
+            )
+        return self._half
 
     @cached_property
     def eye(self) -> Eye:
         """The camera as the renderer takes it."""
         return Eye(view_of(make_sensor(self.camera)))
+
+    @cached_property
+    def packed(self) -> Any:
+        """Its pixels on the device, flat, red in the lowest byte, the mask in the highest; see :func:`unpacked`.
+
+        Four bytes per pixel, so that hundreds of photos fit in the device's memory; made to floats in the kernels.
+        """
+        pixels = self._bytes
+        self._pixels = None
+        return wrapped(mi.UInt32, pixels.view(np.uint32))
 
     @property
     def mask(self) -> Float32Array:
@@ -98,6 +111,8 @@ class TrainingView:
 
     @property
     def _bytes(self) -> npt.NDArray[np.uint8]:
+        if self._pixels is not None:
+            return self._pixels
         pixels: npt.NDArray[np.uint8] = np.array(self.packed).view(np.uint8)
         return pixels.reshape(self.camera.height, self.camera.width, 4)
 

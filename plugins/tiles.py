@@ -55,6 +55,7 @@ class TileLists:
         first: First of those places of each record, and the number of entries.
         nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
+        least: Depth [m] in front of which no peak of each record lies.
         visible, pairs: Number of records and of entries.
         instance: Id of all of them, or None if they have several.
         levels: What entries are sorted by in their tile.
@@ -69,6 +70,7 @@ class TileLists:
     nearest: Any
     start: Any
     stop: Any
+    least: Any
     visible: int
     pairs: int
     instance: int | None
@@ -113,11 +115,19 @@ def bin_gaussians(
         return _empty(tiles, records)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
-    return _listed(records, near_rows, pairs, count, tiles, view, only)
+    return _listed(records, near_rows, pairs, least, count, tiles, view, only)
 
 
 def _listed(
-    records: Any, near: Any, pairs: _Pairs, visible: int, tiles: int, view: View, only: int | None, own: Any = None
+    records: Any,
+    near: Any,
+    pairs: _Pairs,
+    least: Any,
+    visible: int,
+    tiles: int,
+    view: View,
+    only: int | None,
+    own: Any = None,
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
     slots = _sorted(pairs.level, DEPTH_BITS)
@@ -136,6 +146,7 @@ def _listed(
         nearest=_depth_of_level(levels, view),
         start=start,
         stop=stop,
+        least=least,
         visible=visible,
         pairs=dr.width(entries),
         instance=only,
@@ -149,8 +160,8 @@ def _empty(tiles: int, records: Any | None = None) -> TileLists:
     entry = dr.zeros(mi.UInt32, 1)
     visible = 0 if records is None else dr.width(records) // RECORD
     records = dr.zeros(mi.Float, RECORD) if records is None else records
-    none = dr.zeros(mi.Float, 1)
-    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry)
+    none = dr.zeros(mi.Float, max(visible, 1))
+    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, none, visible, 0, None, entry)
 
 
 def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:
@@ -172,7 +183,23 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
         records, near = shifted, concatenated([first.near, near])
     records = concatenated([first.records, records])
     near = first.near if near is None else near
-    return _listed(records, near, pairs, visible + second.visible, dr.width(tiles), view, None, tiles)
+    least = concatenated([first.least, second.least])
+    return _listed(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
+
+
+def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
+    """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
+    pairs = _pairs_in(lists, chosen, 0)
+    assert pairs is not None
+    number, place, _ = pairs
+    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
+    record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
+    slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
+    level = _level(_least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
+    dr.eval(level)
+    count = dr.width(tiles)
+    again = _Pairs(number, place, level, None)
+    return _listed(lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles)
 
 
 def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:

@@ -13,9 +13,11 @@ with W and C the sums of w_i and of w_i c_i over B, and T the transmittance behi
     a (W c - C),
 
 for one neighbour the well-known a_i a_j T (c_j - c_i). Summed over all Gaussians it is the whole error of a ray, and
-the sum of its absolute values bounds that. B would have to be searched for among all that was blended; what comes late
-mostly lies just in front of the deepest ones, so that W and C are estimated by sums in which whatever was blended counts
-half as much with each new deepest Gaussian. Those are six more numbers in a ray's state.
+the sum of its absolute values bounds that. B would have to be searched for among all that was blended. What comes late
+mostly lies just in front of the deepest ones, so that W and C are estimated from sums S of w_i, w_i c_i and w_i z_i that
+forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of them. Of these sums counts what lies behind
+the late peak z, if they reach evenly from the deepest peak to as far in front of their mean. That is one division for each
+Gaussian and seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
 
 Tiles of pixels in which the estimate exceeds the tolerance are walked again, in the order of each ray.
 """
@@ -91,15 +93,15 @@ T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
 """State of a ray: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and from there
 on the tally of its instances where there are several. Where the error of the order is estimated, that comes last."""
 
-ERROR, DEEPEST, BEHIND = -6, -5, slice(-4, None)
-"""State of the estimate: bound of the error, deepest peak, and what is thought to be behind the next one that is not the
-deepest: weight, red, green, blue."""
+ESTIMATE = 7
+ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
+"""State of the estimate: error, deepest peak, and sums of the last weights and of these times depth, red, green, blue."""
 
 
 def _fresh(several: bool, estimated: bool) -> Pixel:
     """A ray that has met nothing yet."""
     nothing = [mi.Float(0.0) for _ in range(TALLY - 1)]
-    tally, error = new_tally() if several else [], [mi.Float(0.0) for _ in range(6 if estimated else 0)]
+    tally, error = new_tally() if several else [], [mi.Float(0.0) for _ in range(ESTIMATE if estimated else 0)]
     return [mi.Float(1.0), *nothing, *tally, *error]
 
 
@@ -112,24 +114,27 @@ def _blend(pixel: Pixel, weight: Any, record: Any, z: Any, several: bool, estima
         *(dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)),
         dr.fma(weight, z, pixel[SUM_Z]),
         dr.select((pixel[T] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z]),
-        *(add_to_tally(pixel[TALLY : ERROR if estimated else None], weight, record[15]) if several else []),
+        *(add_to_tally(pixel[TALLY : -ESTIMATE if estimated else None], weight, record[15]) if several else []),
         *(_add_to_error(pixel, weight, colour, z) if estimated else []),
     ]
 
 
 def _add_to_error(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> list[Any]:
     """The estimate after one more Gaussian, see the module."""
-    behind = pixel[BEHIND]
-    late = (weight > 0) & (z < pixel[DEEPEST])
+    total, moment, *colours = pixel[SUMS]
+    deepest, opacity = pixel[DEEPEST], weight / pixel[T]
+    met = weight > 0
+    late = met & (z < deepest)
     change = mi.Float(0.0)
-    for c, sum_c in zip(colour, behind[1:], strict=True):
-        change = dr.maximum(change, dr.abs(dr.fma(behind[0], c, -sum_c)))
-    keep = dr.select((weight > 0) & ~late, 0.5, 1.0)
+    for c, sum_c in zip(colour, colours, strict=True):
+        change = dr.maximum(change, dr.abs(dr.fma(total, c, -sum_c)))
+    reach = 2 * dr.fma(deepest, total, -moment)
+    behind = dr.minimum((deepest - z) * total, reach) / reach
+    keep = dr.select(met & ~late, total / dr.fma(2, weight, total), 1.0)
     return [
-        dr.select(late, dr.fma(weight / pixel[T], change, pixel[ERROR]), pixel[ERROR]),
-        dr.select(weight > 0, dr.maximum(z, pixel[DEEPEST]), pixel[DEEPEST]),
-        dr.fma(keep, behind[0], weight),
-        *(dr.fma(keep, sum_c, weight * c) for c, sum_c in zip(colour, behind[1:], strict=True)),
+        dr.select(late & (reach > 0), dr.fma(opacity * behind, change, pixel[ERROR]), pixel[ERROR]),
+        dr.select(met, dr.maximum(z, deepest), deepest),
+        *(dr.fma(keep, old, weight * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -82,7 +83,7 @@ def test_tile_order_equals_the_twin_where_gaussians_do_not_overlap_in_depth() ->
     stack = Splats.concatenate(
         [one((0.1, 0.2, 0.01), mean=(0.0, 0.0, z), opacity=0.4) for z in np.linspace(-0.8, 0.8, 5)]
     )
-    quality = Quality(order="tile", alpha_min=1e-6, transmittance_min=0)
+    quality = Quality(alpha_min=1e-6, transmittance_min=0)
     assert error(render_splats(stack, CAMERA, quality=quality), stack, CAMERA) < 1e-4
 
 
@@ -152,11 +153,11 @@ def test_kernel_of_a_distorted_lens_has_the_size_of_its_pixels() -> None:
 
 
 @pytest.mark.parametrize("count", [20, 200])
-@pytest.mark.parametrize("order", ["tile", "ray"])
-def test_coincident_layers_multiply(count: int, order: str) -> None:
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
+def test_coincident_layers_multiply(count: int, tolerance: float) -> None:
     """K layers of opacity a at one place leave (1 - a)^K of the light."""
     splats = one((50.0, 50.0, 0.001), opacity=0.01, count=count)
-    quality = Quality(order=order, alpha_min=1e-6, transmittance_min=0)
+    quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0)
     alpha = render_splats(splats, CAMERA, quality=quality).alpha
     assert alpha[12, 16] == pytest.approx(1 - 0.99**count, abs=1e-4)
 
@@ -337,7 +338,7 @@ def test_turning_the_camera_changes_no_ray() -> None:
         return float(np.abs(np.array(seen) - seen[0]).max())
 
     assert changes(PRESETS["exact"]) < 1e-5
-    assert 1e-3 < changes(replace(PRESETS["exact"], order="tile")) < 0.2
+    assert 1e-3 < changes(replace(PRESETS["exact"], tolerance=math.inf)) < 0.2
 
 
 def test_one_gaussian_covers_the_whole_image() -> None:

@@ -128,11 +128,11 @@ def _add_to_error(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> list[
     change = mi.Float(0.0)
     for c, sum_c in zip(colour, colours, strict=True):
         change = dr.maximum(change, dr.abs(dr.fma(total, c, -sum_c)))
-    reach = 2 * dr.fma(deepest, total, -moment)
-    behind = dr.minimum((deepest - z) * total, reach) / reach
+    gap, reach = (deepest - z) * total, 2 * dr.fma(deepest, total, -moment)
+    behind = dr.select(gap < reach, gap / reach, 1.0)
     keep = dr.select(met & ~late, total / dr.fma(2, weight, total), 1.0)
     return [
-        dr.select(late & (reach > 0), dr.fma(opacity * behind, change, pixel[ERROR]), pixel[ERROR]),
+        dr.select(late, dr.fma(opacity * behind, change, pixel[ERROR]), pixel[ERROR]),
         dr.select(met, dr.maximum(z, deepest), deepest),
         *(dr.fma(keep, old, weight * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
     ]
@@ -196,15 +196,15 @@ def march(
         dr.eval(lists.nearest)
     several, estimated = lists.instance is None, quality.order == "window" and lists.pairs > 0
 
-    def pixels(dx: float, dy: float, labelled: bool) -> list[Pixel]:
+    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], Any]:
         state = {"several": labelled and several, "estimated": estimated}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
-        return walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
+        found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
+        return ([pixel[:-ESTIMATE] for pixel in found], _too_wrong(found, quality)) if estimated else (found, None)
 
-    found = pixels(0.5, 0.5, labelled=True)
+    found, wrong = pixels(0.5, 0.5, labelled=True)
     image, unsure = _collect(found, lanes, lists.instance)
-    wrong = _too_wrong(found, quality) if estimated else None
     if estimated:
         dr.eval(image, unsure, wrong)  # in one kernel
     # One bit is soon read on a CPU, and mostly saves the launch; a GPU would have to be waited for.
@@ -217,9 +217,9 @@ def march(
         if (2 * x + 1, 2 * y + 1) == (n, n):  # the centre is one of an odd number of samples
             colours.append([*image.rgb, image.alpha])
         else:
-            found = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
+            found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
             colours.append([*_picture(found, lanes)])
-            wrong = wrong | _too_wrong(found, quality) if estimated else None
+            wrong = wrong | also if estimated else None
         dr.eval(colours[-1], wrong)
     *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
     return image if wrong is None else _repaired(image, wrong, lists, view, quality, z_max)

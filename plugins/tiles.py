@@ -131,7 +131,8 @@ def _listed(
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
     slots = _sorted(pairs.level, DEPTH_BITS)
-    slots = _sorted(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
+    # As many bits as numbers of all tiles have, so that lists of a few need no kernels of their own.
+    slots = _sorted(pairs.tile, max(1, (view.tiles_x * view.tiles_y - 1).bit_length()), slots)
     entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
     begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
     start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)

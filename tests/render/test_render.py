@@ -338,7 +338,9 @@ def test_turning_the_camera_changes_no_ray() -> None:
         return float(np.abs(np.array(seen) - seen[0]).max())
 
     assert changes(PRESETS["exact"]) < 1e-5
-    assert 1e-3 < changes(replace(PRESETS["exact"], tolerance=math.inf)) < 0.2
+    tile = changes(replace(PRESETS["exact"], tolerance=math.inf))
+    assert 1e-3 < tile < 0.2
+    assert changes(replace(PRESETS["exact"], tolerance=5e-3)) < 5e-3
 
 
 def test_one_gaussian_covers_the_whole_image() -> None:
@@ -476,10 +478,10 @@ def test_second_frame_needs_no_new_kernel() -> None:
             render_splats(splats, camera)
             return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
 
-    first = kernels(make_splats(200, 25), CAMERA)
+    first = kernels(make_splats(400, 27), CAMERA)  # crowded enough that tiles of both are walked again
     moved = Camera.look_at((0.3, 0.2, -1.9), (0.1, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=42)
     assert first
-    assert kernels(make_splats(300, 26), moved) <= first
+    assert kernels(make_splats(500, 28), moved) <= first
 
 
 @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))

@@ -11,7 +11,7 @@ view records; Dr.Jit's own differentiation carries them on through the projectio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -21,11 +21,12 @@ import numpy as np
 
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.plugins.march import march
-from mitsplat.plugins.project import CloudSet, Placement
+from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import TILE, View
-from mitsplat.plugins.tiles import TileLists, bin_gaussians
+from mitsplat.plugins.tiles import TileLists, bin_gaussians, bin_records
 from mitsplat.plugins.walk import Lanes
 from mitsplat.quality import KERNELS, Quality
+from mitsplat.recorded import Table, recorded
 
 LN_2 = 0.6931471805599453
 
@@ -58,12 +59,21 @@ def render_depth_differentiable(cloud: Cloud, view: View, quality: Quality) -> t
     """
     lists = _bin_cloud(cloud, view, quality)
     rgb, alpha = _march(lists.records, lists, view, quality)
-    row = dr.arange(mi.UInt32, max(1, lists.visible)) * RECORD
-    tinted = dr.copy(lists.records)
-    depth = dr.gather(mi.Float, lists.records, row + 9, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(tinted, depth, row + 6)
-    (moment, _, _), _ = _march(tinted, lists, view, quality)
+    (moment, _, _), _ = _march(_tinted(lists.records), lists, view, quality)
     return rgb, alpha, moment
+
+
+def _tinted(records: Any) -> Any:
+    """View records whose red is the depth of the centre."""
+    row = dr.arange(mi.UInt32, dr.width(records) // RECORD) * RECORD
+    tinted = dr.copy(records)
+    depth = dr.gather(mi.Float, records, row + _DEPTH, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(tinted, depth, row + _RED)
+    return tinted
+
+
+_RED, _DEPTH = 6, 9
+"""Places in a view record."""
 
 
 def _march(records: Any, lists: TileLists, view: View, quality: Quality) -> tuple[list[Any], Any]:
@@ -73,16 +83,191 @@ def _march(records: Any, lists: TileLists, view: View, quality: Quality) -> tupl
 
 
 def _bin_cloud(cloud: Cloud, view: View, quality: Quality) -> TileLists:
+    _check(view, quality)
+    return bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False)
+
+
+def _check(view: View, quality: Quality) -> None:
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
         raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
     if KERNELS[quality.kernel].alpha_max < 1:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
-    clouds = CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
-    eye = Placement(0, _IDENTITY, 1)
-    return bin_gaussians(clouds, [eye], view, quality, at_camera=False)
 
 
-_IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+def _only(cloud: Cloud) -> CloudSet:
+    return CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
+
+
+_PLACE = Placement(0, np.eye(4), 1)
+
+
+class Eye:
+    """A camera as the parts of a training step take it that do not know the number of Gaussians that it sees.
+
+    Attributes:
+        view: The camera.
+        numbers: What cameras of its kind differ in, on the device.
+    """
+
+    def __init__(self, view: View) -> None:
+        nothing = CloudSet((1,), (0,), None, None, None, 0, 0)
+        table, _, _ = placement_table(nothing, [_PLACE], view)
+        self.view, self.numbers = view, view.numbers | {"table": table}
+
+
+def project_cloud(
+    cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality
+) -> tuple[Any, Any, Any, Any]:
+    """View records of all Gaussians of a cloud, least depths, boxes of tiles, and which are seen, not yet evaluated.
+
+    Args:
+        cloud: Gaussians in world space.
+        kind: Of the camera's view.
+        numbers: Those of an :class:`Eye`.
+        quality: Cut-offs and SH degree.
+    """
+    projector = Projector(_only(cloud), numbers["table"], View.of_numbers(kind, numbers), quality, at_camera=False)
+    return projector.every_record(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))
+
+
+def gather_gradients(
+    cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality, found: Any
+) -> None:
+    """Add to the gradients of what a cloud is made of those that reach it from its view records.
+
+    Those of Gaussians that are not seen are zero, where the chain rule says 0 times infinity.
+
+    Args:
+        cloud: From :func:`pack_cloud`, with gradients.
+        kind: Of the camera's view.
+        numbers: Those of an :class:`Eye`.
+        quality: Cut-offs and SH degree.
+        found: Gradients of the records of :func:`project_cloud`.
+    """
+    packed = cloud.geometry, cloud.scales, cloud.sh
+    leaves = [mi.Float(dr.detach(values)) for values in packed]
+    dr.enable_grad(leaves)
+    apart = replace(cloud, geometry=leaves[0], scales=leaves[1], sh=leaves[2])
+    records, _, _, visible = project_cloud(apart, kind, numbers, quality)
+    _send_back(records, found)
+    for values, leaf, width in zip(packed, leaves, (8, 4, cloud.sh_stride), strict=True):
+        own = dr.gather(mi.Bool, visible, dr.arange(mi.UInt32, width * cloud.count) // width)
+        _send_back(values, dr.select(own, dr.grad(leaf), 0))
+
+
+def _send_back(values: Any, gradient: Any) -> None:
+    """Add to the gradients of all that values were made of."""
+    dr.set_grad(values, gradient)
+    dr.enqueue(dr.ADMode.Backward, values)
+    dr.traverse(dr.ADMode.Backward)
+
+
+class Rendering:
+    """An image of view records, and the way back from its gradients to theirs.
+
+    Args:
+        lists: Records per tile.
+        view: Camera.
+        quality: Cut-offs.
+
+    Attributes:
+        rgb: Display-encoded colour times alpha, three flat row-major arrays.
+        alpha: Opacity.
+    """
+
+    def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
+        self._lists, self._view, self._quality = lists, view, quality
+        tiles = Table(lists.entries), lists.records, lists.start, lists.stop
+        self.rgb, self.alpha, self._slopes = _image(view.kind, view.numbers, quality, *tiles)
+
+    def gradient(self, colour: list[Any], alpha: Any) -> Any:
+        """Gradient of the records, flat as they are, from evaluated ones of colour and alpha."""
+        lists, view, seen = self._lists, self._view, [*self.rgb, self.alpha]
+        gradient = [*colour, alpha]
+        if not 0 < lists.pairs <= PAIRS_AT_ONCE:
+            return march_backward(lists, view, self._quality, seen, gradient, self._slopes)
+        tiles = Table(lists.entries), Table(lists.slots), lists.first, lists.records, lists.start, lists.stop
+        room = _room(lists.pairs)
+        return _way_back(view.kind, view.numbers, self._quality, room, *tiles, seen, gradient, self._slopes)
+
+
+def _room(pairs: int) -> int:
+    """A number of pairs that holds for those of many views, at most a quarter more."""
+    step = max(1024, 1 << max(0, pairs.bit_length() - 3))
+    return -(-pairs // step) * step
+
+
+@recorded
+def _image(
+    kind: tuple[Any, ...], numbers: dict[str, Any], quality: Quality, entries: Any, records: Any, start: Any, stop: Any
+) -> tuple[list[Any], Any, Any]:
+    """Colours and alpha of the rays of a view, and their slopes if its lens distorts them."""
+    view = View.of_numbers(kind, numbers)
+    lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
+    # The way back needs them again, and to undo a lens's distortion takes longer than a march.
+    slopes = Lanes(lists, view).centre_slopes()
+    image = march(lists, view, quality, slopes=slopes)
+    return image.rgb, image.alpha, slopes if view.distortion else None
+
+
+@recorded
+def _way_back(
+    kind: tuple[Any, ...],
+    numbers: dict[str, Any],
+    quality: Quality,
+    room: int,
+    entries: Any,
+    slots: Any,
+    first: Any,
+    records: Any,
+    start: Any,
+    stop: Any,
+    seen: list[Any],
+    gradient: list[Any],
+    slopes: Any,
+) -> Any:
+    """Gradient of the view records from those of colours and alpha, with room for so many pairs."""
+    view = View.of_numbers(kind, numbers)
+    lists = _bare_lists(entries, slots, first, records, start, stop, room)
+    return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
+
+
+def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, stop: Any, pairs: int) -> TileLists:
+    """Tile lists of one instance for the order per tile."""
+    visible = dr.width(records) // RECORD
+    return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACE.instance, None)
+
+
+class DepthRendering(Rendering):
+    """A rendering and the sum ``moment`` of the centres' depths [m] by their weights in alpha."""
+
+    def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
+        super().__init__(lists, view, quality)
+        self._depths = Rendering(replace(lists, records=_tinted(lists.records)), view, quality)
+        self.moment = self._depths.rgb[0]
+
+    def gradient_of_moment(self, moment: Any) -> Any:
+        """Gradient of the records from an evaluated one of the moment."""
+        nothing = dr.zeros(mi.Float, dr.width(moment))
+        tinted = self._depths.gradient([moment, nothing, nothing], nothing)
+        entry = dr.arange(mi.UInt32, dr.width(tinted))
+        place = entry % RECORD
+        red = dr.gather(mi.Float, tinted, entry - (_DEPTH - _RED), place == _DEPTH)
+        return dr.select(place == _DEPTH, red, dr.select(place == _RED, 0, tinted))
+
+
+def render_records(
+    records: Any, least: Any, box: Any, view: View, quality: Quality, *, depth: bool = False
+) -> Rendering:
+    """The image of what :func:`project_cloud` found; a :class:`DepthRendering` if it is to have depth.
+
+    Raises:
+        ValueError: As for :func:`render_differentiable`.
+        CrowdedError: If there are too many pairs of a Gaussian and a tile to hold.
+    """
+    _check(view, quality)
+    lists = bin_records(records, None, least, box, view, quality, _PLACE.instance)
+    return (DepthRendering if depth else Rendering)(lists, view, quality)
 
 
 def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, bands: int) -> Cloud:
@@ -120,19 +305,13 @@ class _March(dr.CustomOp):
 
     def eval(self, records: Any, context: Callable[[], tuple[TileLists, View, Quality]]) -> tuple[Any, ...]:
         lists, view, quality = context()
-        self.lists, self.view, self.quality = replace(lists, records=records), view, quality
-        # Backward needs them again, and to undo a lens's distortion takes longer than a march.
-        self.slopes = Lanes(lists, view).centre_slopes()
-        image = march(self.lists, view, quality, slopes=self.slopes)
-        dr.eval(image.rgb, image.alpha)
-        self.image = image
-        return (*image.rgb, image.alpha)
+        self.rendering = Rendering(replace(lists, records=records), view, quality)
+        return (*self.rendering.rgb, self.rendering.alpha)
 
     def backward(self) -> None:
-        gradient = [dr.zeros(mi.Float, dr.width(self.image.alpha)) + g for g in self.grad_out()]
+        gradient = [dr.zeros(mi.Float, dr.width(self.rendering.alpha)) + g for g in self.grad_out()]
         dr.eval(gradient)
-        found = march_backward(self.lists, self.view, self.quality, self.image, gradient, self.slopes)
-        self.set_grad_in("records", found)
+        self.set_grad_in("records", self.rendering.gradient(gradient[:3], gradient[3]))
 
     def name(self) -> str:
         return "march"
@@ -142,19 +321,29 @@ def march_backward(
     lists: TileLists,
     view: View,
     quality: Quality,
-    image: Any,
+    seen: list[Any],
     gradient: list[Any],
-    slopes: tuple[list[Any], list[Any]],
+    slopes: tuple[list[Any], list[Any]] | None,
 ) -> Any:
-    """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha."""
+    """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha.
+
+    Args:
+        lists: Records per tile.
+        view: Camera.
+        quality: Cut-offs.
+        seen: Red, green, blue and alpha.
+        gradient: Of these.
+        slopes: Of the rays, where they are known.
+    """
     if lists.pairs == 0:
         return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
+    slopes = slopes or Lanes(lists, view).centre_slopes()
     if lists.pairs <= PAIRS_AT_ONCE:
-        return _gradient(lists, view, quality, image, gradient, slopes)
+        return _gradient(lists, view, quality, seen, gradient, slopes)
     total = dr.zeros(mi.Float, RECORD * lists.visible)
     for part, lane in _parts(lists):
         us, vs = ([dr.gather(mi.Float, values, lane) for values in axis] for axis in slopes)
-        total += _gradient(part, view, quality, image, gradient, (us, vs))
+        total += _gradient(part, view, quality, seen, gradient, (us, vs))
         dr.eval(total)
     return total
 
@@ -194,11 +383,11 @@ def _gradient(
     lists: TileLists,
     view: View,
     quality: Quality,
-    image: Any,
+    seen: list[Any],
     gradient: list[Any],
     slopes: tuple[list[Any], list[Any]],
 ) -> Any:
-    """The gradient that comes from the tiles of some lists."""
+    """The gradient that comes from the tiles of some lists; they may say that there are more pairs than there are."""
     lanes = Lanes(lists, view)
     us, vs = slopes
     column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE
@@ -210,11 +399,11 @@ def _gradient(
         return [dr.gather(mi.Float, values, p, m) for p, m in zip(lanes.pixel, lanes.inside, strict=True)]
 
     d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
-    whole = list(zip(*(load(c) for c in image.rgb), strict=True))
+    whole = list(zip(*(load(c) for c in seen[:3]), strict=True))
     # What lies behind, weighted with the gradient, less the gradient that reaches alpha through the end of the ray.
     behind = [
         sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
-        for cs, ds, a, d_alpha in zip(whole, d_colour, load(image.alpha), load(gradient[3]), strict=True)
+        for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
     ]
 
     def body(i: Any, light: list[Any], rest: list[Any]) -> tuple[Any, list[Any], list[Any]]:

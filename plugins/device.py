@@ -40,6 +40,16 @@ def concatenated(parts: Sequence[Any]) -> Any:
     return whole
 
 
+def on_device(*numbers: float) -> Any:
+    """A few numbers that change from step to step, in one array: one copy, and kernels that do not contain them."""
+    return wrapped(mi.Float, np.array(numbers, dtype=np.float32))
+
+
+def number(values: Any, place: int) -> Any:
+    """One of the numbers of :func:`on_device`."""
+    return dr.gather(mi.Float, values, place)
+
+
 Columns = TypeVar("Columns")
 
 
@@ -54,7 +64,7 @@ def ray_scene(contents: Mapping[str, Any]) -> mi.Scene:
 
     Embree loses rays that meet an edge which two triangles share, unless it is told not to; OptiX does not.
     """
-    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents})
+    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents}, parallel=False)
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:

@@ -31,6 +31,7 @@ from mitsplat.plugins.emitters import Beam, Emitters, receiver
 from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter
 from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
+from mitsplat.plugins.tiles import stable_order
 
 BLOCK = 8
 """Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
@@ -49,6 +50,9 @@ the scene's lights. Metals reflect more, and keep the rest as it was captured: i
 
 FIRST_RAYS = 4
 """Rays per point after which its error is first estimated."""
+
+LEVEL_BITS = 4
+"""Of how often that number is doubled: 2^15 times it is more than any setting."""
 
 WORD = 32
 """Rays whose fate is kept as bits of one number."""
@@ -153,19 +157,17 @@ def light_factor(
     light_filter = LightFilter(here, view, index)
     tracer = _Tracer(emitters, proxies, here, index, view, seed)
     places = _blockwise(light_filter.place, view)
-    estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), rays)
+    estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), dr.opaque(mi.UInt32, rays), rays)
     if rays < accuracy.most:
         wanted = light_filter.rays_for(estimate, accuracy.error)
-        # Doubled until enough: pixels with the same number of rays go together, so that no lane waits for another.
-        done = rays
-        while done < accuracy.most:
-            more = dr.gather(mi.Float, wanted, places) > dr.opaque(mi.Float, done)
-            places = dr.gather(mi.UInt32, places, dr.compress(more))
-            if not dr.width(places):
-                break
-            extra = min(done, accuracy.most - done)
-            estimate = tracer.trace(places, estimate, extra, first=done)
-            done += extra
+        more = dr.gather(mi.Float, wanted, places) > dr.opaque(mi.Float, rays)
+        places = dr.gather(mi.UInt32, places, dr.compress(more))
+        if dr.width(places):
+            # Doubled until enough; pixels with the same number of rays go together, so that no lane waits for another.
+            level, extra = _doublings(dr.gather(mi.Float, wanted, places), rays, accuracy.most)
+            order = stable_order(level, LEVEL_BITS)
+            places, extra = (dr.gather(mi.UInt32, values, order) for values in (places, extra))
+            estimate = tracer.trace(places, estimate, extra, accuracy.most - rays, first=rays)
     lit, base, shine = light_filter.smooth(estimate)
     share = dr.select(base > 0, lit / base, 1)
     shine *= dr.pi / reference
@@ -187,6 +189,18 @@ def light_factor(
     dr.scatter(light, share, index)
     dr.scatter(highlight, shine, index)
     return light, highlight
+
+
+def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
+    """How often ``rays`` is doubled until it is enough or ``most``, and how many more rays these are."""
+    level, extra = (dr.zeros(mi.UInt32, dr.width(wanted)) for _ in range(2))
+    while rays < most:
+        more, step = wanted > dr.opaque(mi.Float, rays), min(rays, most - rays)
+        level += dr.select(more, mi.UInt32(1), 0)
+        extra += dr.select(more, dr.opaque(mi.UInt32, step), 0)
+        rays += step
+    dr.eval(level, extra)
+    return level, extra
 
 
 def _spread(found: Any, enough: Any, view: View) -> Any:
@@ -255,12 +269,13 @@ class _Tracer:
             stopped = stopped | stopper.stop(ray, surface.instance, self.pixel, active & ~stopped)
         return dr.select(stopped, mi.Float(1), 0)
 
-    def trace(self, places: Any, before: Estimate, rays: int, *, first: int = 0) -> Estimate:
-        """What ``rays`` more rays add to an estimate at the points ``places``, which have had ``first``."""
+    def trace(self, places: Any, before: Estimate, rays: Any, most: int, *, first: int = 0) -> Estimate:
+        """What ``rays`` more rays, ``most`` at the most, add to an estimate at ``places``, which have had ``first``."""
         apart = self.proxies.apart
-        if apart and rays > WORD:
-            for begin in range(0, rays, WORD):
-                before = self.trace(places, before, min(WORD, rays - begin), first=first + begin)
+        if apart and most > WORD:
+            for begin in range(0, most, WORD):
+                part = dr.minimum(dr.maximum(rays, begin) - begin, WORD)
+                before = self.trace(places, before, part, min(WORD, most - begin), first=first + begin)
             return before
         surface = gathered(self.surface, places)
         pixel = dr.gather(mi.UInt32, self.pixel, places)
@@ -271,7 +286,6 @@ class _Tracer:
         cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
         static, casting = self.proxies.static, self.proxies.casting
         stoppers: tuple[Stopper, ...] = casting if static is None else (static, *casting)
-        count = dr.opaque(mi.UInt32, rays)
         known: list[Any] = []
 
         def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:
@@ -294,7 +308,7 @@ class _Tracer:
         if apart:  # a bit for each ray and scene but the last, each by a kernel of its own
             for _ in stoppers[1:]:
                 nothing = dr.zeros(mi.UInt32, dr.width(places))
-                _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < count, note, label="stopped")
+                _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < rays, note, label="stopped")
                 dr.eval(word)
                 known.append(word)
 
@@ -315,8 +329,8 @@ class _Tracer:
 
         sums = [dr.gather(type(v), v, places) for v in (before.lit, before.base, before.shine, before.squares)]
         state = dr.zeros(mi.UInt32, dr.width(places)), *sums
-        _, *sums = dr.while_loop(state, lambda i, *_: i < count, body, label="light")
-        return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(count))
+        _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
+        return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
 
     def bounce(self, grid: RadianceGrid) -> Any:
         """Irradiance (Color3f) from the surroundings over that of display white, averaged over neighbours."""

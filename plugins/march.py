@@ -1,9 +1,9 @@
 """The march: rays through all pixels walk their tiles' lists, see module `walk`, and become an image.
 
 What the order of blending does to the colour of a ray. Let some Gaussians be blended in the order of their peaks, with
-weights w_i and colours c_i, and let one more come, of opacity a, whose peak lies in front of some of them, the set B. In
-its place it takes the share a of the light of B, and is seen through what is in front of B; at the end of the row it is
-also seen through B:
+weights w_i and colours c_i, and let one more come, of opacity a, whose peak lies in front of some of them, the set B.
+In its place it takes the share a of the light of B, and is seen through what is in front of B; at the end of the row it
+is also seen through B:
 
     in its place   sum_front w_i c_i + a (T + W) c + (1 - a) C
     at the end     sum_front w_i c_i + C + a T c
@@ -14,10 +14,10 @@ with W and C the sums of w_i and of w_i c_i over B, and T the transmittance behi
 
 for one neighbour the well-known a_i a_j T (c_j - c_i). Summed over all Gaussians it is the whole error of a ray, and
 the sum of its absolute values bounds that. B would have to be searched for among all that was blended. What comes late
-mostly lies just in front of the deepest ones, so that W and C are estimated from sums S of w_i, w_i c_i and w_i z_i that
-forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of them. Of these sums counts what lies behind
-the late peak z, if they reach evenly from the deepest peak to as far in front of their mean. That is one division for each
-Gaussian and seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
+mostly lies just in front of the deepest ones, so that W and C are estimated from sums of w_i, w_i c_i and w_i z_i that
+forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of them, S being the sum of weights. Of these
+sums counts what lies behind the late peak, if they reach evenly from the deepest peak to as far in front of their mean.
+Those are seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
 
 Tiles of pixels in which the estimate exceeds the tolerance are walked again, in the order of each ray.
 """
@@ -95,7 +95,7 @@ on the tally of its instances where there are several. Where the error of the or
 
 ESTIMATE = 7
 ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
-"""State of the estimate: error, deepest peak, and sums of the last weights and of these times depth, red, green, blue."""
+"""State of the estimate: error, deepest peak, sums of the last weights and of these times depth, red, green, blue."""
 
 
 def _fresh(several: bool, estimated: bool) -> Pixel:

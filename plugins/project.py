@@ -15,6 +15,7 @@ from mitsplat.plugins.gaussian import (
     LOG2_E_HALF,
     RECORD,
     Cloud,
+    Response,
     ellipse_bounds,
     evaluate_sh,
     general_response,
@@ -105,6 +106,8 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     else:
         sh = dr.zeros(mi.Float, stride * sum(counts))
         for start, c in zip(first, clouds, strict=True):
+            if c.count == 0:  # Dr.Jit adds nothing to arrays of no elements
+                continue
             i = dr.arange(mi.UInt32, c.count * c.sh_stride)
             # Opaque, so that another set of clouds reuses the compiled kernels.
             row = i // c.sh_stride + dr.opaque(mi.UInt32, start)
@@ -221,19 +224,40 @@ class Projector:
         count = dr.width(local)
         g = self._load(owner, local)
         response, opacity, _, _, _, box, least = self._bounds(g)
-        colour = self._colour(g["mean"], local)
-        order = dr.arange(mi.UInt32, count)
+        record = self._record(g, response, opacity, local)
         near_rows = None
         near_index = dr.compress(near)
         near_number = dr.zeros(mi.UInt32, count)
         if dr.width(near_index) > 0:
             near_rows = self._near_rows(near_index, owner, local)
             dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
+        record[0], record[2] = dr.select(near, mi.Float(near_number), record[0]), dr.select(near, -1.0, record[2])
+        records, tile_box = _rows(mi.Float, record), _rows(mi.UInt32, self._tile_box(box))
+        least = dr.detach(least)
+        dr.eval(records, tile_box, least)
+        return records, near_rows, least, tile_box
+
+    def every_record(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
+        """View records of all Gaussians, seen or not, least depths, boxes of tiles, and which are seen.
+
+        Boxes of those that are not seen are empty. Unlike after :meth:`cull`, no width depends on the view.
+        """
+        g = self._load(owner, local)
+        response, opacity, _, _, visible, box, least = self._bounds(g)
+        x0, x1, y0, y1 = self._tile_box(box)
+        visible = dr.detach(visible) & (x1 > x0) & (y1 > y0)
+        record = self._record(g, response, opacity, local)
+        boxes = _rows(mi.UInt32, [x0, x1, y0, dr.select(visible, y1, y0)])
+        return _rows(mi.Float, record), dr.detach(least), boxes, visible
+
+    def _record(self, g: dict[str, Any], response: Response, opacity: Any, local: Any) -> list[Any]:
+        """View records of Gaussians that do not reach the camera's plane."""
         scaled = LOG2_E_HALF
-        record = [
-            dr.select(near, mi.Float(near_number), response.u0),
+        colour = self._colour(g["mean"], local)
+        return [
+            response.u0,
             response.v0,
-            dr.select(near, -1.0, response.a * scaled),
+            response.a * scaled,
             response.b2 * scaled,
             response.c * scaled,
             dr.log2(opacity),
@@ -246,13 +270,9 @@ class Projector:
             response.i,
             g["instance"],
         ]
-        records, tile_box = dr.empty(mi.Float, RECORD * count), dr.empty(mi.UInt32, 4 * count)
-        dr.scatter(records, mi.ArrayXf(record), order)
-        x0, x1, y0, y1 = self.view.tile_box(*(dr.detach(side) for side in box))
-        dr.scatter(tile_box, mi.ArrayXu([x0, x1, y0, y1]), order)
-        least = dr.detach(least)
-        dr.eval(records, tile_box, least)
-        return records, near_rows, least, tile_box
+
+    def _tile_box(self, box: tuple[Any, ...]) -> list[Any]:
+        return list(self.view.tile_box(*(dr.detach(side) for side in box)))
 
     def _near_rows(self, index: Any, owner: Any, local: Any) -> Any:
         """General responses of Gaussians at the camera's plane."""
@@ -279,3 +299,11 @@ class Projector:
         # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
         direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
         return evaluate_sh(direction, coefficient, bands)
+
+
+def _rows(kind: Any, columns: list[Any]) -> Any:
+    """Columns side by side, as a flat array of type ``kind``."""
+    count = dr.width(columns)
+    rows = dr.empty(kind, len(columns) * count)
+    dr.scatter(rows, (mi.ArrayXf if kind is mi.Float else mi.ArrayXu)(columns), dr.arange(mi.UInt32, count))
+    return rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Protocol
@@ -159,27 +159,43 @@ class _TraceScene:
                 return None
             nothing = mi.Float([0.0] * 9)
             return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing)
-        corners, normals = [], []
-        for occluder in occluders:
-            turn, shift = occluder.world_from_mesh[:3, :3], occluder.world_from_mesh[:3, 3]
-            corners.append(occluder.mesh.triangles.reshape(-1, 3) @ turn.T + shift)
-            turn = turn / np.cbrt(np.linalg.det(turn))
-            normals.append(smooth_normals(occluder.mesh).reshape(-1, 3) @ turn.T)
-        positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
-        count = sum(len(c) for c in corners)
-        mesh = mi.Mesh("proxies", count, count // 3)
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = positions
-        params["faces"] = dr.arange(mi.UInt32, count)
-        params.update()
-        instances = np.repeat([o.instance for o in occluders], [len(o.mesh.faces) for o in occluders])
-        return cls(
-            ray_scene({"mesh": mesh, **others}),
-            dr.opaque(mi.ShapePtr, mesh),  # its number would be written into kernels, and changes with every layout
-            wrapped(mi.UInt32, instances.astype(np.uint32)),
-            positions,
-            wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
-        )
+        parts = tuple((o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes()) for o in occluders)
+        return _merged(parts, others) if others else _kept(parts, str(mi.variant()))
+
+
+_Parts = tuple[tuple[trimesh.Trimesh, int, bytes], ...]
+"""Meshes, each with its instance id and its pose, 16 floats."""
+
+
+@lru_cache(maxsize=2)
+def _kept(parts: _Parts, _variant: str) -> _TraceScene:
+    """The static meshes, kept from layout to layout, and the last dynamic ones."""
+    return _merged(parts, {})
+
+
+def _merged(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
+    corners, normals = [], []
+    for part, _, pose in parts:
+        world_from_mesh = np.frombuffer(pose).reshape(4, 4)
+        turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
+        corners.append(part.triangles.reshape(-1, 3) @ turn.T + shift)
+        turn = turn / np.cbrt(np.linalg.det(turn))
+        normals.append(smooth_normals(part).reshape(-1, 3) @ turn.T)
+    positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
+    count = sum(len(c) for c in corners)
+    mesh = mi.Mesh("proxies", count, count // 3)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = positions
+    params["faces"] = dr.arange(mi.UInt32, count)
+    params.update()
+    instances = np.repeat([instance for _, instance, _ in parts], [len(part.faces) for part, _, _ in parts])
+    return _TraceScene(
+        ray_scene({"mesh": mesh, **others}),
+        dr.opaque(mi.ShapePtr, mesh),  # its number would be written into kernels, and changes with every layout
+        wrapped(mi.UInt32, instances.astype(np.uint32)),
+        positions,
+        wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
+    )
 
 
 @lru_cache(maxsize=64)

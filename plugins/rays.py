@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -71,6 +72,28 @@ class View:
         """What tells two views apart."""
         lens = self.fx, self.fy, self.cx, self.cy, self.distortion, self.lens, self.shift
         return self.width, self.height, *lens, self.near, self.samples, self.world_from_camera.tobytes()
+
+    @property
+    def kind(self) -> tuple[int, int, int, Lens, int]:
+        """What decides the kernels of a view beside its :attr:`numbers`: size, coefficients, lens, samples."""
+        return self.width, self.height, len(self.distortion), self.lens, self.samples
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What views of one kind differ in, on the device; the pose is in a table of placements."""
+        return self._opaque | ({"extent": self._extent} if self.distortion else {})
+
+    @classmethod
+    def of_numbers(cls, kind: tuple[int, int, int, Lens, int], numbers: Mapping[str, Any]) -> View:
+        """A view that knows no more than its kind and :attr:`numbers`: enough to project, not to march."""
+        view = object.__new__(cls)
+        width, height, coefficients, lens, samples = kind
+        known = {"width": width, "height": height, "distortion": (0.0,) * coefficients, "lens": lens}
+        known |= {"samples": samples, "_opaque": dict(numbers)}
+        if coefficients:
+            known["_extent"] = numbers["extent"]
+        view.__dict__.update(known)
+        return view
 
     @property
     def tiles_x(self) -> int:

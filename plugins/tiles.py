@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -55,11 +55,11 @@ class TileLists:
         first: First of those places of each record, and the number of entries.
         nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
-        least: Depth [m] in front of which no peak of each record lies.
         visible, pairs: Number of records and of entries.
         instance: Id of all of them, or None if they have several.
         levels: What entries are sorted by in their tile.
         tiles: Numbers of the tiles whose ranges these are; None for all of the view's.
+        least: Depth [m] in front of which no peak of each record lies, for tiles that are sorted again.
     """
 
     records: Any
@@ -70,12 +70,12 @@ class TileLists:
     nearest: Any
     start: Any
     stop: Any
-    least: Any
     visible: int
     pairs: int
     instance: int | None
     levels: Any
     tiles: Any | None = None
+    least: Any | None = None
 
 
 def bin_gaussians(
@@ -95,27 +95,36 @@ def bin_gaussians(
     """
     tiles = view.tiles_x * view.tiles_y
     table, owner, local = placement_table(clouds, placements, view)
-    total = dr.width(local)
-    if total == 0:
+    if dr.width(local) == 0:
         return _empty(tiles)
     source = Projector(clouds, table, view, quality, at_camera)
 
     visible, near = source.cull(owner, local)
     index = dr.compress(visible)
-    count = dr.width(index)
-    if count == 0:
+    if dr.width(index) == 0:
         return _empty(tiles)
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     near = dr.gather(mi.Bool, near, index)
     dr.eval(owner, local, near)
 
     records, near_rows, least, box = source.records(owner, local, near)
+    ids = {placement.instance for placement in placements}
+    return bin_records(records, near_rows, least, box, view, quality, ids.pop() if len(ids) == 1 else None)
+
+
+def bin_records(
+    records: Any, near: Any, least: Any, box: Any, view: View, quality: Quality, only: int | None
+) -> TileLists:
+    """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
+
+    Raises:
+        CrowdedError: If there are too many pairs to hold.
+    """
+    tiles = view.tiles_x * view.tiles_y
     pairs = _pair(dr.detach(records), least, box, view, quality)
     if pairs is None:
         return _empty(tiles, records)
-    ids = {placement.instance for placement in placements}
-    only = ids.pop() if len(ids) == 1 else None
-    return _listed(records, near_rows, pairs, least, count, tiles, view, only)
+    return _listed(records, near, pairs, least, dr.width(least), tiles, view, only)
 
 
 def _listed(
@@ -130,9 +139,9 @@ def _listed(
     own: Any = None,
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
-    slots = _sorted(pairs.level, DEPTH_BITS)
+    slots = stable_order(pairs.level, DEPTH_BITS)
     # As many bits as numbers of all tiles have, so that lists of a few need no kernels of their own.
-    slots = _sorted(pairs.tile, max(1, (view.tiles_x * view.tiles_y - 1).bit_length()), slots)
+    slots = stable_order(pairs.tile, max(1, (view.tiles_x * view.tiles_y - 1).bit_length()), slots)
     entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
     begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
     start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
@@ -162,7 +171,7 @@ def _empty(tiles: int, records: Any | None = None) -> TileLists:
     visible = 0 if records is None else dr.width(records) // RECORD
     records = dr.zeros(mi.Float, RECORD) if records is None else records
     none = dr.zeros(mi.Float, max(visible, 1))
-    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, none, visible, 0, None, entry)
+    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, None, none)
 
 
 def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:
@@ -190,9 +199,7 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
 
 def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
     """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
-    pairs = _pairs_in(lists, chosen, 0)
-    assert pairs is not None
-    number, place, _ = pairs
+    number, place, _ = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
     tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
     record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
     slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
@@ -339,7 +346,7 @@ def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any
     return distorted if view.distortion else straight
 
 
-def _sorted(key: Any, bits: int, order: Any | None = None) -> Any:
+def stable_order(key: Any, bits: int, order: Any | None = None) -> Any:
     """Stable order of keys of so many bits: positions in ``key``, which is taken in ``order`` if that is given.
 
     A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.

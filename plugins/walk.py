@@ -31,8 +31,8 @@ Pixel = list[Any]
 
 Blend = Callable[[Pixel, Any, Any, Any], Pixel]
 """The state of a ray after one more Gaussian in front-to-back order: from the state, the Gaussian's weight, which the
-ray loses of its transmittance, its record, and the depth of its peak. A weight of 0 changes nothing. Only the colour and
-the instance of a record are asked for."""
+ray loses of its transmittance, its record, of which colour and instance may be asked for, and the depth of its peak. A
+weight of 0 changes nothing."""
 
 
 class Lanes:

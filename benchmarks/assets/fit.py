@@ -1,6 +1,10 @@
 """Fit a capture here and with gsplat: held-out PSNR and SSIM, and time, in one table.
 
-    python -m benchmarks.assets.fit CAPTURE --variant cuda_ad_rgb --gsplat
+    python -m benchmarks.assets.fit CAPTURE --device cuda --gsplat
+    python -m benchmarks.assets.fit --synthetic spur_gear --device cuda --iterations 3000
+
+The second fits photos of an asset's splats, which it makes itself, with all that a fit does by default, and says what a
+step waits for: its kernels, in a few steps that are timed one kernel at a time, and the rest.
 
 gsplat's side follows its ``examples/simple_trainer.py mcmc``: same photos, split, seeds, losses, rates and budget; its
 D-SSIM is computed by PyTorch's convolutions. gsplat takes pinhole cameras only: undistort a capture's photos first.
@@ -9,57 +13,122 @@ D-SSIM is computed by PyTorch's convolutions. gsplat takes pinhole cameras only:
 from __future__ import annotations
 
 import argparse
+import hashlib
+import statistics
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
-import mitsuba as mi
+# isort: off
+from mitsplat.device import use_device  # which must come before Dr.Jit
+
+import drjit as dr
 import numpy as np
 
-from benchmarks.record import figure, recording
+# isort: on
+from benchmarks.assets.photographed import photograph_asset
+from benchmarks.record import ROOT, figure, recording
+from mitsplat import recorded
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
-from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.fit.training_view import TrainingView
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", type=Path)
+    parser.add_argument("capture", type=Path, nargs="?")
+    parser.add_argument("--synthetic", metavar="ASSET", help="of scenes/assets, in place of a capture")
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--edge", type=int, default=800)
-    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--replay", choices=("on", "off"), help="recordings of kernels, which must change nothing")
     parser.add_argument("--gsplat", action="store_true")
     args = parser.parse_args()
-    mi.set_variant(args.variant)
-    with recording("assets.fit", parser, args, gpu=args.variant.startswith("cuda")):
-        compare(args)
+    if (args.capture is None) == (args.synthetic is None):
+        parser.error("give a capture, or --synthetic")
+    device = use_device(args.device)
+    recorded.REPLAY = None if args.replay is None else args.replay == "on"
+    with recording("assets.fit", parser, args, gpu=device.kind == "cuda"), tempfile.TemporaryDirectory() as folder:
+        settings = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge)
+        if args.synthetic:
+            capture = photograph_asset(ROOT / "scenes/assets" / args.synthetic, Path(folder), args.edge)
+        else:
+            capture = Capture.load(args.capture)
+            settings = replace(
+                settings, masks="off", background="black", coarse=0.0, opacity_weight=0.01, depth_weight=0.0
+            )
+        compare(args, capture, settings)
 
 
-def compare(args: argparse.Namespace) -> None:
-    capture = Capture.load(args.capture)
-    settings = FitSettings(
-        gaussians=args.gaussians,
-        iterations=args.iterations,
-        size=args.edge,
-        masks="off",
-        background="black",
-        coarse=0.0,
-        opacity_weight=0.01,
-        depth_weight=0.0,
-    )
+def compare(args: argparse.Namespace, capture: Capture, settings: FitSettings) -> None:
     print(f"{len(capture.photos)} photos, {args.gaussians} Gaussians, {args.iterations} iterations, {args.edge} px")
     print("fit                  s      PSNR    SSIM   Gaussians")
+    watch = Watch(settings.iterations)
     with tempfile.TemporaryDirectory() as folder:
-        own = fit_capture(capture, folder, settings)
+        own = fit_capture(capture, folder, settings, progress=watch)
+        digest = hashlib.sha256((Path(folder) / "splats.ply").read_bytes()).hexdigest()
     keep("mitsplat", own.seconds, own.psnr, own.ssim, len(own.splats))
-    print(f"mitsplat {args.variant} {own.seconds:7.1f} {own.psnr:7.2f} {own.ssim:7.4f} {len(own.splats)}")
+    print(f"mitsplat {args.device:11} {own.seconds:7.1f} {own.psnr:7.2f} {own.ssim:7.4f} {len(own.splats)}")
+    print(f"    splats.ply has SHA-256 {digest[:16]}")
+    watch.say()
     if args.gsplat:
         seconds, psnr, ssim, count = fit_with_gsplat(capture, settings)
         keep("gsplat", seconds, psnr, ssim, count)
         print(f"gsplat               {seconds:7.1f} {psnr:7.2f} {ssim:7.4f} {count}")
+
+
+class Watch:
+    """Times the steps between a fit's reports, and in one span its kernels.
+
+    Args:
+        iterations: Steps of the fit.
+    """
+
+    def __init__(self, iterations: int) -> None:
+        self.before, self.timed = int(0.7 * iterations), int(0.9 * iterations)
+        self.last: tuple[int, float] | None = None
+        self.spans: list[float] = []
+        self.kernels, self.launches, self.compiled = 0.0, 0.0, 0
+
+    def __call__(self, now: FitProgress) -> None:
+        """Note what the fit reports."""
+        at = time.perf_counter()
+        counting = dr.flag(dr.JitFlag.KernelHistory)
+        if self.last is not None and now.step > self.before:
+            steps = now.step - self.last[0]
+            if counting:
+                history = dr.kernel_history()
+                self.kernels = sum(entry["execution_time"] for entry in history) / steps
+                self.launches = len(history) / steps
+                self.compiled = sum(not entry.get("cache_hit", True) for entry in history)
+                self.timed = 1 << 60
+            else:
+                self.spans.append(1e3 * (at - self.last[1]) / steps)
+        dr.set_flag(dr.JitFlag.KernelHistory, now.step >= self.timed)
+        dr.kernel_history_clear()
+        self.last = now.step, time.perf_counter()
+
+    def say(self) -> None:
+        """Print and keep what a step takes after 70 % of the fit, where the number of Gaussians stays."""
+        dr.set_flag(dr.JitFlag.KernelHistory, False)
+        if not (self.spans and self.launches):
+            return
+        step = statistics.median(self.spans)
+        print(
+            f"    {step:.2f} ms a step, {self.kernels:.2f} of them in kernels, {self.launches:.0f} launches, "
+            f"{self.compiled} kernels compiled in the steps that were watched"
+        )
+        for value, unit, name in (
+            (step, "ms", "step"),
+            (self.kernels, "ms", "kernels"),
+            (self.launches, "", "launches"),
+            (self.compiled, "", "compiled"),
+        ):
+            figure(value, unit, "mitsplat", "a step", name)
 
 
 def keep(name: str, seconds: float, psnr: float, ssim: float, count: int) -> None:

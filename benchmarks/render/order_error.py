@@ -2,10 +2,10 @@
 
     python -m benchmarks.render.order_error [--captures FOLDER] [--size 1280x720] [--names plant boot_100k ...]
 
-For every capture, and for the splats of a layout of the default scene: the rank correlation of the estimate with the true
-error, over pixels where there is one; of the pixels whose error exceeds a tolerance, the share that lies in tiles which
-the estimate names, and how many it misses; and the largest and the root mean square error that repair leaves. Then
-processor seconds of all threads and errors of the presets, against ``exact``; ``before`` is ``balanced`` as it was when
+For every capture, and for the splats of a layout of the default scene: the rank correlation of the estimate with the
+true error, over pixels where there is one; of the pixels whose error exceeds a tolerance, the share that lies in tiles
+which the estimate names, and how many it misses; and the largest and the root mean square error that repair leaves.
+Then processor seconds of all threads and errors of the presets, against ``exact``; ``before`` is ``balanced`` as it was when
 all its rays were walked in their own order. All steps take turns; quote medians and ratios.
 """
 
@@ -160,7 +160,7 @@ def print_presets(name: str, picture: Picture) -> None:
         for key, value, unit in (("cpu", seconds, "s"), ("rmse", error, ""), ("largest", largest, "")):
             figure(value, unit, name, step, key)
         figure(seconds / before, "", name, step, "share of before")
-        print(f"  {step:9s}{seconds:7.3f} s, {seconds / before:5.2f} of before, RMSE {error:.2e}, largest {largest:.4f}")
+        print(f"  {step:9s}{seconds:7.3f} s, {seconds / before:.2f} of before, RMSE {error:.2e}, largest {largest:.4f}")
 
 
 def main() -> None:

@@ -101,6 +101,7 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
         "Formats": ", ".join(content["scene"]["output"]["formats"]),
         "Seed": str(content["scene"]["seed"]),
         "Command": " ; ".join(run["command"] for run in runs) or "unknown",
+        "Device": content.get("device", "cpu"),
         "mitsplat": content["mitsplat"],
     }
     lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -347,7 +348,9 @@ def _hits_nearby(
         mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)),
     )
     hit = scene.ray_intersect_preliminary(rays)
-    normal = np.asarray(hit.compute_surface_interaction(rays).n).T.reshape(origins.shape)
+    facing = hit.compute_surface_interaction(rays).n
+    dr.eval(facing, hit.t)  # together: what is left for later would trace the rays again
+    normal = np.asarray(facing).T.reshape(origins.shape)
     distance = np.asarray(hit.t).reshape(origins.shape[:2])
     alike = np.einsum("nmd,nd->nm", normal, normals) > 0.8
     return np.asarray((distance < reach[:, None]) & alike)
@@ -399,7 +402,7 @@ def _sharpened(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Ar
     if not rounds or len(surfels) < 2:
         return target
     neighbours = min(16, len(surfels))
-    _, index = KDTree(surfels.points).query(surfels.points, k=neighbours)
+    _, index = KDTree(surfels.points).query(surfels.points, k=neighbours, workers=-1)
     offset = surfels.points[:, None] - surfels.points[index]
     local = np.einsum("nkj,nkji->nki", offset, surfels.frames[index]) / surfels.scales[index]
     facing = np.einsum("nkd,nd->nk", surfels.normals[index], surfels.normals) > 0.8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -58,12 +59,7 @@ def _mean_radiance(
     The paths of one mean share a multi-jittered pattern (Kensler 2013), which has several times less noise than
     independent ones.
     """
-    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
-    if sampler.sample_count() == samples:
-        sampler.set_samples_per_wavefront(samples)
-    else:  # a number that has no grid
-        sampler = mi.load_dict({"type": "independent"})
+    integrator, sampler = _path_tracer(bounces, samples, mi.variant())
     sampler.seed(seed, dr.width(directions))
     spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
     # A path that meets a sliver may end in no number, a few of ten million in drawings: the mean is of the others.
@@ -76,6 +72,18 @@ def _mean_radiance(
         np.asarray(dr.block_sum(channel, samples), dtype=np.float64) for channel in (*radiance, hit, number)
     )
     return np.stack(sums, axis=1) / np.maximum(numbers, 1.0)[:, None], hits / samples
+
+
+@lru_cache(maxsize=4)
+def _path_tracer(bounces: int, samples: int, variant: str) -> tuple[Any, Any]:
+    """Integrator and sampler: a GPU traces a picture while they load. To seed the sampler resets it."""
+    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+    if sampler.sample_count() == samples:
+        sampler.set_samples_per_wavefront(samples)
+    else:  # a number that has no grid
+        sampler = mi.load_dict({"type": "independent"})
+    return integrator, sampler
 
 
 def render_mesh(

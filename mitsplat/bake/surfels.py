@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -164,7 +165,7 @@ class _Pool:
         if look.any():
             tree = KDTree(points[look])
             bend[look] = _bend(tree, mesh.face_normals[faces[look]], spacing[faces[look]])
-            extra_bend = bend[look][tree.query(extra[0])[1]]
+            extra_bend = bend[look][_query(tree, extra[0])[1]]
         near = (extra_distance < spacing[extra[1]]) | (extra_bend > _BEND)
         points = np.concatenate([points, extra[0][near]])
         faces = np.concatenate([faces, extra[1][near]])
@@ -190,7 +191,7 @@ def _uneven_faces(mesh: trimesh.Trimesh, spacing: Float64Array, creases: _Crease
 
 def _bend(tree: KDTree, normals: Float64Array, reach: Float64Array) -> Float64Array:
     """Angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of every point of ``tree``."""
-    distance, index = tree.query(tree.data, k=min(10, tree.n))
+    distance, index = _query(tree, tree.data, k=min(10, tree.n))
     cosine = np.einsum("pkd,pd->pk", normals[index], normals)
     return np.asarray(np.arccos(np.clip(np.where(distance < reach[:, None], cosine, 1.0).min(axis=1), -1.0, 1.0)))
 
@@ -208,7 +209,7 @@ def _overhang_limit(pool: _Pool, points: Float64Array, frames: Float64Array, sig
             reach = 2.0 * candidate * sigma[undecided] * frames[undecided, :, axis]
             rise = np.zeros(len(undecided))
             for tips in (points[undecided] + reach, points[undecided] - reach):
-                _, nearest = tree.query(tips)
+                _, nearest = _query(tree, tips)
                 above = np.einsum("nd,nd->n", tips - pool.points[nearest], pool.normals[nearest])
                 rise = np.maximum(rise, above)
             close = rise < _OVERHANG * sigma[undecided, 0]
@@ -236,7 +237,7 @@ def poisson_subset(
         chosen = np.zeros(len(points), dtype=bool)
         chosen[seeds] = True
         rest = np.flatnonzero(~chosen)
-        gap, nearest = KDTree(points[seeds]).query(points[rest], distance_upper_bound=float(radius.max()))
+        gap, nearest = _query(KDTree(points[seeds]), points[rest], distance_upper_bound=float(radius.max()))
         nearest = seeds[np.minimum(nearest, len(seeds) - 1)]
         facing = np.einsum("nd,nd->n", normals[rest], normals[nearest]) > 0.7
         rest = rest[(gap > 0.8 * np.minimum(radius[rest], radius[nearest])) | ~facing]
@@ -249,7 +250,7 @@ def poisson_subset(
         lifted = np.concatenate([points, _NORMAL_WEIGHT * reach * normals], axis=1)
         if kept:
             finer = KDTree(lifted[np.concatenate(kept)])
-            gap, _ = finer.query(lifted[index], distance_upper_bound=0.85 * reach)
+            gap, _ = _query(finer, lifted[index], distance_upper_bound=0.85 * reach)
             index = index[np.isinf(gap)]
         pairs = KDTree(lifted[index]).query_pairs(reach, output_type="ndarray")
         kept.append(index[_independent_set(len(index), pairs, rng)])
@@ -270,6 +271,12 @@ def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) ->
         alive[pairs[winners[pairs[:, 1]], 0]] = False
         pairs = pairs[alive[pairs].all(axis=1)]
     return chosen
+
+
+def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Distances and indices of nearest neighbours, by all processors: no point's answer depends on another's."""
+    found: tuple[npt.NDArray[Any], npt.NDArray[Any]] = tree.query(points, workers=-1, **options)
+    return found
 
 
 def _draw(
@@ -314,12 +321,14 @@ def _closed(
     normals: Float64Array,
 ) -> Float64Array:
     """``scales`` (N, 3), grown up to ``widest`` (N, 2) until little light passes between discs at ``probes`` (P, 3)."""
-    _, index = KDTree(centres).query(probes, k=min(12, len(centres)))
-    local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], frames[index][..., :2])
-    facing = np.einsum("pkj,pj->pk", frames[index][..., 2], normals) > 0.7
+    _, index = _query(KDTree(centres), probes, k=min(12, len(centres)))
+    own = frames[index]
+    local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], own[..., :2])
+    facing = np.einsum("pkj,pj->pk", own[..., 2], normals) > 0.7
     scales = scales.copy()
     for _ in range(_CLOSING_ROUNDS):
-        response = np.exp(-0.5 * ((local / scales[index][..., :2]) ** 2).sum(axis=2)) * facing
+        across, along = ((local[..., axis] / scales[index, axis]) ** 2 for axis in range(2))
+        response = np.exp(-0.5 * (across + along)) * facing
         leaking = np.prod(1.0 - response, axis=1) > _LEAK
         if not leaking.any():
             break
@@ -377,8 +386,8 @@ class _CreaseIndex:
             return near
         local = KDTree(pool.points[near])
         inward, normal = self.inward[self.owner, 0], self.inward[self.owner, 1]
-        spacing = pool.radius[near][local.query(self.tree.data)[1]]
-        distance, index = local.query(self.tree.data + offset * spacing[:, None] * inward, k=np.arange(1, 5))
+        spacing = pool.radius[near][_query(local, self.tree.data)[1]]
+        distance, index = _query(local, self.tree.data + offset * spacing[:, None] * inward, k=np.arange(1, 5))
         index = near[np.minimum(index, len(near) - 1)]
         alike = np.einsum("nkd,nd->nk", pool.normals[index], normal) > 0.9
         alike &= distance < 0.4 * spacing[:, None]
@@ -394,7 +403,7 @@ class _CreaseIndex:
         """Distances (N,) [m] to the nearest crease; infinite beyond ``reach`` [m] or without creases."""
         if self.tree is None:
             return np.full(len(points), np.inf)
-        return np.asarray(self.tree.query(points, distance_upper_bound=reach)[0])
+        return np.asarray(_query(self.tree, points, distance_upper_bound=reach)[0])
 
     def offsets(self, points: Float64Array, count: int) -> tuple[Float64Array, BoolArray]:
         """Vectors (N, ``count``, 3) to the nearest points of the nearest creases, far away without creases.
@@ -403,7 +412,7 @@ class _CreaseIndex:
         """
         if self.tree is None:
             return np.full((len(points), count, 3), 1e6), np.zeros((len(points), count), dtype=bool)
-        _, index = self.tree.query(points, k=np.arange(1, count + 1))
+        _, index = _query(self.tree, points, k=np.arange(1, count + 1))
         segment = self.owner[np.minimum(index, len(self.owner) - 1)]
         from_start = points[:, None] - self.starts[segment]
         position = np.einsum("nkd,nkd->nk", from_start, self.units[segment])

@@ -57,7 +57,7 @@ def _llvm() -> Finding:
     remedy = f"pip install karellen-llvm-core, or set {VARIABLE} to a libLLVM of version {OLDEST_USABLE} or newer"
     number, fault = _try("cpu", {})
     if fault:
-        return Finding("LLVM", False, f"{number or 'LLVM'} from {path} {fault}", remedy)
+        return Finding("LLVM", False, f"{number} from {path} {fault}" if number else f"{path} {fault}", remedy)
     return Finding("LLVM", True, f"{number} from {path} renders the trial scene as it is known")
 
 
@@ -67,7 +67,7 @@ def _try(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
     done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
     if done.returncode:
         said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        return "", f"does not render ({said})"
+        return "", f"does not render ({re.sub('^mitsplat[.]errors[.][A-Za-z]+: ', '', said)})"
     found = json.loads(done.stdout.splitlines()[-1])
     faults = "; ".join(found["faults"])
     return found["llvm"], f"renders the trial scene wrong ({faults})" if faults else ""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -11,13 +12,26 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray
-from mitsplat.plugins.backward import pack_cloud
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.backward import Eye, Rendering, gather_gradients, pack_cloud, project_cloud, render_records
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.gaussian import Cloud
+from mitsplat.quality import Quality
+from mitsplat.recorded import recorded
 from mitsplat.splats import Splats
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15
 """Adam as in 3DGS; mi.ad.Adam forgets all moments when the number of Gaussians changes."""
+
+
+class BandRates(NamedTuple):
+    """Learning rates of SH coefficients: of the constant ones, of the others, and how many there are per channel."""
+
+    constant: float
+    rest: float
+    bands: int
+
+
+Rate = float | BandRates
 
 
 class Adam:
@@ -41,21 +55,24 @@ class Adam:
         """Collect gradients from here on."""
         dr.enable_grad(self.values)
 
-    def update(self, rates: Mapping[str, Any]) -> None:
-        """One step down the gradients, with a rate per parameter: a number, or an array for its elements."""
+    def update(self, rates: Mapping[str, Rate]) -> None:
+        """One step down the gradients, with a rate per parameter."""
         self.steps += 1
         unbias = np.sqrt(1 - _BETA_2**self.steps) / (1 - _BETA_1**self.steps)
-        for name, value in self.values.items():
-            gradient = dr.grad(value)
-            # Exactly in the camera's plane a derivative is undefined, and would stay in the moments for ever.
-            gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+        bands: dict[str, int] = {}
+        pairs: list[float] = []
+        for name in self.values:
             rate = rates[name]
-            rate = dr.opaque(mi.Float, rate * unbias) if isinstance(rate, float) else rate * dr.opaque(mi.Float, unbias)
-            first = dr.lerp(gradient, self.first[name], _BETA_1)
-            second = dr.lerp(gradient * gradient, self.second[name], _BETA_2)
-            self.first[name], self.second[name] = first, second
-            self.values[name] = dr.detach(value) - rate * first / (dr.sqrt(second) + _EPSILON)
-        self._settle()
+            bands[name] = rate.bands if isinstance(rate, BandRates) else 1
+            if isinstance(rate, BandRates):
+                pairs += [float(np.float32(value) * np.float32(unbias)) for value in (rate.constant, rate.rest)]
+            else:
+                pairs += [rate * unbias] * 2
+        numbers = on_device(*pairs)
+        gradients = {name: dr.grad(value) for name, value in self.values.items()}
+        values = dr.detach(self.values)
+        dr.eval(gradients, values)
+        self.values, self.first, self.second = _descend(values, gradients, self.first, self.second, numbers, bands)
 
     def take(self, rows: npt.NDArray[np.uint32], widths: Mapping[str, int], fresh: BoolArray) -> None:
         """Become these rows of the parameters, of so many floats each; ``fresh`` rows lose their moments."""
@@ -89,6 +106,29 @@ class Adam:
 
     def _settle(self) -> None:
         dr.eval(self.values, self.first, self.second)
+
+
+_Arrays = dict[str, Any]
+
+
+@recorded
+def _descend(
+    values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: Any, bands: dict[str, int]
+) -> tuple[_Arrays, _Arrays, _Arrays]:
+    """Parameters and moments after a step; two rates per parameter, that of its constant bands and that of the rest."""
+    values, first, second = dict(values), dict(first), dict(second)
+    for place, (name, value) in enumerate(values.items()):
+        gradient = gradients[name]
+        # Exactly in the camera's plane a derivative is undefined, and would stay in the moments for ever.
+        gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+        rate = number(rates, 2 * place)
+        if bands[name] > 1:
+            element = dr.arange(mi.UInt32, dr.width(value)) % (3 * bands[name])
+            rate = dr.select(element < 3, rate, number(rates, 2 * place + 1))
+        first[name] = dr.lerp(gradient, first[name], _BETA_1)
+        second[name] = dr.lerp(gradient * gradient, second[name], _BETA_2)
+        values[name] = value - rate * first[name] / (dr.sqrt(second[name]) + _EPSILON)
+    return values, first, second
 
 
 class GaussianModel(Adam):
@@ -127,25 +167,53 @@ class GaussianModel(Adam):
 
     def activated(self) -> tuple[Any, Any, Any, Any, Any]:
         """Means [m], quaternions, scales [m], opacities and SH coefficients, flat, with gradients if tracked."""
-        p = self.values
-        return (
-            p["means"] * self._unit,
-            p["quats"],
-            dr.exp(p["scales"]) * self._unit,
-            dr.rcp(1 + dr.exp(-p["opacities"])),
-            p["sh"],
-        )
+        return _activated(self.values, self._unit)
 
     def cloud(self) -> Cloud:
         """The Gaussians as the renderer takes them."""
         return pack_cloud(*self.activated(), self.bands)
 
-    def sh_rates(self, rate: float, rest_rate: float) -> Any:
-        """Rates of the elements of ``sh``: one for the constant coefficients, another for the rest."""
-        if self.bands == 1:
-            return rate
-        element = dr.arange(mi.UInt32, 3 * self.bands * self.count) % (3 * self.bands)
-        return dr.select(element < 3, dr.opaque(mi.Float, rate), dr.opaque(mi.Float, rest_rate))
+    def render(self, eye: Eye, quality: Quality, *, depth: bool = False) -> Rendering:
+        """The Gaussians as a camera sees them, a :class:`DepthRendering` with depth; :meth:`learn` goes back.
+
+        Args:
+            eye: The camera.
+            quality: Cut-offs and SH degree.
+            depth: Whether depths are wanted.
+        """
+        found = _project(dr.detach(self.values), self._unit, eye.view.kind, eye.numbers, quality, self.bands)
+        return render_records(*found, eye.view, quality, depth=depth)
+
+    def learn(
+        self,
+        eye: Eye,
+        quality: Quality,
+        gradients: Sequence[Any],
+        *,
+        opacity_weight: float = 0,
+        scale_weight: float = 0,
+    ) -> None:
+        """Give the parameters the gradients of a loss, for :meth:`update`.
+
+        Args:
+            eye: The camera that the loss looks through.
+            quality: As it was rendered with.
+            gradients: Of the view records, to be added up.
+            opacity_weight: Gradient of the loss by every opacity, beside these.
+            scale_weight: The same by every scale [1/m].
+        """
+        values = dr.detach(self.values)
+        weights = on_device(opacity_weight, scale_weight)
+        found = _gradients(
+            values, self._unit, eye.view.kind, eye.numbers, quality, self.bands, list(gradients), weights
+        )
+        self.track()
+        for name, gradient in found.items():
+            dr.set_grad(self.values[name], gradient)
+
+    def sh_rates(self, rate: float, rest_rate: float) -> Rate:
+        """Rates of ``sh``: one for the constant coefficients, another for the rest."""
+        return rate if self.bands == 1 else BandRates(rate, rest_rate, self.bands)
 
     def splats(self) -> Splats:
         """The Gaussians as they are now."""
@@ -158,6 +226,45 @@ class GaussianModel(Adam):
             sh=sh.reshape(-1, self.bands, 3),
         )
 
-    @property
+    @cached_property
     def _unit(self) -> Any:
         return dr.opaque(mi.Float, self.unit)
+
+
+def _activated(values: _Arrays, unit: Any) -> tuple[Any, Any, Any, Any, Any]:
+    return (
+        values["means"] * unit,
+        values["quats"],
+        dr.exp(values["scales"]) * unit,
+        dr.rcp(1 + dr.exp(-values["opacities"])),
+        values["sh"],
+    )
+
+
+@recorded
+def _project(
+    values: _Arrays, unit: Any, kind: tuple[Any, ...], numbers: _Arrays, quality: Quality, bands: int
+) -> tuple[Any, Any, Any]:
+    """View records of Gaussians, least depths and boxes of tiles."""
+    records, least, box, _ = project_cloud(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality)
+    return records, least, box
+
+
+@recorded
+def _gradients(
+    values: _Arrays,
+    unit: Any,
+    kind: tuple[Any, ...],
+    numbers: _Arrays,
+    quality: Quality,
+    bands: int,
+    found: list[Any],
+    weights: Any,
+) -> _Arrays:
+    """Gradients of parameters from those of their view records, and from weights of opacities and of scales."""
+    values = {name: mi.Float(value) for name, value in values.items()}
+    dr.enable_grad(values)
+    _, _, scales, opacities, _ = _activated(values, unit)
+    dr.backward(dr.sum(opacities) * number(weights, 0) + dr.sum(scales) * number(weights, 1))
+    gather_gradients(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality, sum(found[1:], found[0]))
+    return {name: dr.grad(value) for name, value in values.items()}

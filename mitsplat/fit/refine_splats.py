@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,9 +14,11 @@ from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.plugins.backward import render_differentiable
+from mitsplat.plugins.backward import Eye
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
+from mitsplat.recorded import recorded
 from mitsplat.render.layers import ensure_variant, make_sensor
 from mitsplat.splats import Splats
 
@@ -63,6 +66,8 @@ class RefineSettings:
 
 
 QUALITY = Quality(transmittance_min=1e-3)
+_EVERY = 10
+"""Steps between reports: reading a loss waits for the device."""
 
 
 def refine_splats(
@@ -81,7 +86,7 @@ def refine_splats(
         splats: Where to start.
         pictures: What to come close to.
         settings: Steps and rates.
-        observe: Told after every step its number and its PSNR [dB].
+        observe: Told after every tenth step and the last one its number and its PSNR [dB].
 
     Raises:
         ValueError: If there are no pictures, or no splats.
@@ -90,9 +95,9 @@ def refine_splats(
         raise ValueError(f"refining needs pictures and splats (got {len(pictures)} and {len(splats)})")
     ensure_variant()
     model = GaussianModel(splats, float(np.mean(splats.scales)))
-    views = [view_of(make_sensor(picture.camera)) for picture in pictures]
+    eyes = [Eye(view_of(make_sensor(picture.camera))) for picture in pictures]
     targets = [
-        ([mi.Float(np.ravel(p.rgb[..., c]).astype(np.float32)) for c in range(3)], mi.Float(np.ravel(p.alpha)))
+        ([wrapped(mi.Float, p.rgb[..., c].astype(np.float32)) for c in range(3)], wrapped(mi.Float, p.alpha))
         for p in pictures
     ]
     rng = np.random.default_rng(settings.seed)
@@ -100,17 +105,24 @@ def refine_splats(
     for step in range(settings.iterations):
         order = order or list(rng.permutation(len(pictures)))
         picture = order.pop()
-        model.track()
-        rgb, alpha = render_differentiable(model.cloud(), views[picture], QUALITY)
-        seen, cover = targets[picture]
-        grey = dr.opaque(mi.Float, float(rng.random()))
-        loss = mi.Float(0)
-        for channel, target in zip(rgb, seen, strict=True):
-            loss += dr.mean(dr.square(channel - target + grey * (cover - alpha)))
-        dr.backward(loss)
+        seen = model.render(eyes[picture], QUALITY)
+        colour, alpha, loss = _gradients(seen.rgb, seen.alpha, *targets[picture], on_device(rng.random()))
+        model.learn(eyes[picture], QUALITY, [seen.gradient(colour, alpha)])
         decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
         rates = {name: getattr(settings, f"rate_{name}") * decay for name in model.values}
         model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * settings.rest_rate)})
-        if observe is not None:
+        if observe is not None and (step % _EVERY == 0 or step == settings.iterations - 1):
             observe(step, psnr_of(float(loss.numpy()[0]) / 3))
     return model.splats()
+
+
+@recorded
+def _gradients(rgb: list[Any], alpha: Any, target: list[Any], cover: Any, grey: Any) -> tuple[list[Any], Any, Any]:
+    """Gradients of the loss by colours and by alpha, and the loss."""
+    rgb, alpha = [mi.Float(channel) for channel in rgb], mi.Float(alpha)
+    dr.enable_grad(rgb, alpha)
+    behind, loss = number(grey, 0), mi.Float(0)
+    for channel, wanted in zip(rgb, target, strict=True):
+        loss += dr.mean(dr.square(channel - wanted + behind * (cover - alpha)))
+    dr.backward(loss)
+    return [dr.grad(channel) for channel in rgb], dr.grad(alpha), dr.detach(loss)

@@ -21,8 +21,9 @@ from scipy.special import comb
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.gaussian import rotation_axes
+from mitsplat.recorded import recorded
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 
@@ -164,26 +165,32 @@ def jitter(model: GaussianModel, rate: float, seed: Sequence[int]) -> None:
         rate: Learning rate of the means.
         seed: Two numbers that decide the noise, such as seed and step.
     """
-    p = model.values
-    i = dr.arange(mi.UInt32, model.count)
-    sigma = dr.exp(dr.gather(mi.Vector3f, p["scales"], i))
-    axes = rotation_axes(dr.normalize(dr.gather(mi.Array4f, p["quats"], i)))
-    key, step = (dr.opaque(mi.UInt32, int(value) % 2**32) for value in seed)
+    p = dr.detach(model.values)
+    numbers = wrapped(mi.UInt32, np.array([int(value) % 2**32 for value in seed], dtype=np.uint32))
+    shape = p["scales"], p["quats"], p["opacities"]
+    model.values["means"] = _jittered(p["means"], *shape, on_device(_NOISE * rate), numbers)
+
+
+@recorded
+def _jittered(means: Any, scales: Any, quats: Any, opacities: Any, size: Any, seed: Any) -> Any:
+    i = dr.arange(mi.UInt32, dr.width(opacities))
+    sigma = dr.exp(dr.gather(mi.Vector3f, scales, i))
+    axes = rotation_axes(dr.normalize(dr.gather(mi.Array4f, quats, i)))
+    key, step = (dr.gather(mi.UInt32, seed, place) for place in range(2))
     first = mi.sample_tea_32(i, key + 0x9E3779B9 * step)
     second = mi.sample_tea_32(first[0], first[1])
     uniform = [mi.Float(v >> 8) * 2.0**-24 for v in (*first, *second)]  # below 1, which has no finite normal
     x, y = mi.warp.square_to_std_normal(mi.Point2f(*uniform[:2]))
     z, _ = mi.warp.square_to_std_normal(mi.Point2f(*uniform[2:]))
     noise = mi.Vector3f(x, y, z)
-    faint = dr.rcp(1 + dr.exp(-100 * (DEAD - dr.rcp(1 + dr.exp(-p["opacities"])))))
-    size = dr.opaque(mi.Float, _NOISE * rate) * faint
-    moved = dr.gather(mi.Vector3f, p["means"], i)
+    faint = dr.rcp(1 + dr.exp(-100 * (DEAD - dr.rcp(1 + dr.exp(-opacities)))))
+    gain = number(size, 0) * faint
+    moved = dr.gather(mi.Vector3f, means, i)
     for axis, s in zip(axes, sigma, strict=True):
-        moved += axis * (dr.dot(axis, noise) * s * s * size)
-    means = dr.empty(mi.Float, 3 * model.count)
-    dr.scatter(means, moved, i)
-    dr.eval(means)
-    p["means"] = means
+        moved += axis * (dr.dot(axis, noise) * s * s * gain)
+    result = dr.empty(mi.Float, dr.width(means))
+    dr.scatter(result, moved, i)
+    return result
 
 
 def _draw(weights: Float64Array, count: int, rng: np.random.Generator) -> npt.NDArray[np.intp]:

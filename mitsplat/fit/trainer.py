@@ -7,17 +7,20 @@ see :mod:`mitsplat.fit.folder`.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.camera import Camera
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
@@ -28,10 +31,12 @@ from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.optimizer import Adam, GaussianModel
 from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
-from mitsplat.fit.training_view import HeldOut, TrainingView
-from mitsplat.plugins.backward import render_depth_differentiable, render_differentiable
+from mitsplat.fit.training_view import HeldOut, TrainingView, unpacked
+from mitsplat.plugins.backward import DepthRendering
+from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.photometric import photometric_loss
 from mitsplat.quality import Quality
+from mitsplat.recorded import recorded
 from mitsplat.render.layers import ensure_variant
 from mitsplat.version import __version__
 
@@ -237,8 +242,13 @@ class _Fit:
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        self.photos = [_training_view(photo, settings, maps.get(photo.name)) for photo in training]
-        self.validation = [_training_view(photo, settings) for photo in validation]
+        with ThreadPoolExecutor(os.cpu_count()) as threads:  # one by one takes longer than a GPU fits them
+            self.photos = list(
+                threads.map(lambda photo: _training_view(photo, settings, maps.get(photo.name)), training)
+            )
+            if settings.coarse > 0:
+                list(threads.map(lambda sight: sight.half, self.photos))
+            self.validation = list(threads.map(lambda photo: _training_view(photo, settings), validation))
         centres = np.array([photo.camera.centre for photo in training])
         self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
         rng = np.random.default_rng([settings.seed, 0])
@@ -276,9 +286,7 @@ class _Fit:
         rng = np.random.default_rng([s.seed, 2, self.steps])
         sight = self.photos[number].half if fraction < s.coarse else self.photos[number]
         degree = min(s.sh_degree, int(5 * fraction))
-        self.model.track()
-        loss, error = self._loss(sight, number, replace(QUALITY, sh_degree=degree), fraction, rng)
-        dr.backward(loss)
+        error = self._learn(sight, number, replace(QUALITY, sh_degree=degree), fraction, rng)
         self.densification.look(self.model, sight.camera)
         rate = s.rate_means * 0.01**fraction
         self.model.update(
@@ -303,40 +311,47 @@ class _Fit:
             return 0.0
         return self.settings.depth_weight * (1 if sight.inverse_depth is None else _MAPS_FALL_TO**fraction)
 
-    def _loss(
+    def _learn(
         self, sight: TrainingView, number: int, quality: Quality, fraction: float, rng: np.random.Generator
-    ) -> tuple[Any, Any]:
-        """The loss, and the mean squared error alone."""
+    ) -> Any:
+        """Give the parameters the gradients of the loss of a photo, whose mean squared error it returns."""
         s = self.settings
-        loss = mi.Float(0)
         weight = self._depth_weight(sight, fraction)
-        depths = sight.depths(self.points) if weight > 0 else ()
-        if depths and dr.width(depths[0]):
-            rgb, alpha, moment = render_depth_differentiable(self.model.cloud(), sight.view, quality)
-            loss += dr.opaque(mi.Float, weight * self.extent) * _depth_error(alpha, moment, *depths)
-        else:
-            rgb, alpha = render_differentiable(self.model.cloud(), sight.view, quality)
-        target, mask = sight.pixels()
+        pixel, inverse = sight.depths(self.points) if weight > 0 else (mi.UInt32(), mi.Float())
+        known = dr.width(pixel)
+        seen = self.model.render(sight.eye, quality, depth=known > 0)
+        behind = rng.random(3) if s.background == "random" else np.zeros(3)
+        numbers = on_device(*behind, weight * self.extent, 1 / max(known, 1))
+        recipe = _Recipe(
+            sight.camera.width,
+            sight.camera.height,
+            s.ssim_share,
+            s.alpha_weight if s.masks == "alpha" and sight.masked else None,
+            only_masked=s.masks == "ignore",
+            background=s.background == "random",
+        )
+        correction = (
+            (self.exposure.values["exposure"], wrapped(mi.UInt32, np.array([number], dtype=np.uint32)))
+            if s.exposure
+            else None
+        )
+        depth = (seen.moment, _depth_image(sight.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
+        gradient, error = _gradients(seen.rgb, seen.alpha, depth, sight.packed, correction, numbers, recipe)
+        records = [seen.gradient(gradient["rgb"], gradient["alpha"])]
+        if isinstance(seen, DepthRendering):
+            records.append(seen.gradient_of_moment(gradient["moment"]))
         if s.exposure:
             self.exposure.track()
-            rgb = _exposed(rgb, alpha, self.exposure.values["exposure"], number, len(self.photos))
-        if s.masks == "ignore":
-            rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
-        if s.background == "random":
-            behind = [dr.opaque(mi.Float, float(value)) for value in rng.random(3)]
-            rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
-            target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
-        camera = sight.camera
-        loss += photometric_loss(rgb, target, camera.width, camera.height, s.ssim_share)
-        if s.masks == "alpha" and sight.masked:
-            loss += s.alpha_weight * dr.mean(dr.abs(alpha - mask))
-        _, _, scales, opacities, _ = self.model.activated()
-        # Means by opaque counts: a literal one would compile the kernels anew whenever Gaussians are added.
-        loss += dr.sum(opacities) * dr.opaque(mi.Float, s.opacity_weight / self.model.count)
-        loss += dr.sum(scales) * dr.opaque(mi.Float, self.scale_weight / (3 * self.model.count * self.extent))
-        error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
-        dr.schedule(error)
-        return loss, error
+            dr.set_grad(self.exposure.values["exposure"], gradient["exposure"])
+        count = self.model.count
+        self.model.learn(
+            sight.eye,
+            quality,
+            records,
+            opacity_weight=s.opacity_weight / count,
+            scale_weight=self.scale_weight / (3 * count * self.extent),
+        )
+        return error
 
     def report(self) -> FitProgress:
         """Where the fit stands; looks now and then at the photos that the target is for."""
@@ -386,17 +401,90 @@ def _densification(settings: FitSettings, start: int) -> Densification:
     return Mcmc(s.gaussians, start, s.refine_every, s.seed)
 
 
-def _depth_error(alpha: Any, moment: Any, pixel: Any, inverse: Any) -> Any:
-    """Mean difference between inverse depths [1/m] at pixels, all different, as splats have them and should have."""
+class _Recipe(NamedTuple):
+    """What decides the kernels of a loss."""
+
+    width: int
+    height: int
+    ssim_share: float
+    alpha_weight: float | None
+    only_masked: bool
+    background: bool
+
+
+@recorded
+def _gradients(
+    rgb: list[Any],
+    alpha: Any,
+    depth: tuple[Any, Any] | None,
+    packed: Any,
+    correction: tuple[Any, Any] | None,
+    numbers: Any,
+    recipe: _Recipe,
+) -> tuple[dict[str, Any], Any]:
+    """Gradients of the loss of one photo, and the mean squared error of its pixels.
+
+    Args:
+        rgb: What the splats show, three flat row-major arrays.
+        alpha: Their opacity.
+        depth: Moment of depth, and inverse depths that are known, see :func:`_depth_image`.
+        packed: Pixels of the photo.
+        correction: The table of colour corrections, and which one is the photo's.
+        numbers: What is behind the splats, red, green and blue; weight of depth; inverse number of known depths.
+        recipe: What else there is to the loss.
+
+    Returns:
+        Gradients of ``rgb``, ``alpha``, and of the ``moment`` and ``exposure`` where there are such; and the error.
+    """
+    inputs: dict[str, Any] = {"rgb": [mi.Float(c) for c in rgb], "alpha": mi.Float(alpha)}
+    if depth is not None:
+        inputs["moment"] = mi.Float(depth[0])
+    if correction is not None:
+        inputs["exposure"] = mi.Float(correction[0])
+    dr.enable_grad(inputs)
+    rgb, alpha, loss = inputs["rgb"], inputs["alpha"], mi.Float(0)
+    if depth is not None:
+        loss += number(numbers, 3) * number(numbers, 4) * _depth_error(alpha, inputs["moment"], depth[1])
+    target, mask = unpacked(packed)
+    if correction is not None:
+        table = inputs["exposure"]
+        rgb = _exposed(rgb, alpha, table, correction[1], dr.width(table) // 12)
+    if recipe.only_masked:
+        rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
+    if recipe.background:
+        behind = [number(numbers, channel) for channel in range(3)]
+        rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
+        target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
+    loss += photometric_loss(rgb, target, recipe.width, recipe.height, recipe.ssim_share)
+    if recipe.alpha_weight is not None:
+        loss += recipe.alpha_weight * dr.mean(dr.abs(alpha - mask))
+    error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
+    dr.backward(loss)
+    return {name: dr.grad(value) for name, value in inputs.items()}, error
+
+
+def _depth_image(camera: Camera, pixel: Any, inverse: Any) -> Any:
+    """Inverse depths [1/m] at pixels, all different, as an image, flat and row-major; NaN where there are none."""
+    image = dr.full(mi.Float, dr.nan, camera.width * camera.height)
+    dr.scatter(image, inverse, pixel)
+    dr.eval(image)
+    return image
+
+
+def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
+    """Sum of the differences between inverse depths [1/m] as splats have them and as an image has them."""
+    known = dr.isfinite(inverse)
+    wanted = dr.select(known, inverse, 0)
+    # Gathered, because gradients of the layers themselves would be rounded with those that they have elsewhere.
+    pixel = dr.arange(mi.UInt32, dr.width(inverse))
     cover, depth = (dr.gather(mi.Float, layer, pixel, mode=dr.ReduceMode.NoConflicts) for layer in (alpha, moment))
-    seen = (cover > 0.1) & (depth > 0)
-    found = dr.select(seen, cover / dr.select(seen, depth, 1), inverse)
-    return dr.sum(dr.abs(found - inverse)) * dr.opaque(mi.Float, 1 / dr.width(pixel))
+    seen = known & (cover > 0.1) & (depth > 0)
+    found = dr.select(seen, cover / dr.select(seen, depth, 1), wanted)
+    return dr.sum(dr.abs(found - wanted))
 
 
-def _exposed(rgb: list[Any], alpha: Any, table: Any, number: int, photos: int) -> list[Any]:
+def _exposed(rgb: list[Any], alpha: Any, table: Any, place: Any, photos: int) -> list[Any]:
     """Premultiplied colours after the affine correction of a photo; the table has its twelve entries photo by photo."""
-    place = dr.opaque(mi.UInt32, number)
     m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
     return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
 

@@ -19,7 +19,7 @@ from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
 from mitsplat.fit.image_metrics import psnr, ssim
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.plugins.backward import render_differentiable
+from mitsplat.plugins.backward import Eye
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.sensors import view_of
 from mitsplat.quality import Quality
@@ -69,21 +69,35 @@ class TrainingView:
         self.masked = masked and mask is not None
         cover = mask if self.masked and mask is not None else np.ones((height, width), np.float32)
         pixels = np.rint(np.concatenate([rgb, cover[..., None]], axis=2) * 255).astype(np.uint8)
-        # Four bytes per pixel, so that hundreds of photos fit in memory; made to floats in the kernels.
-        self._packed = pixels.view(np.uint32).ravel()
+        self._pixels: npt.NDArray[np.uint8] | None = pixels
         self._photo, self._scale, self._mask_used = photo, scale, masked
         self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
         self._depths: tuple[Any, Any] | None = None
+        self._half: TrainingView | None = None
 
-    @cached_property
+    @property
     def half(self) -> TrainingView:
-        """The same photo at half the size."""
-        return TrainingView(self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth)
+        """The same photo at half the size, read when it is first asked for."""
+        if self._half is None:  # a cached_property of Python 3.11 would let threads take turns
+            self._half = TrainingView(
+                self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth
+            )
+        return self._half
 
     @cached_property
-    def view(self) -> Any:
+    def eye(self) -> Eye:
         """The camera as the renderer takes it."""
-        return view_of(make_sensor(self.camera))
+        return Eye(view_of(make_sensor(self.camera)))
+
+    @cached_property
+    def packed(self) -> Any:
+        """Its pixels on the device, flat, red in the lowest byte, the mask in the highest; see :func:`unpacked`.
+
+        Four bytes per pixel, so that hundreds of photos fit in the device's memory; made to floats in the kernels.
+        """
+        pixels = self._bytes
+        self._pixels = None
+        return wrapped(mi.UInt32, pixels.view(np.uint32))
 
     @property
     def mask(self) -> Float32Array:
@@ -97,14 +111,10 @@ class TrainingView:
 
     @property
     def _bytes(self) -> npt.NDArray[np.uint8]:
-        pixels: npt.NDArray[np.uint8] = self._packed.view(np.uint8)
+        if self._pixels is not None:
+            return self._pixels
+        pixels: npt.NDArray[np.uint8] = np.array(self.packed).view(np.uint8)
         return pixels.reshape(self.camera.height, self.camera.width, 4)
-
-    def pixels(self) -> tuple[list[Any], Any]:
-        """Display-encoded colour times mask, and the mask, flat on the device."""
-        packed = wrapped(mi.UInt32, self._packed)
-        red, green, blue, mask = (mi.Float((packed >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24))
-        return [red * mask, green * mask, blue * mask], mask
 
     def depths(self, points: Float64Array) -> tuple[Any, Any]:
         """Pixels and inverse depths [1/m] on the device: of its map, else of the points (N, 3) that the photo sees."""
@@ -130,9 +140,9 @@ class TrainingView:
 
     def render(self, model: GaussianModel, quality: Quality) -> tuple[Float32Array, Float32Array]:
         """Display-encoded colour times alpha, (H, W, 3), and alpha, (H, W), as the splats look from here."""
-        rgb, alpha = render_differentiable(model.cloud(), self.view, quality)
+        seen = model.render(self.eye, quality)
         shape = self.camera.height, self.camera.width
-        return np.stack([np.array(c).reshape(shape) for c in rgb], axis=-1), np.array(alpha).reshape(shape)
+        return np.stack([np.array(c).reshape(shape) for c in seen.rgb], axis=-1), np.array(seen.alpha).reshape(shape)
 
     def compare(self, seen: Float32Array, folder: Path | None) -> HeldOut:
         """A render (H, W, 3) against the photo; writes them and their difference, 4 times as bright, side by side."""
@@ -154,3 +164,9 @@ class TrainingView:
             psnr_object=psnr(seen[shown], truth[shown]),
             psnr_corrected=psnr(corrected, truth[shown]),
         )
+
+
+def unpacked(packed: Any) -> tuple[list[Any], Any]:
+    """Display-encoded colour times mask, and the mask, of the pixels of a :class:`TrainingView`."""
+    red, green, blue, mask = (mi.Float((packed >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24))
+    return [red * mask, green * mask, blue * mask], mask

@@ -160,7 +160,7 @@ class Renderer:
             frames = [renderer.render(index) for index in range(12)]
 
     It takes no device, because that is Mitsuba's variant, of which a process has one (see :mod:`mitsplat.variant`): a
-    second renderer could not keep to another. ``mi.set_variant("cuda_ad_rgb")`` before the first one takes the GPU.
+    second renderer could not keep to another. ``ms.use_device("cuda")`` before the first one takes the GPU.
 
     Attributes:
         scene: The scene.
@@ -211,7 +211,8 @@ class Renderer:
             with _timed(seconds, "settle"):
                 layout = self._settle(plan.layout)
         with _timed(seconds, "place"):
-            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights))
+            # Its few parts are made sooner than threads are woken.
+            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights), parallel=False)
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):

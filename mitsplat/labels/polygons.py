@@ -88,25 +88,25 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
     position = pixels @ (1, shape[1])
     order = np.argsort(position, kind="stable")
     shared = np.flatnonzero(np.diff(position[order]) == 0)  # walls one pixel thick belong to the rings of both sides
-    here, beside = order[shared], order[shared + 1]
-    apart = ring_of[here] != ring_of[beside]
-    pairs = [(here[apart], beside[apart])]
+    a, b = order[shared], order[shared + 1]
+    apart = ring_of[a] != ring_of[b]
+    pairs = [(a[apart], b[apart])]
     ring_near = ring_of[near]
     everything, ahead, behind = slice(None), slice(1, None), slice(-1)
-    for one, other in (
+    for here, beside in (
         ((everything, behind), (everything, ahead)),
         ((behind, everything), (ahead, everything)),
         ((behind, behind), (ahead, ahead)),
         ((behind, ahead), (ahead, behind)),
     ):
-        border = ring_near[one] != ring_near[other]
-        pairs.append((near[one][border], near[other][border]))
+        border = ring_near[here] != ring_near[beside]
+        pairs.append((near[here][border], near[beside][border]))
     a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     length = np.abs(pixels[a] - pixels[b]).max(axis=1)
     if len(rings) == 2:  # most often: one part with one hole
-        shortest = length.argmin()
-        start, end = (a, b) if ring_of[a[shortest]] == 0 else (b, a)
-        return [(pixels[start[shortest]], rings[1], int(end[shortest]) - len(rings[0]))]
+        nearest = int(length.argmin())
+        one, other = (a, b) if ring_of[a[nearest]] == 0 else (b, a)
+        return [(pixels[one[nearest]], rings[1], int(other[nearest]) - len(rings[0]))]
     low, high = np.minimum(ring_of[a], ring_of[b]), np.maximum(ring_of[a], ring_of[b])
     shortest = np.lexsort((length, low * len(rings) + high))
     _, first = np.unique((low * len(rings) + high)[shortest], return_index=True)
@@ -129,9 +129,10 @@ def _corners(walk: Int64Array) -> Int64Array:
     if len(walk) == 1:
         return walk
     x, y = (walk - np.concatenate([walk[-1:], walk[:-1]])).T
-    walk = walk[(x != 0) | (y != 0)]
+    walk = walk[np.logical_or(x, y)]
     if len(walk) == 1:
         return walk
     arriving = walk - np.concatenate([walk[-1:], walk[:-1]])
     x, y = (arriving - np.concatenate([arriving[1:], arriving[:1]])).T
-    return walk[(x != 0) | (y != 0)]
+    corners: Int64Array = walk[np.logical_or(x, y)]
+    return corners

@@ -94,7 +94,13 @@ def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -
 def make_sensor(camera: Camera) -> Any:
     """A camera as the sensor plugin ``opencv_camera``."""
     ensure_variant()
-    return mi.load_dict(describe_sensor(camera))
+    return mi.load_dict(describe_sensor(camera), parallel=False)
+
+
+@lru_cache(maxsize=1)
+def _sensor_of(camera: Camera, _variant: str) -> Any:
+    """The sensor of the last camera, through which a frame is looked at twice."""
+    return make_sensor(camera)
 
 
 def describe_sensor(camera: Camera) -> dict[str, Any]:
@@ -166,7 +172,7 @@ def _alone(splats: Splats, variant: str) -> tuple[Any, Any]:
 
 def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
     """Run the integrator; each layer comes to the host when it is first looked at, see :class:`Layers`."""
-    layers = integrator.render_layers(scene, make_sensor(camera), seed=seed)
+    layers = integrator.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
     refuse_lost_rays()
     return Layers.on_device(layers, (camera.height, camera.width))
 
@@ -205,6 +211,6 @@ def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
 
 def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
     """Every instance as it would be seen alone, by its ``splats`` or by its ``proxies``, see the integrator plugin."""
-    silhouettes = dict(integrator.silhouettes(scene, make_sensor(camera), source=source))
+    silhouettes = dict(integrator.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
     refuse_lost_rays()
     return silhouettes

@@ -108,7 +108,7 @@ def test_an_llvm_that_does_not_load(monkeypatch, libraries):
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", libraries)
     finding = doctor._llvm()
     assert not finding.ok and "karellen-llvm-core" in finding.remedy
-    assert finding.text.startswith(f"LLVM from {libraries} does not render (")
+    assert finding.text.startswith(f"{libraries} does not render (Dr.Jit has found no LLVM")
 
 
 def missing(name):

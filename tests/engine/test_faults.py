@@ -152,6 +152,31 @@ def test_a_worker_that_is_killed_costs_nothing(scene, tmp_path, undisturbed):
     assert contents(tmp_path / "out") == undisturbed
 
 
+@dataclass(frozen=True)
+class TooLarge:
+    """Renders, but one frame takes more memory than there is."""
+
+    index: int
+
+    def __call__(self, scene, index, *, layout):
+        if index == self.index:
+            raise RuntimeError("jit_malloc(): out of memory! Could not allocate 9 GiB of device memory.")
+        return render(scene, index, layout=layout)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_memory_that_runs_out_costs_no_frame(scene, tmp_path, undisturbed, workers):
+    out = tmp_path / "out"
+    with pytest.raises(
+        MissingResourceError, match=r"^frame 7 cannot be made: memory has run out \(jit_malloc.*are kept$"
+    ):
+        write(scene, out, render=TooLarge(7), workers=workers)
+    kept = lines(out)
+    assert kept >= 7
+    assert write(scene, out).rendered == 20 - kept
+    assert contents(out) == undisturbed
+
+
 def test_no_room_in_a_file(scene, tmp_path, undisturbed):
     """A limit on the size of files stops the run like a full disk does, also within the manifest's line."""
     out = tmp_path / "out"

@@ -380,11 +380,14 @@ def test_weight_of_maps_falls_and_that_of_points_does_not(capture: Capture) -> N
     assert state._depth_weight(dense, 0.0) == 0
 
 
-def test_depth_error_is_the_mean_difference_of_inverse_depths() -> None:
+def test_depth_error_is_the_difference_of_inverse_depths_that_are_known() -> None:
     ensure_variant()
+    camera = replace(look(np.ones(3)), width=2, height=2)
     alpha, moment = mi.Float([1.0, 0.5, 0.05, 1.0]), mi.Float([2.0, 2.0, 1.0, 5.0])
-    found = fit._depth_error(alpha, moment, mi.UInt32([0, 1, 2]), mi.Float([0.4, 0.35, 0.9]))
-    assert found[0] == pytest.approx((0.1 + 0.1 + 0.0) / 3, abs=1e-6)  # what is hardly covered says nothing
+    known = fit._depth_image(camera, mi.UInt32([0, 1, 2]), mi.Float([0.4, 0.35, 0.9]))
+    assert np.isnan(np.array(known)).tolist() == [False, False, False, True]
+    found = fit._depth_error(alpha, moment, known)
+    assert found[0] == pytest.approx(0.1 + 0.1 + 0.0, abs=1e-6)  # what is hardly covered says nothing
 
 
 def test_too_few_photos_are_refused(capture: Capture, tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_fit_comes_back_to_disturbed_splats_and_generalises() -> None:
     steps: list[float] = []
     fitted = refine_splats(start, shown, RefineSettings(iterations=160), observe=lambda step, psnr: steps.append(psnr))
     unseen = Camera.look_at((1.5, 1.6, 0.5), (0, 0, 0), width=48, height=40, fov_x=45)
-    assert len(steps) == 160
+    assert len(steps) == 17 and steps[-1] > steps[0]
     assert error(fitted, truth, unseen) < 0.15 * error(start, truth, unseen)
 
 

@@ -5,8 +5,8 @@
 For every capture, and for the splats of a layout of the default scene: the rank correlation of the estimate with the
 true error, over pixels where there is one; of the pixels whose error exceeds a tolerance, the share that lies in tiles
 which the estimate names, and how many it misses; and the largest and the root mean square error that repair leaves.
-Then processor seconds of all threads and errors of the presets, against ``exact``; ``before`` is ``balanced`` as it was when
-all its rays were walked in their own order. All steps take turns; quote medians and ratios.
+Then processor seconds of all threads and errors of the presets, against ``exact``; ``before`` is ``balanced`` as it was
+when all its rays were walked in their own order. All steps take turns; quote medians and ratios.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,6 +11,7 @@ from mitsplat.errors import InputError
 KernelName = Literal["exact", "mip", "3dgs", "gsplat"]
 ResponseName = Literal["perspective", "ewa"]
 PresetName = Literal["fast", "balanced", "exact"]
+Order = Literal["tile", "window", "ray"]
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,10 @@ class Quality:
         kernel: ``exact`` evaluates the Gaussian itself at the pixel's centre. ``mip`` widens footprints by the variance
             of a pixel, so that small Gaussians do not sparkle (2-D Mip filter, Yu et al. 2024). ``3dgs`` and ``gsplat``
             dilate and limit opacity as those trainers do.
-        order: Gaussians are blended in the order of their peaks along one ray of every 4 x 4 tile of pixels (``tile``),
-            or along the pixel's own ray (``ray``).
+        tolerance: Error of a display-encoded colour that the order of blending may make. Infinite: Gaussians are
+            blended in the order of their peaks along one ray of every 4 x 4 tile of pixels. 0: along every pixel's own
+            ray. Between: nearly so, with an estimate of the error, and along every ray of the tiles where that exceeds
+            the tolerance; a few pixels err by more.
         alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
         transmittance_min: A ray ends when less than this share of the light behind would still be seen.
         sh_degree: Highest spherical-harmonic band that is evaluated.
@@ -57,7 +61,7 @@ class Quality:
 
     response: ResponseName = "perspective"
     kernel: KernelName = "exact"
-    order: Literal["tile", "ray"] = "tile"
+    tolerance: float = math.inf
     alpha_min: float = 1.0 / 255.0
     transmittance_min: float = 1e-3
     sh_degree: int = 3
@@ -69,8 +73,8 @@ class Quality:
             raise InputError(f"quality: response must be 'perspective' or 'ewa' (got {self.response!r})")
         if self.kernel not in KERNELS:
             raise InputError(f"quality: kernel must be one of {', '.join(KERNELS)} (got {self.kernel!r})")
-        if self.order not in ("tile", "ray"):
-            raise InputError(f"quality: order must be 'tile' or 'ray' (got {self.order!r})")
+        if not self.tolerance >= 0.0:
+            raise InputError(f"quality: tolerance must be at least 0 (got {self.tolerance})")
         if not 0.0 < self.alpha_min < 1.0:
             raise InputError(f"quality: alpha_min must be between 0 and 1 (got {self.alpha_min})")
         if not 0.0 <= self.transmittance_min < 1.0:
@@ -82,11 +86,16 @@ class Quality:
         if type(self.lens_rings) is not int or not 1 <= self.lens_rings <= 8:
             raise InputError(f"quality: lens_rings must be from 1 to 8 (got {self.lens_rings})")
 
+    @property
+    def order(self) -> Order:
+        """How rays walk the lists of their tiles before any are repaired."""
+        return "ray" if self.tolerance == 0 else "tile" if math.isinf(self.tolerance) else "window"
+
 
 PRESETS: dict[PresetName, Quality] = {
     "fast": Quality(alpha_min=2e-3, transmittance_min=1e-2, sh_degree=2),
-    "balanced": Quality(order="ray", alpha_min=1e-3),
-    "exact": Quality(order="ray", alpha_min=1e-5, transmittance_min=1e-6),
+    "balanced": Quality(tolerance=5e-3, alpha_min=7e-4, transmittance_min=1e-4),
+    "exact": Quality(tolerance=0.0, alpha_min=1e-5, transmittance_min=1e-6),
 }
 
 

@@ -89,7 +89,7 @@ def _bin_cloud(cloud: Cloud, view: View, quality: Quality) -> TileLists:
 
 def _check(view: View, quality: Quality) -> None:
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
-        raise ValueError("gradients need quality.order 'tile' and one sample per pixel")
+        raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
     if KERNELS[quality.kernel].alpha_max < 1:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
 

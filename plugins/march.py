@@ -1,9 +1,32 @@
-"""The march: rays through all pixels walk their tiles' lists, see module `walk`, and become an image."""
+"""The march: rays through all pixels walk their tiles' lists, see module `walk`, and become an image.
+
+What the order of blending does to the colour of a ray. Let some Gaussians be blended in the order of their peaks, with
+weights w_i and colours c_i, and let one more come, of opacity a, whose peak lies in front of some of them, the set B.
+In its place it takes the share a of the light of B, and is seen through what is in front of B; at the end of the row it
+is also seen through B:
+
+    in its place   sum_front w_i c_i + a (T + W) c + (1 - a) C
+    at the end     sum_front w_i c_i + C + a T c
+
+with W and C the sums of w_i and of w_i c_i over B, and T the transmittance behind all. The difference is
+
+    a (W c - C),
+
+for one neighbour the well-known a_i a_j T (c_j - c_i). Summed over all Gaussians it is the whole error of a ray, and
+the sum of its absolute values bounds that. B would have to be searched for among all that was blended. What comes late
+mostly lies just in front of the deepest ones, so that W and C are estimated from sums of w_i, w_i c_i and w_i z_i that
+forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of them, S being the sum of weights. Of these
+sums counts what lies behind the late peak, if they reach evenly from the deepest peak to as far in front of their mean.
+Those are seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
+
+Tiles of pixels in which the estimate exceeds the tolerance are walked again, in the order of each ray.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -13,7 +36,7 @@ import numpy as np
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.shares import add_to_tally, new_tally, settle_instances, winner_of_tally
-from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians
+from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, in_ray_order
 from mitsplat.plugins.walk import Lanes, Pixel, Rays, walk
 from mitsplat.quality import Quality
 
@@ -50,28 +73,68 @@ class Image:
         rest = [dr.concat([getattr(p, name) for p in parts]) for name in ("alpha", "depth", "instance", "centre_alpha")]
         return cls(rgb, *rest)
 
+    def with_tiles(self, part: Image, lists: TileLists, view: View) -> Image:
+        """This image with the tiles of ``lists`` from another."""
+        changed = dr.zeros(mi.Bool, view.width * view.height)
+        lanes = Lanes(lists, view)
+        for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
+            dr.scatter(changed, mi.Bool(True), pixel, inside)
+        dr.eval(changed, part)
+        return Image(**{f.name: _select(changed, getattr(part, f.name), getattr(self, f.name)) for f in fields(Image)})
+
+
+def _select(changed: Any, new: Any, old: Any) -> Any:
+    if isinstance(new, list):
+        return [dr.select(changed, a, b) for a, b in zip(new, old, strict=True)]
+    return dr.select(changed, new, old)
+
 
 T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
 """State of a ray: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and from there
-on the tally of its instances where there are several."""
+on the tally of its instances where there are several. Where the error of the order is estimated, that comes last."""
+
+ESTIMATE = 7
+ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
+"""State of the estimate: error, deepest peak, sums of the last weights and of these times depth, red, green, blue."""
 
 
-def _fresh(several: bool) -> Pixel:
+def _fresh(several: bool, estimated: bool) -> Pixel:
     """A ray that has met nothing yet."""
-    return [mi.Float(1.0), *(mi.Float(0.0) for _ in range(TALLY - 1)), *(new_tally() if several else [])]
+    nothing = [mi.Float(0.0) for _ in range(TALLY - 1)]
+    tally, error = new_tally() if several else [], [mi.Float(0.0) for _ in range(ESTIMATE if estimated else 0)]
+    return [mi.Float(1.0), *nothing, *tally, *error]
 
 
-def _blend(pixel: Pixel, weight: Any, record: Any, z: Any) -> Pixel:
+def _blend(pixel: Pixel, weight: Any, record: Any, z: Any, several: bool, estimated: bool) -> Pixel:
     """The pixel after one more Gaussian."""
     transmittance = pixel[T] - weight
+    colour = [record[6], record[7], record[8]]
     return [
         transmittance,
-        dr.fma(weight, record[6], pixel[RED]),
-        dr.fma(weight, record[7], pixel[GREEN]),
-        dr.fma(weight, record[8], pixel[BLUE]),
+        *(dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)),
         dr.fma(weight, z, pixel[SUM_Z]),
         dr.select((pixel[T] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z]),
-        *(add_to_tally(pixel[TALLY:], weight, record[15]) if len(pixel) > TALLY else []),
+        *(add_to_tally(pixel[TALLY : -ESTIMATE if estimated else None], weight, record[15]) if several else []),
+        *(_add_to_error(pixel, weight, colour, z) if estimated else []),
+    ]
+
+
+def _add_to_error(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> list[Any]:
+    """The estimate after one more Gaussian, see the module."""
+    total, moment, *colours = pixel[SUMS]
+    deepest, opacity = pixel[DEEPEST], weight / pixel[T]
+    met = weight > 0
+    late = met & (z < deepest)
+    change = mi.Float(0.0)
+    for c, sum_c in zip(colour, colours, strict=True):
+        change = dr.maximum(change, dr.abs(dr.fma(total, c, -sum_c)))
+    gap, reach = (deepest - z) * total, 2 * dr.fma(deepest, total, -moment)
+    behind = dr.select(gap < reach, gap / reach, 1.0)
+    keep = dr.select(met & ~late, total / dr.fma(2, weight, total), 1.0)
+    return [
+        dr.select(late, dr.fma(opacity * behind, change, pixel[ERROR]), pixel[ERROR]),
+        dr.select(met, dr.maximum(z, deepest), deepest),
+        *(dr.fma(keep, old, weight * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
     ]
 
 
@@ -124,36 +187,64 @@ def march(
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
         slopes: Those of the rays, where they are known already; for one sample per pixel.
     """
-    lanes = Lanes(lists, view)
+    lanes = Lanes(lists, view, TILE if quality.order == "tile" else 1)
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
         for p, m in zip(lanes.pixel, lanes.inside, strict=True)
     ]
     if quality.order == "ray":
         dr.eval(lists.nearest)
-    several = lists.instance is None
+    several, estimated = lists.instance is None, quality.order == "window" and lists.pairs > 0
 
-    def pixels(dx: float, dy: float, labelled: bool) -> list[Pixel]:
+    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], Any]:
+        state = {"several": labelled and several, "estimated": estimated}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
-        return walk(rays, quality.order, lambda: _fresh(labelled and several), _blend)
+        found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
+        return ([pixel[:-ESTIMATE] for pixel in found], _too_wrong(found, quality)) if estimated else (found, None)
 
-    image, unsure = _collect(pixels(0.5, 0.5, labelled=True), lanes, lists.instance)
+    found, wrong = pixels(0.5, 0.5, labelled=True)
+    image, unsure = _collect(found, lanes, lists.instance)
+    if estimated:
+        dr.eval(image, unsure, wrong)  # in one kernel
     # One bit is soon read on a CPU, and mostly saves the launch; a GPU would have to be waited for.
     if several and (dr.backend_v(unsure) == dr.JitBackend.CUDA or dr.any(unsure)):
         image.instance = settle_instances(image.instance, unsure, lists, view, quality, z_max)
     if view.samples == 1:
-        return image
+        return image if wrong is None else _repaired(image, wrong, lists, view, quality, z_max)
     n, colours = view.samples, []
     for y, x in np.ndindex(n, n):
         if (2 * x + 1, 2 * y + 1) == (n, n):  # the centre is one of an odd number of samples
             colours.append([*image.rgb, image.alpha])
         else:
-            found = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
+            found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
             colours.append([*_picture(found, lanes)])
-        dr.eval(colours[-1])
+            wrong = wrong | also if estimated else None
+        dr.eval(colours[-1], wrong)
     *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
-    return image
+    return image if wrong is None else _repaired(image, wrong, lists, view, quality, z_max)
+
+
+def _too_wrong(pixels: list[Pixel], quality: Quality) -> Any:
+    """Whether the estimate of an error exceeds the tolerance in a lane."""
+    largest = pixels[0][ERROR]
+    for pixel in pixels[1:]:
+        largest = dr.maximum(largest, pixel[ERROR])
+    return largest > dr.opaque(mi.Float, quality.tolerance)
+
+
+def _repaired(image: Image, wrong: Any, lists: TileLists, view: View, quality: Quality, z_max: Any | None) -> Image:
+    """The image with the tiles that hold lanes which are ``wrong`` in the order of each ray."""
+    per_tile = TILE * TILE
+    lane = dr.arange(mi.UInt32, dr.width(wrong) // per_tile) * per_tile
+    flags = dr.gather(mi.Bool, wrong, lane)
+    for k in range(1, per_tile):
+        flags |= dr.gather(mi.Bool, wrong, lane + k)
+    chosen = dr.compress(flags)
+    if dr.width(chosen) == 0:
+        return image
+    again = in_ray_order(lists, chosen, view)
+    return image.with_tiles(march(again, view, replace(quality, tolerance=0.0), z_max=z_max), again, view)
 
 
 def _picture(pixels: list[Pixel], lanes: Lanes) -> list[Any]:

@@ -8,6 +8,7 @@ tile's list for each instance that is in it, and stops as soon as all its pixels
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -48,7 +49,7 @@ def splat_silhouettes(
         return {}
     canvas, left, top = _canvas(view)
     ids = np.unique([placement.instance for placement in objects])
-    quality = replace(quality, order="tile", sh_degree=0)
+    quality = replace(quality, tolerance=math.inf, sh_degree=0)
     covered = _cover(clouds, objects, canvas.sampled(quality.samples), quality, ids)
     return _assemble(*covered, ids, canvas, left, top)
 

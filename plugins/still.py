@@ -8,17 +8,15 @@ same, bit for bit, as one made of everything at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 
 from mitsplat.plugins.march import Image, march
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians, merge_lists
-from mitsplat.plugins.walk import Lanes
 from mitsplat.quality import Quality
 
 
@@ -62,20 +60,4 @@ class StillLayer:
         if dr.width(touched) == 0:
             return self.image
         lists = merge_lists(self.lists, objects, touched, view)
-        part = march(lists, view, quality, z_max=z_max)
-        changed = dr.zeros(mi.Bool, view.width * view.height)
-        lanes = Lanes(lists, view)
-        for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
-            dr.scatter(changed, mi.Bool(True), pixel, inside)
-        dr.eval(changed, part)
-        merged = {name: _select(changed, getattr(part, name), getattr(self.image, name)) for name in _CHANNELS}
-        return Image(**merged)
-
-
-_CHANNELS = tuple(field.name for field in fields(Image))
-
-
-def _select(changed: Any, new: Any, old: Any) -> Any:
-    if isinstance(new, list):
-        return [dr.select(changed, a, b) for a, b in zip(new, old, strict=True)]
-    return dr.select(changed, new, old)
+        return self.image.with_tiles(march(lists, view, quality, z_max=z_max), lists, view)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +59,7 @@ class TileLists:
         instance: Id of all of them, or None if they have several.
         levels: What entries are sorted by in their tile.
         tiles: Numbers of the tiles whose ranges these are; None for all of the view's.
+        least: Depth [m] in front of which no peak of each record lies, for tiles that are sorted again.
     """
 
     records: Any
@@ -74,6 +75,7 @@ class TileLists:
     instance: int | None
     levels: Any
     tiles: Any | None = None
+    least: Any | None = None
 
 
 def bin_gaussians(
@@ -122,15 +124,24 @@ def bin_records(
     pairs = _pair(dr.detach(records), least, box, view, quality)
     if pairs is None:
         return _empty(tiles, records)
-    return _listed(records, near, pairs, dr.width(least), tiles, view, only)
+    return _listed(records, near, pairs, least, dr.width(least), tiles, view, only)
 
 
 def _listed(
-    records: Any, near: Any, pairs: _Pairs, visible: int, tiles: int, view: View, only: int | None, own: Any = None
+    records: Any,
+    near: Any,
+    pairs: _Pairs,
+    least: Any,
+    visible: int,
+    tiles: int,
+    view: View,
+    only: int | None,
+    own: Any = None,
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
     slots = stable_order(pairs.level, DEPTH_BITS)
-    slots = stable_order(pairs.tile, max(1, (tiles - 1).bit_length()), slots)
+    # As many bits as numbers of all tiles have, so that lists of a few need no kernels of their own.
+    slots = stable_order(pairs.tile, max(1, (view.tiles_x * view.tiles_y - 1).bit_length()), slots)
     entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
     begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
     start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
@@ -145,6 +156,7 @@ def _listed(
         nearest=_depth_of_level(levels, view),
         start=start,
         stop=stop,
+        least=least,
         visible=visible,
         pairs=dr.width(entries),
         instance=only,
@@ -158,8 +170,8 @@ def _empty(tiles: int, records: Any | None = None) -> TileLists:
     entry = dr.zeros(mi.UInt32, 1)
     visible = 0 if records is None else dr.width(records) // RECORD
     records = dr.zeros(mi.Float, RECORD) if records is None else records
-    none = dr.zeros(mi.Float, 1)
-    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry)
+    none = dr.zeros(mi.Float, max(visible, 1))
+    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, None, none)
 
 
 def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:
@@ -181,7 +193,21 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
         records, near = shifted, concatenated([first.near, near])
     records = concatenated([first.records, records])
     near = first.near if near is None else near
-    return _listed(records, near, pairs, visible + second.visible, dr.width(tiles), view, None, tiles)
+    least = concatenated([first.least, second.least])
+    return _listed(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
+
+
+def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
+    """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
+    number, place, _ = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
+    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
+    record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
+    slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
+    level = _level(_least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
+    dr.eval(level)
+    count = dr.width(tiles)
+    again = _Pairs(number, place, level, None)
+    return _listed(lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles)
 
 
 def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,17 +18,21 @@ import mitsuba as mi
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists
-from mitsplat.quality import KERNELS, Quality
+from mitsplat.quality import KERNELS, Order, Quality
 
 SORT_SLOTS = 8
 """Gaussians that the per-ray order collects in one walk over a part of a list."""
+
+WINDOW_SLOTS = 8
+"""Gaussians of a list that a ray holds back until it knows which of them comes first."""
 
 Pixel = list[Any]
 """State of a ray, the transmittance first."""
 
 Blend = Callable[[Pixel, Any, Any, Any], Pixel]
 """The state of a ray after one more Gaussian in front-to-back order: from the state, the Gaussian's weight, which the
-ray loses of its transmittance, its record, and the depth of its peak. A weight of 0 changes nothing."""
+ray loses of its transmittance, its record, of which colour and instance may be asked for, and the depth of its peak. A
+weight of 0 changes nothing."""
 
 
 class Lanes:
@@ -138,16 +142,29 @@ class Rays:
         return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
 
 
-def walk(rays: Rays, order: Literal["tile", "ray"], fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
-    """States of the rays at their ends, in the order of their tile's list or of their own peaks.
+def walk(rays: Rays, order: Order, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
+    """States of the rays at their ends, in the order of their tile's list, of their own peaks, or between the two.
 
     Args:
         rays: The rays.
-        order: As in :class:`mitsplat.quality.Quality`.
+        order: As of :class:`mitsplat.quality.Quality`.
         fresh: Makes the state of a ray that has met nothing.
         blend: What Gaussians add to it.
     """
-    return (_walk_in_tile_order if order == "tile" else _walk_in_ray_order)(rays, fresh, blend)
+    ways = {"tile": _walk_in_tile_order, "window": _walk_in_window, "ray": _walk_in_ray_order}
+    return ways[order](rays, fresh, blend)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fields:
+    """Fields of the records of that number, fetched where they are asked for: rays of a lane meet different ones."""
+
+    records: Any
+    number: Any
+    mask: Any
+
+    def __getitem__(self, field: int) -> Any:
+        return dr.gather(mi.Float, self.records, self.number * RECORD + field, self.mask)
 
 
 def respond_along(
@@ -218,6 +235,61 @@ def _walk_in_tile_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) ->
     return pixels
 
 
+def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
+    """Blend in the order of the tile's list, but for what a window can put right.
+
+    A ray holds back the last :data:`WINDOW_SLOTS` Gaussians that it met, sorted by their peaks along it, and blends the
+    first one when another comes. What is more places too late in the list than that is blended late.
+    """
+    lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
+
+    def push(pixel: Pixel, window: _Slots, z: Any, alpha: Any, number: Any) -> tuple[Pixel, _Slots]:
+        result: _Slots = []
+        for slot_z, slot_alpha, slot_number in reversed(window):
+            # Whatever lies in front of the new peak, or is its equal, moves forward by one.
+            deeper = z >= slot_z
+            result.insert(
+                0,
+                (
+                    dr.maximum(z, slot_z),
+                    dr.select(deeper, alpha, slot_alpha),
+                    dr.select(deeper, number, slot_number),
+                ),
+            )
+            alpha, number = dr.select(deeper, slot_alpha, alpha), dr.select(deeper, slot_number, number)
+            z = dr.minimum(z, slot_z)
+        return blend(pixel, pixel[0] * alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
+
+    def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
+        brightest = pixels[0][0]
+        for pixel in pixels[1:]:
+            brightest = dr.maximum(brightest, pixel[0])
+        return (i < rays.stop) & (brightest > end)
+
+    def body(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> tuple[Any, list[Pixel], list[_Slots]]:
+        number = dr.gather(mi.UInt32, lists.entries, i)
+        record = dr.gather(mi.ArrayXf, lists.records, number, shape=(RECORD, dr.width(i)))
+        states = []
+        for pixel, window, (log_alpha, z), z_far in zip(pixels, windows, rays.respond(record), far, strict=True):
+            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[0] > end)
+            state = pixel, window, z, dr.exp2(log_alpha), number
+            states.append(dr.if_stmt(state, hit, push, lambda pixel, window, *_: (pixel, window), label="push"))
+        return i + 1, [pixel for pixel, _ in states], [window for _, window in states]
+
+    # An empty slot lies in front of all peaks, and nothing is seen of it.
+    empty = [[(mi.Float(0), mi.Float(0), mi.UInt32(0)) for _ in range(WINDOW_SLOTS)] for _ in far]
+    state = mi.UInt32(rays.start), [fresh() for _ in far], empty
+    _, pixels, windows = dr.while_loop(state, alive, body, label="march in a window")
+    ends = []
+    for pixel, window in zip(pixels, windows, strict=True):
+        for z, alpha, number in window:
+            seen = (alpha > 0) & (pixel[0] > end)
+            weight = dr.select(seen, pixel[0] * alpha, 0.0)
+            pixel = blend(pixel, weight, _Fields(lists.records, number, seen), z)
+        ends.append(pixel)
+    return ends
+
+
 def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
     """Blend in the exact order of the peaks along each ray.
 
@@ -286,7 +358,7 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
             for z, alpha, i in own:
                 found = active & (z < dr.inf) & (pixel[0] > end)
                 number = dr.gather(mi.UInt32, lists.entries, i, found)
-                record = dr.gather(mi.ArrayXf, lists.records, number, found, shape=(RECORD, width))
+                record = _Fields(lists.records, number, found)
                 weight = dr.select(found, pixel[0] * alpha, 0.0)
                 z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, which no weight makes 0
                 pixel = blend(pixel, weight, record, z)

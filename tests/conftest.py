@@ -221,9 +221,9 @@ def known_object(tmp_path_factory: pytest.TempPathFactory) -> KnownObject:
     import mitsuba as mi
     from PIL import Image
 
-    from mitsplat.bake.surfels import place_surfels
     from mitsplat.colour import encode_srgb
     from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
+    from mitsplat.surfels import place_surfels
 
     ball = trimesh.creation.icosphere(3, 0.05)
     box = trimesh.creation.box((0.06, 0.04, 0.05))

@@ -19,7 +19,6 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.assets.known import chamfer, solid
 from benchmarks.record import figure, recording
-from mitsplat.bake.surfels import place_surfels
 from mitsplat.camera import Camera
 from mitsplat.plugins.device import plain_mesh, ray_scene
 from mitsplat.reconstruct.evaluation import iou
@@ -28,6 +27,7 @@ from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, refin
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.render.layers import ensure_variant
 from mitsplat.splats import Splats
+from mitsplat.surfels import place_surfels
 
 WAVE = 8.0
 """Length over which an outline wavers [px]."""

@@ -131,7 +131,12 @@ class BopReader:
         except (OSError, ValueError) as error:
             yield file, f"cannot be read ({error})"
             info = None
-        for number in range(1, len(self._content["assets"]) + 1):
+        distractors = self._content.get("distractors", ())
+        labelled = [position for position in range(len(self._content["assets"])) if position not in distractors]
+        numbers = {str(position + 1) for position in labelled}
+        if isinstance(info, dict) and info.keys() - numbers:
+            yield file, f"measures {min(info.keys() - numbers)}, which is no object that is labelled"
+        for number in (position + 1 for position in labelled):
             model = f"bop/models/obj_{number:06d}.ply"
             if not (self._root / model).is_file():
                 yield model, "is missing"

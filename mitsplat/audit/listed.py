@@ -217,8 +217,14 @@ class LayoutReader:
                 yield where, f"{label.name} has another pose than in {file}"
         dropped = Counter(frame.record["labels"]["dropped"])
         del dropped["fragments"]
-        if len(frame.instances) + dropped.total() != len(self._found):
+        labelled = [entry for entry in self._found.values() if entry.get("class_index") is not None]
+        if len(frame.instances) + dropped.total() != len(labelled):
             yield where, f"{len(frame.instances)} labels and {dropped.total()} instances without are not all of {file}"
+        drawn = frame.record.get("objects")
+        if drawn is not None and [(one["id"], one["asset"]) for one in drawn] != [
+            (number, entry.get("asset")) for number, entry in self._found.items()
+        ]:
+            yield where, f"its objects are not those of {file}"
 
     def finish(self) -> Violations:
         """Files of layouts that no frame shows belong to no frame."""

@@ -72,7 +72,7 @@ class Owned:
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._formats = content["scene"]["output"]["formats"]
-        self._assets = len(content["assets"])
+        self._models = sorted(set(range(len(content["assets"]))) - set(content.get("distractors", ())))
         self._names = array("Q")
         self._last = ("", -1)
         for file in self._of_all():
@@ -90,7 +90,7 @@ class Owned:
             yield "label-studio/config.xml"
         if "bop" in self._formats:
             yield "bop/models/models_info.json"
-            yield from (f"bop/models/obj_{number:06d}.ply" for number in range(1, self._assets + 1))
+            yield from (f"bop/models/obj_{position + 1:06d}.ply" for position in self._models)
         if "colmap" in self._formats:
             yield from (f"colmap/{name}.txt" for name in ("cameras", "images", "points3D"))
 

@@ -1,4 +1,4 @@
-"""Cameras of a dataset compared with the scene that it states: intrinsics, and where the scene lets cameras be."""
+"""Frames of a dataset compared with the scene that it states: intrinsics, where cameras may be, what is labelled."""
 
 from __future__ import annotations
 
@@ -21,15 +21,29 @@ class SceneReader:
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._camera, self._output = content["scene"]["camera"], content["scene"]["output"]
+        self._distractors = set(content.get("distractors", ()))
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Whether the frame's camera can be one of the scene's."""
-        for text in (*self._check_lens(frame), *self._check_place(frame)):
+        """Whether the frame's camera can be one of the scene's, and its labels are of what is labelled."""
+        for text in (*self._check_lens(frame), *self._check_place(frame), *self._check_objects(frame)):
             yield f"manifest.jsonl, frame {frame.index}", text
 
     def finish(self) -> Violations:
         """Nothing is left."""
         yield from ()
+
+    def _check_objects(self, frame: TrueFrame) -> Iterator[str]:
+        drawn = frame.record.get("objects")
+        for label in frame.instances:
+            asset = label.entry["asset"]
+            if asset in self._distractors:
+                yield f"{label.name} is labelled, though the scene says that it is not"
+            if drawn is not None and not any(
+                (one["id"], one["asset"], one["label"]) == (label.id, asset, True) for one in drawn
+            ):
+                yield f"{label.name} is none of the objects that were drawn"
+        if frame.record.get("empty") and frame.instances:
+            yield f"has {len(frame.instances)} labels, though its layout is an empty one"
 
     def _check_lens(self, frame: TrueFrame) -> Iterator[str]:
         lens, (width, height) = self._camera["intrinsics"], (self._output["width"], self._output["height"])

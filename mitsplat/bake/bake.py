@@ -1,6 +1,6 @@
 """CAD meshes to assets: surface-aligned Gaussians whose outgoing radiance Mitsuba's path tracer bakes.
 
-Surfels (:mod:`mitsplat.bake.surfels`) are seen from directions all over their hemispheres. The radiance that leaves
+Surfels (:mod:`mitsplat.surfels`) are seen from directions all over their hemispheres. The radiance that leaves
 them towards each, display-encoded, is fitted with spherical harmonics. A diffuse white surface under the ``uniform``
 light has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or face
 colours.
@@ -25,7 +25,6 @@ from mitsplat.bake.materials import Finish
 from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts, world_from_file
 from mitsplat.bake.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.bake.surfels import Surfels, place_surfels
 from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
 from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
@@ -37,6 +36,7 @@ from mitsplat.render.layers import ensure_variant
 from mitsplat.scene.spec import LightSpec
 from mitsplat.spherical_harmonics import sh_basis
 from mitsplat.splats import Splats
+from mitsplat.surfels import Surfels, place_surfels
 from mitsplat.variant import one_at_a_time
 
 _OPACITY = 0.98

@@ -175,7 +175,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
             yield Finding(name, True, f"{len(asset.splats)} Gaussians, nothing to say")
     extent = np.subtract(spec.region.max, spec.region.min)
     most = [entry.count[1] for entry in spec.objects]
-    volumes = [float(np.prod(asset.mesh.extents)) for asset in scene.assets if asset.mesh is not None]
+    meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
+    volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
     fill = float(np.dot(most, volumes) / np.prod(extent))
     yield Finding(
         "room", fill <= MAX_FILL or not spec.objects, f"at most {sum(most)} objects take {fill:.0%} of the region",

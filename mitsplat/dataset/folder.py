@@ -306,6 +306,7 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
         "classes": list(scene.class_names),
         "keypoints": [list(names) for names in catalogue.keypoint_names],
         "assets": list(catalogue.assets),
+        **({"distractors": list(catalogue.distractors)} if catalogue.distractors else {}),
         "inputs": describe_inputs(scene),
         "libraries": {name: importlib.metadata.version(name) for name in libraries},
     }

@@ -28,7 +28,11 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
     Of assets all values, and SHA-256 of splats and meshes, with the entry's size, scale and class applied.
     """
     described = _Describer()
-    found: dict[str, Any] = {f"objects[{i}]": described.asset(asset) for i, asset in enumerate(scene.assets)}
+    found: dict[str, Any] = {}
+    for position, pool in enumerate(scene.pools):
+        for number, asset in enumerate(pool):
+            key = f"objects[{position}]" + (f"[{number}]" if len(pool) > 1 else "")
+            found[key] = described.asset(scene.assets[asset])
     if scene.environment is not None:
         found["environment"] = described.asset(scene.environment)
     for i, mesh in enumerate(scene.shape_meshes):

@@ -80,7 +80,7 @@ def run_faults(
 
 def count_faults(scene: Scene) -> Iterator[Finding]:
     """More objects or images than have numbers."""
-    most = sum(len(entry.poses) or entry.count[1] for entry in scene.spec.objects)
+    most = sum(entry.most for entry in scene.spec.objects)
     if most > MOST_OBJECTS:
         text = f"objects: a layout must have at most {MOST_OBJECTS} objects, as many as there are ids (got {most})"
         yield Finding("count", False, text, "lower objects[].count")
@@ -118,7 +118,8 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
 
 def _room_faults(scene: Scene, dropped: Sequence[int], low: Float64Array, high: Float64Array) -> Iterator[Finding]:
     """Whether there is room for the objects in a region: of what is in the way, and of their number."""
-    meshes = [mesh for i in dropped if (mesh := scene.assets[i].mesh) is not None]
+    pools = [[mesh for asset in scene.pools[i] if (mesh := scene.assets[asset].mesh) is not None] for i in dropped]
+    meshes = [mesh for pool in pools for mesh in pool]
     finest = min(float(mesh.extents.min()) for mesh in meshes) / 2
     cells = np.clip(np.ceil((high - low) / finest), 5, _CELLS).astype(int)
     axes = [start + (end - start) * (np.arange(n) + 0.5) / n for start, end, n in zip(low, high, cells, strict=True)]
@@ -137,7 +138,7 @@ def _room_faults(scene: Scene, dropped: Sequence[int], low: Float64Array, high: 
     volume = float(np.prod(high - low)) * float((~taken).mean())
     hulls = {id(mesh): float(mesh.convex_hull.volume) for mesh in meshes}
     numbers = [scene.spec.objects[i].count[1] for i in dropped]
-    need = float(np.dot(numbers, [hulls[id(mesh)] for mesh in meshes]))
+    need = float(np.dot(numbers, [min(hulls[id(mesh)] for mesh in pool) for pool in pools]))
     if need > volume:
         yield Finding(
             "room",
@@ -177,7 +178,8 @@ def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
 def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     """Why no image can have a label: cameras do not see where objects can be, or not as large as labels must be."""
     spec, least = scene.spec, scene.spec.labels.min_pixels
-    meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
+    labelled = [scene.assets[i] for i in range(len(scene.assets)) if scene.class_index(i) is not None]
+    meshes = [asset.mesh for asset in labelled if asset.mesh is not None]
     if not meshes or not len(frames):
         return
     pixels = spec.output.width * spec.output.height

@@ -53,6 +53,7 @@ class _Content(_Stored):
     classes: list[str]
     keypoints: list[list[str]]
     assets: list[str]
+    distractors: list[Count] = []
     libraries: dict[str, str]
     device: Literal["cpu", "cuda"] = "cpu"
 
@@ -105,6 +106,15 @@ class _Environment(_Stored):
     box: Bounds
 
 
+class _Drawn(_Stored):
+    id: Annotated[int, Field(ge=1, le=65535)]
+    entry: Count
+    asset: Count
+    name: str
+    scale: Annotated[float, Field(gt=0)]
+    label: bool
+
+
 class _Record(_Stored):
     index: Count
     layout: Count
@@ -115,6 +125,8 @@ class _Record(_Stored):
     labels: _Labels
     environment: _Environment | None = None
     depth_scale: Annotated[float, Field(gt=0)] | None = None
+    objects: list[_Drawn] | None = None
+    empty: bool = False
 
 
 def read_content(root: Path) -> dict[str, Any]:

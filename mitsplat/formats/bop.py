@@ -2,7 +2,7 @@
 
 ::
 
-    bop/models/obj_000001.ply, models_info.json      proxy meshes [mm]; object ids are positions in ``objects`` + 1
+    bop/models/obj_000001.ply, models_info.json      proxy meshes [mm]; object ids are positions among the assets + 1
     bop/<split>/000000/scene_camera.json, scene_gt.json, scene_gt_info.json
     bop/<split>/000000/rgb/000003.png, depth/000003.png, mask/000003_000000.png, mask_visib/000003_000000.png
 
@@ -14,7 +14,7 @@ numbers. The one difference: what is visible is known exactly, where the toolkit
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,12 @@ class ScenesWriter:
     """
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
-        self._root, self._meshes = root, catalogue.meshes
+        self._root = root
+        self._meshes = {
+            position + 1: mesh
+            for position, mesh in enumerate(catalogue.meshes)
+            if position not in catalogue.distractors
+        }
         self._folder, self._layout = "", -1
         self._files: dict[str, EntriesFile] = {}
         self._ended: list[GrowingFile] = []
@@ -114,10 +119,10 @@ class ScenesWriter:
             file.discard()
 
 
-def write_models(root: Path, meshes: Sequence[trimesh.Trimesh]) -> None:
-    """Write the objects' meshes, and their bounds and diameters."""
+def write_models(root: Path, meshes: Mapping[int, trimesh.Trimesh]) -> None:
+    """Write the objects' meshes by object id, and their bounds and diameters."""
     info = {}
-    for number, mesh in enumerate(meshes, start=1):
+    for number, mesh in meshes.items():
         scaled = mesh.copy()
         scaled.apply_scale(MILLIMETRES)
         info[str(number)] = model_info(scaled)

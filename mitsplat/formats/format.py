@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -31,12 +31,16 @@ class Catalogue:
         keypoint_names: Keypoints of every class.
         assets: Names, by position among the scene's assets.
         meshes: Their proxy meshes [m].
+        distractors: Positions of the assets that are in no label.
+        drawn: Of a scene that draws its objects, what the manifest states of an instance of each asset; else empty.
     """
 
     class_names: Sequence[str]
     keypoint_names: Sequence[Sequence[str]]
     assets: Sequence[str]
     meshes: Sequence[trimesh.Trimesh]
+    distractors: Sequence[int] = ()
+    drawn: Sequence[Mapping[str, Any]] = ()
 
     @classmethod
     def of(cls, scene: Scene) -> Catalogue:
@@ -46,7 +50,10 @@ class Catalogue:
             InputError: If assets of one class name different keypoints, or a format cannot show what the scene has.
         """
         points: dict[str, tuple[str, tuple[str, ...]]] = {}
-        for asset in scene.assets:
+        kinds = [scene.class_index(position) for position in range(len(scene.assets))]
+        for asset, kind in zip(scene.assets, kinds, strict=True):
+            if kind is None:
+                continue
             names = tuple(asset.keypoints)
             other, known = points.setdefault(asset.class_name, (asset.name, names))
             if known != names:
@@ -64,12 +71,26 @@ class Catalogue:
                 f"(got {list(scene.spec.camera.intrinsics.distortion)})"
             )
         meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
-        return cls(scene.class_names, keypoint_names, [asset.name for asset in scene.assets], meshes)
+        distractors = [position for position, kind in enumerate(kinds) if kind is None]
+        assets = [asset.name for asset in scene.assets]
+        return cls(scene.class_names, keypoint_names, assets, meshes, distractors, _drawn(scene))
 
     @property
     def num_keypoints(self) -> int:
         """Keypoints of the class that has most."""
         return max(map(len, self.keypoint_names), default=0)
+
+
+def _drawn(scene: Scene) -> list[dict[str, Any]]:
+    """What the manifest states of each asset's instances, if the scene file leaves open which ones lie in a layout."""
+    if not any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in scene.spec.objects):
+        return []
+    found: list[dict[str, Any]] = []
+    for position, entry in enumerate(scene.spec.objects):
+        for scale in [scale for _ in entry.names for scale in entry.scales]:
+            name = scene.assets[len(found)].name
+            found.append({"entry": position, "asset": len(found), "name": name, "scale": scale, "label": entry.label})
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +100,7 @@ class FrameFiles:
     Attributes:
         frame: What is written.
         image: The frame's picture, relative to the root, which is there before any other file.
-        ids: Ids of the instances that labels are of, shape (H, W), those without a label included.
+        ids: Ids of the instances that labels are of, shape (H, W), those without a label included, but no distractors.
     """
 
     root: Path

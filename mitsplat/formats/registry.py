@@ -38,6 +38,7 @@ from mitsplat.files import Record
 from mitsplat.formats import bop, coco, label_studio, maps, voc, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
+from mitsplat.scene.contents import is_empty
 from mitsplat.scene.spec import FORMATS, Output, SceneSpec
 
 if TYPE_CHECKING:
@@ -69,6 +70,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
     """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest."""
     plan, output = frame.plan, spec.output
     ids = frame.instance if spec.labels.source == "splats" else frame.proxy_instance
+    if distractors := [instance.id for instance in frame.layout.instances if instance.class_index is None]:
+        ids = np.where(np.isin(ids, distractors), ids.dtype.type(0), ids)
     record: Record = {
         "index": frame.index,
         "layout": plan.layout,
@@ -82,6 +85,10 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         "labels": frame.labels.to_json(),
         "rest": frame.layout.certificate.to_json(),
     }
+    if catalogue.drawn:
+        record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
+    if spec.empty:
+        record["empty"] = is_empty(spec, plan.layout)
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"
     files = FrameFiles(root, frame, catalogue, record, image, ids)
     files.add_bytes(image, encode_image(frame.image, output))

@@ -54,11 +54,12 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     the scene's cameras (in the middle of the region, where they are dropped), rays, objects, and objects times pixels.
     """
     spec = scene.spec
-    most = [max(entry.count[1], len(entry.poses)) for entry in spec.objects]
-    placed = [(asset.splats, count) for asset, count in zip(scene.assets, most, strict=True)]
+    most = [entry.most for entry in spec.objects]
+    pools = [[scene.assets[i].splats for i in pool] for pool in scene.pools]
+    placed = [(max(pool, key=len), count) for pool, count in zip(pools, most, strict=True)]
     middle = np.add(spec.region.min, spec.region.max) / 2
     static = [] if scene.environment is None else [scene.environment.splats]
-    splats = {id(one): one for one in (*static, *(one for one, _ in placed))}.values()
+    splats = {id(one): one for one in (*static, *(one for pool in pools for one in pool))}.values()
     stored = sum(getattr(one, f.name).nbytes for one in splats for f in fields(one))
     count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
     samples = {**vars(resolve_quality(spec.quality)), **spec.rendering.model_dump()}["samples"]

@@ -233,7 +233,7 @@ def label_instances(
 
     Args:
         truth: The frame's maps, all of the same shape (H, W).
-        instances: Everything that was placed.
+        instances: Everything that was placed; what has no class is in the maps, and not in the labels.
         class_names: Names by class index.
         rules: What is dropped or marked.
         camera: Needed for keypoints.
@@ -255,6 +255,8 @@ def label_instances(
     labels = []
     dropped = dict.fromkeys(("fragments", "small", "occluded", "disagreeing", "hidden", "outside"), 0)
     for instance in sorted(instances, key=lambda instance: instance.id):
+        if instance.class_index is None:
+            continue
         alone = truth.silhouettes.get(instance.id)
         if instance.id not in found:
             dropped["outside" if alone is None or alone.inside(width, height) is None else "hidden"] += 1

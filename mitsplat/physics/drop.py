@@ -22,6 +22,7 @@ from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
+from mitsplat.scene.contents import draw_objects
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
@@ -97,7 +98,7 @@ class Drop:
             InputError: If objects find no room, or no draw holds.
         """
         spec, refused, capacity = self.scene.spec, [], 1.0
-        assets, given = self._draw_objects(index)
+        assets, given = draw_objects(self.scene, index)
         if not assets:
             return Layout(index, (), NOTHING_TO_REST)
         frictions = self._draw_frictions(index)
@@ -143,7 +144,7 @@ class Drop:
 
     def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
         """Poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
-        assets, given = self._draw_objects(layout.index)
+        assets, given = draw_objects(self.scene, layout.index)
         if not assets:
             return
         certificate = layout.certificate
@@ -165,21 +166,8 @@ class Drop:
         fastest = _POURED if settle.arrangement == "pile" else np.inf
         return run_to_rest(world, max_time=settle.max_time, bounds=self._bounds, fastest=fastest, **options)
 
-    def _draw_objects(self, index: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
-        """Which entry each object of a layout is of, and the pose that the file gives it, if any."""
-        counts = random_stream(self.scene.spec.seed, "object counts", index)
-        assets: list[int] = []
-        given: list[Float64Array | None] = []
-        for position, entry in enumerate(self.scene.spec.objects):
-            count = int(counts.integers(*entry.count, endpoint=True))
-            poses: list[Float64Array | None] = [stated_pose(pose) for pose in entry.poses]
-            poses = poses or [None] * count
-            assets += [position] * len(poses)
-            given += poses
-        return tuple(assets), tuple(given)
-
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
-        """Friction coefficient of each entry in a layout."""
+        """Friction coefficient of each asset in a layout."""
         spec = self.scene.spec
         rng = random_stream(spec.seed, "friction", index)
         return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
@@ -259,7 +247,7 @@ class Drop:
         keys: dict[PlacedSurface, str] = {}
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
-                keys[self._placed(entry, stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
+                keys[self._placed(self.scene.pools[entry][0], stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
         for pair in all_clearances(list(keys), self._obstacles, reach=_REACH):
             if -pair.distance > _DEEPEST_GIVEN:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
@@ -331,7 +319,7 @@ class Drop:
         return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
 
     def _instances(self, assets: Sequence[int], poses: Float64Array) -> tuple[Instance, ...]:
-        classes = [self.scene.class_names.index(self.scene.assets[asset].class_name) for asset in assets]
+        classes = map(self.scene.class_index, assets)
         return tuple(
             Instance(number + 1, asset, class_index, pose)
             for number, (asset, class_index, pose) in enumerate(zip(assets, classes, poses, strict=True))

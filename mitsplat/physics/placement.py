@@ -27,13 +27,13 @@ class Item:
     """An object to place.
 
     Attributes:
-        entry: Position of its entry in the scene file; a stack is of one entry.
+        asset: Position of its asset in the scene; a stack is of one asset.
         surface: Its mesh.
         outline: Vertices of its convex hull [m], shape (N, 3).
         pose: Where the scene file puts it, or None.
     """
 
-    entry: int
+    asset: int
     surface: Surface
     outline: Float64Array
     pose: Float64Array | None = None
@@ -96,8 +96,8 @@ class _Draw:
         # Large ones first, for which room is scarce.
         free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
         if arrangement == "stack":
-            entries = dict.fromkeys(self._items[i].entry for i in free)
-            done = all(self._stack([i for i in free if self._items[i].entry == entry]) for entry in entries)
+            assets = dict.fromkeys(self._items[i].asset for i in free)
+            done = all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
         else:
             place: dict[str, Callable[[int], bool]] = {
                 "drop": self._drop,

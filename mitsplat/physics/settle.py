@@ -27,7 +27,14 @@ from mitsplat.warp_start import quiet_warp
 PACKAGE = Path(__file__).parents[1]
 
 _OWN = ("contacts", "drop", "friction", "placement", "rest", "worlds")
-MODULES = ("mesh", "mesh_distance", *(f"physics.{name}" for name in _OWN), "scene.streams", "scene.walls")
+MODULES = (
+    "mesh",
+    "mesh_distance",
+    *(f"physics.{name}" for name in _OWN),
+    "scene.contents",
+    "scene.streams",
+    "scene.walls",
+)
 """Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
 LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
@@ -127,6 +134,8 @@ def _scene_hash(scene: Scene) -> str:
         digest.add((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
+    if spec.empty or any(entry.balance for entry in spec.objects):  # which depend on a layout's split
+        add(spec.empty, spec.output.validation)
     for mesh in scene.shape_meshes:
         add_mesh(mesh)
     surroundings = [scene.environment] if spec.environment_collides and scene.environment is not None else []

@@ -18,13 +18,13 @@ class Instance:
     Attributes:
         id: Instance id, from 1.
         asset: Index into the scene's assets.
-        class_index: Index into the scene's class names.
+        class_index: Index into the scene's class names; None for what is not labelled.
         world_from_object: Rigid transform of the asset's frame, shape (4, 4).
     """
 
     id: int
     asset: int
-    class_index: int
+    class_index: int | None
     world_from_object: Float64Array
 
 

@@ -6,11 +6,12 @@ adding one never shifts another, and any worker may plan any frame in any order.
 
 from __future__ import annotations
 
-import math
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Literal, SupportsIndex
 
@@ -19,18 +20,22 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.asset import Asset, read_mesh
+from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
+from mitsplat.scene.contents import split_of
+from mitsplat.scene.primitives import make_primitives
 from mitsplat.scene.spec import (
+    PRIMITIVES,
     SCHEMA_VERSION,
     CameraHemisphere,
     CameraOrbit,
     EnvironmentLight,
     Intrinsics,
     LightSpec,
+    ObjectSpec,
     Output,
     PointLight,
     Region,
@@ -41,7 +46,7 @@ from mitsplat.scene.spec import (
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.untrusted_images import check_image
 from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
-from mitsplat.yaml_input import key_place, load_yaml
+from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
 _DRAWN = (
     *("exposure", "vignetting", "motion_blur", "motion_angle", "iso"),
@@ -55,12 +60,12 @@ class Scene:
     """A scene file with everything that it refers to.
 
     Attributes:
-        spec: What the file says, its enclosure written out as shapes.
+        spec: What the file says, its enclosure written out as shapes and patterns of pools as what they match.
         path: The scene file.
         environment: The surroundings, or None.
-        assets: Asset of each entry of ``spec.objects``, with its scale and class name applied.
+        assets: Assets of each entry of ``spec.objects`` in turn, in each of its scales, with its class name.
         shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
-        class_names: Sorted; the position in it is the class index.
+        class_names: Of what is labelled, sorted; the position in it is the class index.
         images: Files of the images that lights name, by those names.
     """
 
@@ -76,6 +81,20 @@ class Scene:
     def num_frames(self) -> int:
         """Layouts times views; frames of one layout are neighbours."""
         return self.spec.output.layouts * self.spec.output.views
+
+    @cached_property
+    def pools(self) -> tuple[range, ...]:
+        """Positions among the assets that each entry of ``spec.objects`` draws from."""
+        ends = list(accumulate((len(entry.names) * len(entry.scales) for entry in self.spec.objects), initial=0))
+        return tuple(range(*ends) for ends in pairwise(ends))
+
+    def entry_of(self, asset: int) -> ObjectSpec:
+        """The entry of ``spec.objects`` that draws an asset."""
+        return next(entry for entry, pool in zip(self.spec.objects, self.pools, strict=True) if asset in pool)
+
+    def class_index(self, asset: int) -> int | None:
+        """Class index that objects of an asset are labelled with; None if they are not."""
+        return self.class_names.index(self.assets[asset].class_name) if self.entry_of(asset).label else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +139,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     spec = load_yaml(path, SceneSpec, overrides=overrides)
     if not allow_outside:
         _confine(spec, path)
+    spec = _matched(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     named = _read_named(spec, path)
     _check_images(spec, path, named)
@@ -133,7 +153,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         environment=environment,
         assets=assets,
         shape_meshes=shape_meshes,
-        class_names=tuple(sorted({asset.class_name for asset in assets})),
+        class_names=_class_names(spec, assets),
         images=named.images,
     )
 
@@ -155,10 +175,12 @@ def _read_named(spec: SceneSpec, path: Path) -> _Named:
     if spec.environment is not None:
         with _blaming(path, "environment"):
             environment = Asset.load(folder / spec.environment)
-    for position, entry in enumerate(spec.objects):
-        if entry.asset not in assets:
-            with _blaming(path, "objects", position, "asset"):
-                assets[entry.asset] = Asset.load(folder / entry.asset)
+    for keys, name, entry in _object_assets(spec):
+        if entry.pool == PRIMITIVES:
+            assets |= {} if name in assets else dict(zip(entry.names, make_primitives(spec.seed), strict=True))
+        elif name not in assets:
+            with _blaming(path, *keys):
+                assets[name] = Asset.load(folder / name)
     for position, shape in enumerate(spec.shapes):
         with _blaming(path, "shapes", position, "mesh"):
             shape_meshes.append(_shape_mesh(shape, folder))
@@ -185,16 +207,67 @@ def _sized_objects(spec: SceneSpec, path: Path, named: _Named) -> tuple[Asset, .
     """
     sized: dict[tuple[str, float | None, float], Asset] = {}
     assets = []
-    for position, entry in enumerate(spec.objects):
-        key = (entry.asset, entry.size, entry.scale)
-        if key not in sized:
-            with _blaming(path, "objects", position, "asset"):
-                asset = named.assets[entry.asset]
-                asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
-                sized[key] = asset if entry.scale == 1.0 else asset.scaled(entry.scale)
-                _check_fit(sized[key], spec.region)
-        assets.append(replace(sized[key], class_name=entry.class_name or sized[key].class_name))
+    for keys, name, entry in _object_assets(spec):
+        for scale in entry.scales:
+            key = (name, entry.size, scale)
+            if key not in sized:
+                with _blaming(path, *keys):
+                    asset = named.assets[name]
+                    asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
+                    sized[key] = asset if scale == 1.0 else asset.scaled(scale)
+                    _check_fit(sized[key], spec.region)
+            assets.append(replace(sized[key], class_name=entry.class_name or sized[key].class_name))
     return tuple(assets)
+
+
+def _class_names(spec: SceneSpec, assets: Sequence[Asset]) -> tuple[str, ...]:
+    """Classes of what is labelled."""
+    entries = [entry for _, _, entry in _object_assets(spec) for _ in entry.scales]
+    return tuple(sorted({asset.class_name for entry, asset in zip(entries, assets, strict=True) if entry.label}))
+
+
+def _object_assets(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str, ObjectSpec]]:
+    """Key, folder and entry of every asset that is named for objects."""
+    for position, entry in enumerate(spec.objects):
+        for number, name in enumerate(entry.names):
+            keys = ("asset",) if entry.asset is not None else ("pool", number)
+            yield ("objects", position, *keys), name, entry
+
+
+def _matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
+    """The specification with patterns of pools replaced by the folders of objects that they match, by name.
+
+    Raises:
+        InputError: If there are none or not as many as weights, or one is a link to where none may be named.
+    """
+    objects = list(spec.objects)
+    for position, entry in enumerate(objects):
+        if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
+            with _blaming(path, "objects", position, "pool"):
+                names = _matches(path.parent, entry.pool, allow_outside=allow_outside)
+            try:
+                entry.check_weights(len(names))
+            except FieldError as error:
+                raise InputError(f"{key_place(path, ('objects', position, *error.key))}: {error}") from error
+            objects[position] = entry.model_copy(update={"pool": names})
+    return spec.model_copy(update={"objects": tuple(objects)}) if objects != list(spec.objects) else spec
+
+
+def _matches(folder: Path, pattern: str, *, allow_outside: bool) -> tuple[str, ...]:
+    """Asset folders of objects that a pattern matches, relative to a folder."""
+    absolute = Path(pattern).is_absolute()
+    try:
+        found = sorted(Path("/").glob(pattern.lstrip("/")) if absolute else folder.glob(pattern))
+    except (ValueError, NotImplementedError) as error:
+        raise InputError(f"must be a pattern of folders ({error}; got {pattern!r})") from error
+    named = [path for path in found if (path / ASSET_FILE).is_file()]
+    if not allow_outside:
+        for path in named:
+            _refuse_outside(folder, str(path.absolute()))
+    objects = [path for path in named if read_spec(path).kind == "object"]
+    if not objects:
+        raise InputError(f"must match at least one folder of an object's asset (got {pattern!r}, which matches none)")
+    return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in objects)
 
 
 def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
@@ -212,13 +285,20 @@ def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[
 def _confine(spec: SceneSpec, path: Path) -> None:
     """Refuse what is named outside of the scene's folder."""
     named: list[tuple[tuple[str | int, ...], str | None]] = [(("environment",), spec.environment)]
-    named += [(("objects", position, "asset"), entry.asset) for position, entry in enumerate(spec.objects)]
+    named += [(keys, name) for keys, name, _ in _object_assets(spec)]
+    patterns = ((i, entry.pool) for i, entry in enumerate(spec.objects))
+    named += [(("objects", i, "pool"), pattern) for i, pattern in patterns if isinstance(pattern, str)]
     named += [(("shapes", position, "mesh"), shape.mesh) for position, shape in enumerate(spec.shapes)]
     named += [(("lights", i, "image"), getattr(light, "image", None)) for i, light in enumerate(spec.lights)]
     for keys, name in named:
-        if name is not None and not is_inside(path.parent, name):
+        if name is not None:
             with _blaming(path, *keys):
-                raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
+                _refuse_outside(path.parent, name)
+
+
+def _refuse_outside(folder: Path, name: str) -> None:
+    if not is_inside(folder, name):
+        raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
 
 
 def _check_lens(spec: SceneSpec, path: Path) -> None:
@@ -261,7 +341,7 @@ def plan_frame(scene: Scene, index: int) -> FramePlan:
         index=index,
         layout=layout,
         view=view,
-        split=_split(layout, spec.output.validation),
+        split=split_of(layout, spec.output.validation),
         camera=_camera(spec, view, index),
         next_camera=_camera(spec, view + 1, index + 1) if view + 1 < spec.output.views else None,
         lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
@@ -320,16 +400,6 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
         return read_mesh(folder / str(shape.mesh))
     box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=stated_pose(shape.box))
     return box
-
-
-def _split(layout: int, validation: float) -> Literal["train", "val"]:
-    """Split of a layout, the same however many follow it: the second layout is the first of the smaller split.
-
-    Among the first n layouts, floor(1 + (n - 2) share) belong to the smaller split.
-    """
-    share = min(validation, 1.0 - validation)
-    before, after = (math.floor(1.0 + (count - 2) * share) for count in (layout, layout + 1))
-    return "val" if (after > before) == (validation <= 0.5) else "train"
 
 
 def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> LightSpec:

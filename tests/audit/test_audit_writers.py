@@ -296,7 +296,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "bop: models in metres": (
         "bop",
-        changing(bop, "write_models", lambda made, root, meshes: bop_models(root, [m.copy() for m in meshes], 0.001)),
+        changing(bop, "write_models", lambda made, root, meshes: bop_models(root, meshes, 0.001)),
         "bop/models/obj_000001.ply",
         "does not fit its silhouettes",
     ),
@@ -408,10 +408,8 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
 }
 
 
-def bop_models(root: Path, meshes: list[Any], scale: float) -> None:
-    for mesh in meshes:
-        mesh.apply_scale(scale)
-    REAL_MODELS(root, meshes)
+def bop_models(root: Path, meshes: dict[int, Any], scale: float) -> None:
+    REAL_MODELS(root, {number: mesh.copy().apply_scale(scale) for number, mesh in meshes.items()})
 
 
 REAL_MODELS = bop.write_models

@@ -15,7 +15,6 @@ from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts
 from mitsplat.bake.path_tracing import render_mesh, trace_radiance
-from mitsplat.bake.surfels import place_surfels, poisson_subset
 from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
@@ -25,6 +24,7 @@ from mitsplat.render.layers import ensure_variant
 from mitsplat.scene.spec import AreaLight, EnvironmentLight
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats
+from mitsplat.surfels import place_surfels, poisson_subset
 
 FACE_COLOURS = np.array(
     [[230, 40, 40], [40, 200, 60], [50, 70, 220], [220, 200, 40], [40, 200, 210], [200, 60, 200]], dtype=np.uint8

@@ -29,10 +29,11 @@ from mitsplat.formats.yolo import rotated_box
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.masks import Silhouette
+from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import load_scene
 from mitsplat.scene.spec import FORMATS
 from tests.labels.test_labels import Seen, read_yolo, resample, whole
-from tests.synthetic import frame_around
+from tests.synthetic import CERTIFICATE, frame_around
 
 WIDTH, HEIGHT = 160, 120
 CLASSES = ("bolt", "nut")
@@ -125,7 +126,7 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
     )
     return frame_around(
         plan,
-        SimpleNamespace(to_json=lambda: {"certificate": {}}),
+        Layout(index // 2, tuple(instances), CERTIFICATE),
         labels,
         image=rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8),
         ids=ids,
@@ -154,7 +155,9 @@ MESHES = [trimesh.creation.box(extents=(0.02, 0.03, 0.05)), trimesh.creation.ico
 def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     root = tmp_path_factory.mktemp("formats")
     spec = SimpleNamespace(
-        output=SimpleNamespace(formats=FORMATS, image="png", jpeg_quality=95), labels=SimpleNamespace(source="splats")
+        output=SimpleNamespace(formats=FORMATS, image="png", jpeg_quality=95),
+        labels=SimpleNamespace(source="splats"),
+        empty=0.0,
     )
     catalogue = Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES)
     frames = [frame_of(Drawn(covered), index) for index, covered in enumerate(LAYOUTS.values())]

@@ -25,7 +25,7 @@ class Seen:
     """Stands for mitsplat.scene.layout.Instance, of which labels need no more."""
 
     id: int
-    class_index: int
+    class_index: int | None
     world_from_object: np.ndarray
     asset: int = 0
 
@@ -392,3 +392,15 @@ def test_json_gives_the_labels_back():
     for one, other in zip(back.instances, labels.instances, strict=True):
         np.testing.assert_array_equal(one.mask, other.mask)
         np.testing.assert_array_equal(one.world_from_object, other.world_from_object)
+
+
+def test_a_distractor_hides_and_has_no_label():
+    """Half of a square is behind what has no class."""
+    ids = np.zeros((40, 40), dtype=np.uint16)
+    ids[10:30, 10:20], ids[5:35, 20:35] = 1, 2
+    square = np.ones((20, 20), dtype=bool)
+    instances = [Seen(1, 0, np.eye(4)), Seen(2, None, np.eye(4)), Seen(3, None, np.eye(4))]
+    labels = label_instances(truth_of(ids, alone={1: (square, 10, 10)}), instances, CLASSES, LabelRules())
+    (found,) = labels.instances
+    assert (found.id, found.visible_fraction, found.marks) == (1, 0.5, ())
+    assert not any(labels.dropped.values())

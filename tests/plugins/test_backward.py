@@ -18,7 +18,7 @@ from mitsplat.splats import Splats
 from tests.reference import render_reference
 from tests.render.test_render import CAMERA, make_splats
 
-QUALITY = Quality(order="tile", alpha_min=1e-7, transmittance_min=0)
+QUALITY = Quality(alpha_min=1e-7, transmittance_min=0)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 

@@ -57,7 +57,7 @@ def camera(distortion: tuple[float, ...] = ()) -> ms.Camera:
     [
         (Quality(), ()),
         (Quality(samples=2), ()),
-        (Quality(order="ray", alpha_min=1e-5), ()),
+        (Quality(tolerance=0.0, alpha_min=1e-5), ()),
         (Quality(), (0.08, -0.02, 1e-3, -2e-3)),
     ],
     ids=["balanced", "samples", "exact", "distorted"],

@@ -266,7 +266,8 @@ def test_a_thin_lens_is_that_of_our_own_camera() -> None:
     }
     ground = {"floor": make_splats_shape(stripes(0.0)), "sky": WHITE_SKY}
     scene = mi.load_dict({"type": "scene", **ground})
-    integrator = make_integrator(lens_rings=1, shadow="none")
+    # The crop begins inside a tile: only the order of each ray knows of no tiles.
+    integrator = make_integrator(quality="exact", lens_rings=1, shadow="none")
     ours = integrator.render(scene, make_sensor(replace(camera, aperture_radius=0.05, focus_distance=0.5)))
     theirs = integrator.render(scene, mi.load_dict(lens))
     sharp = integrator.render(scene, make_sensor(camera))

@@ -194,6 +194,52 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"output__validation": 1.5}, "output.validation: must be <= 1 (got 1.5)"),
         ({"enclosure": {"floor": 0.2}}, "enclosure.floor: must be below the region's top at 0.2 m (got 0.2)"),
         ({"objects__0__asset": "assets/gone"}, "objects[0].asset: "),
+        ({"objects__0": {"count": 2}}, "objects[0]: must have either an asset or a pool"),
+        ({"objects__0__pool": ["assets/bolt"]}, "objects[0]: must have either an asset or a pool"),
+        ({"objects__0": {"pool": []}}, "objects[0].pool: must name at least one asset (got [])"),
+        ({"objects__0": {"pool": 3}}, "objects[0].pool: must be text (got 3)"),
+        ({"objects__0": {"pool": ["assets/nut", 3]}}, "objects[0].pool[1]: must be text (got 3)"),
+        ({"objects__0": {"pool": ["assets/nut", "assets/gone"]}}, "objects[0].pool[1]: "),
+        (
+            {"objects__0": {"pool": "gone/*"}},
+            "objects[0].pool: must match at least one folder of an object's asset (got 'gone/*', which matches none)",
+        ),
+        ({"objects__0": {"pool": "**a"}}, "objects[0].pool: must "),
+        (
+            {"objects__0": {"pool": ["assets/nut", "assets/bolt"], "weights": [1]}},
+            "objects[0].weights: must be as many as the pool has assets, 2 (got 1)",
+        ),
+        (
+            {"objects__0": {"pool": "assets/*", "weights": [1, 2, 3]}},
+            "objects[0].weights: must be as many as the pool has assets, 2 (got 3)",
+        ),
+        ({"objects__0": {"pool": ["assets/nut"], "weights": [0]}}, "objects[0].weights[0]: must be > 0 (got 0)"),
+        ({"objects__0__weights": [1]}, "objects[0].weights: needs a pool"),
+        ({"objects__0__balance": True}, "objects[0].balance: needs a pool"),
+        ({"objects__0__label": "no"}, 'objects[0].label: must be true or false (got "no")'),
+        (
+            {"objects__0": {"pool": ["assets/nut"], "poses": [{"position": [0, 0, 1]}]}},
+            "objects[0].pool: must not be given together with poses",
+        ),
+        ({"objects__0__scale": [2, 1]}, "objects[0].scale: must be [low, high] with low <= high (got [2.0, 1.0])"),
+        (
+            {"objects__0__scale": [0, 1]},
+            "objects[0].scale: must be a number > 0, or [least, most] of them (got [0, 1])",
+        ),
+        (
+            {"objects__0": {"asset": "assets/nut", "scale": [1, 2], "poses": [{"position": [0, 0, 1]}]}},
+            "objects[0].scale: must be one number together with poses",
+        ),
+        (
+            {"objects__0": {"pool": "primitives", "weights": [1, 2]}},
+            "objects[0].weights: must be as many as the pool has assets, 15 (got 2)",
+        ),
+        (
+            {"objects__0": {"pool": "primitives", "size": 0.1}},
+            "objects[0].size: must not be given for primitives, which take a scale",
+        ),
+        ({"objects__0": {"pool": "primitives", "scale": 30}}, "objects[0].pool[0]: asset 'box_0' must fit into"),
+        ({"empty": 1.5}, "empty: must be <= 1 (got 1.5)"),
         ({"environment": "assets/gone"}, "environment: "),
         ({"shapes__0": {"name": "a", "mesh": "gone.ply"}}, "gone.ply: no such file"),
         (

@@ -1,0 +1,167 @@
+"""Datasets with pools, distractors and empty layouts: what no label may say, and what the manifest states."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.dataset import frame_job
+from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.dataset.write import write_dataset
+from mitsplat.formats.registry import write_frame
+from mitsplat.scene.contents import draw_objects
+from mitsplat.scene.layout import Instance, Layout
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec import FORMATS
+from mitsplat.scene.streams import random_stream
+from tests.conftest import box_asset, small_scene
+from tests.drawn import large_boxes, render_boxes
+from tests.synthetic import CERTIFICATE
+
+OBJECTS = [
+    {"pool": ["assets/nut", "assets/bolt"], "count": [2, 4], "balance": True, "scale": [0.7, 1.2]},
+    {"asset": "assets/crate", "count": 2, "label": False},
+]
+
+
+def scatter_drawn(scene: Scene, index: int, *, progress: Any) -> Layout:
+    """What is drawn for a layout, at random poses; no physics."""
+    rng = random_stream(scene.spec.seed, "drawn layout", index)
+    instances = []
+    for number, asset in enumerate(draw_objects(scene, index)[0]):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = rng.uniform(-0.17, 0.17, 3)
+        instances.append(Instance(number + 1, asset, scene.class_index(asset), pose))
+    return Layout(index, tuple(instances), CERTIFICATE)
+
+
+def write(scene: Scene, out: Path, **options: Any) -> Path:
+    return write_dataset(scene, out, **({"render": render_boxes, "settle": scatter_drawn} | options)).path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("distractors")
+    assets = [*large_boxes(), box_asset("crate", (0.1, 0.1, 0.1))]
+    small = small_scene(
+        folder, assets, OBJECTS, layouts=8, views=2, formats=[name for name in FORMATS if name != "colmap"]
+    )
+    return replace(small, spec=small.spec.model_copy(update={"empty": 0.25}))
+
+
+@pytest.fixture(scope="module")
+def made(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(scene, tmp_path_factory.mktemp("made") / "out")
+
+
+def records_of(root: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
+
+
+def test_the_audit_finds_nothing(made: Path) -> None:
+    found = audit_dataset(made)
+    assert found.violations == ()
+    assert found.frames == 16 and found.instances > 16
+
+
+def test_the_manifest_states_every_draw(made: Path, scene: Scene) -> None:
+    empty = set()
+    for record in records_of(made):
+        assets = draw_objects(scene, record["layout"])[0]
+        assert [drawn["asset"] for drawn in record["objects"]] == list(assets)
+        for drawn in record["objects"]:
+            asset = scene.assets[drawn["asset"]]
+            assert asset.mesh is not None
+            assert drawn["name"] == asset.name
+            assert drawn["label"] == (asset.name != "crate") == (drawn["entry"] == 0)
+            edge = {"nut": 0.16, "bolt": 0.25, "crate": 0.1}[asset.name]
+            assert asset.mesh.extents.max() == pytest.approx(edge * drawn["scale"])
+        if record["empty"]:
+            empty.add(record["layout"])
+            assert {drawn["label"] for drawn in record["objects"]} == {False}
+        assert record["empty"] != any(drawn["label"] for drawn in record["objects"])
+    assert 0 < len(empty) < 4  # a quarter of each split
+
+
+def test_distractors_are_in_no_label_file(made: Path) -> None:
+    """Nor in maps of labels: their pixels are the environment's, where they hide an object too."""
+    seen = 0
+    for path in made.rglob("*"):
+        if path.suffix in (".txt", ".json", ".xml", ".yaml", ".ply") and path.parent.name not in ("scene", "layouts"):
+            stated = path.read_text()
+            assert "crate" not in stated or path.name in ("dataset.json", "poses.json"), path
+    assert {path.name for path in (made / "bop/models").glob("*.ply")} == {f"obj_{n:06d}.ply" for n in range(1, 11)}
+    for record in records_of(made):
+        distractors = [drawn["id"] for drawn in record["objects"] if not drawn["label"]]
+        assert not {label["id"] for label in record["labels"]["instances"]} & set(distractors)
+        name = f"{record['split']}/{record['index']:06d}"
+        semantic = cv2.imread(str(made / f"semantic/{name}.png"), cv2.IMREAD_UNCHANGED)
+        labelled = cv2.imread(str(made / f"instances/{name}.png"), cv2.IMREAD_UNCHANGED)
+        panoptic = cv2.imread(str(made / f"panoptic/{name}.png"))[..., ::-1].astype(int) @ (1, 256, 65536)
+        assert ((semantic == 0) == (labelled == 0))[semantic < 255].all()
+        assert (panoptic[semantic == 0] == record["environment"]["id"]).all()
+        seen += len(record["labels"]["instances"])
+        if record["empty"]:
+            assert (made / f"labels/{name}.txt").read_text() == ""
+            assert not semantic.any()
+    assert seen > 16
+
+
+@pytest.mark.parametrize("part", ["workers", "shards"])
+def test_bytes_do_not_depend_on_who_makes_them(made: Path, scene: Scene, tmp_path: Path, part: str) -> None:
+    if part == "workers":
+        out = write(scene, tmp_path / "out", workers=3)
+    else:
+        parts = [write(scene, tmp_path / f"part{n}", shard=Shard(n, 2)) for n in (1, 2)]
+        out = merge_shards(parts, tmp_path / "out").path
+    whole = {path.relative_to(made): path for path in made.rglob("*") if path.is_file() and path.name != ".lock"}
+    other = {path.relative_to(out) for path in out.rglob("*") if path.is_file() and path.name != ".lock"}
+    assert other == set(whole)
+    for name in other - {Path("timings.jsonl"), Path("runs.jsonl")}:
+        assert (out / name).read_bytes() == whole[name].read_bytes(), name
+
+
+def labelling_distractors(scene: Scene, index: int, *, layout: Layout) -> Any:
+    """Renders as :func:`render_boxes`, but takes all for the first class."""
+    return render_boxes(
+        scene, index, layout=replace(layout, instances=tuple(replace(one, class_index=0) for one in layout.instances))
+    )
+
+
+def test_a_distractor_that_is_labelled_is_found(scene: Scene, tmp_path: Path) -> None:
+    out = write(scene, tmp_path / "out", render=labelling_distractors)
+    texts = [text for _, text in audit_dataset(out).violations]
+    assert any("is labelled, though the scene says that it is not" in text for text in texts)
+    assert any("though its layout is an empty one" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda drawn: drawn.pop(), "its objects are not those of layouts/"),
+        (lambda drawn: drawn[0].update(asset=drawn[0]["asset"] + 1), "its objects are not those of layouts/"),
+        (lambda drawn: drawn[0].update(label=False), "instance 1 is none of the objects that were drawn"),
+    ],
+)
+def test_draws_that_are_stated_wrongly_are_found(
+    scene: Scene, tmp_path: Path, change: Callable[[Any], object], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrongly(*given: Any) -> Any:
+        record = write_frame(*given)
+        change(record["objects"])
+        return record
+
+    monkeypatch.setattr(frame_job, "write_frame", wrongly)
+    out = write(scene, tmp_path / "out")
+    assert any(text in found for _, found in audit_dataset(out).violations)

@@ -1,0 +1,164 @@
+"""The error of the order of blending: its estimate, and tiles that are walked again where it is too large."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsplat.camera import look_at_pose
+from mitsplat.colour import encode_srgb
+from mitsplat.quality import Quality
+from mitsplat.render.layers import (
+    Layers,
+    ensure_variant,
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_splats,
+)
+from mitsplat.splats import Splats
+from tests.render.test_render import CAMERA, make_splats
+
+WIDE = CAMERA.resized(96, 72)
+RAY = Quality(tolerance=0.0, alpha_min=1e-4, transmittance_min=0.0)
+CROWD = make_splats(600, 51, scales=(0.02, 0.3))
+
+
+def display(layers: Layers) -> np.ndarray:
+    """Display-encoded colour, multiplied by alpha, as it is blended."""
+    return encode_srgb(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
+
+
+def errors(quality: Quality) -> np.ndarray:
+    """Largest error of each pixel's channels against the order of its ray, (H, W)."""
+    exact = display(render_splats(CROWD, WIDE, quality=replace(quality, tolerance=0.0)))
+    return np.abs(display(render_splats(CROWD, WIDE, quality=quality)) - exact).max(axis=-1)
+
+
+def test_the_tolerance_is_kept_by_nearly_all_pixels() -> None:
+    tile = errors(replace(RAY, tolerance=math.inf))
+    assert (tile > 5e-3).mean() > 0.1
+    for tolerance in (2e-3, 5e-3, 2e-2):
+        found = errors(replace(RAY, tolerance=tolerance))
+        assert (found > tolerance).mean() < 0.01
+        assert np.sqrt(np.mean(found**2)) < tolerance / 2
+
+
+def test_a_smaller_tolerance_walks_more_tiles_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mitsplat.plugins import march
+
+    again: list[int] = []
+    sort = march.in_ray_order
+    monkeypatch.setattr(march, "in_ray_order", lambda lists, chosen, view: noted(sort(lists, chosen, view)))
+
+    def noted(lists: Any) -> Any:
+        again.append(dr.width(lists.tiles))
+        return lists
+
+    for tolerance in (0.05, 0.01, 1e-3, 1e-9):
+        render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=tolerance))
+    assert 0 < again[0] < again[1] < again[2] < again[3] <= 24 * 18
+    again.clear()
+    for tolerance in (0.0, math.inf):
+        render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=tolerance))
+    assert again == []
+
+
+VIEWS = {
+    "pinhole": {},
+    "distorted": {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)},
+    "fisheye": {"distortion": (0.05, -0.02, 0.01, -0.003), "lens": "fisheye", "fx": 60.0, "fy": 58.0},
+    "thin": {"aperture_radius": 0.05, "focus_distance": 2.0},
+    "inside": {"world_from_camera": look_at_pose((0, 0, -0.2), (0, 0, 1))},
+}
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("lens", VIEWS)
+@pytest.mark.parametrize("mesh", [False, True])
+def test_no_tolerance_is_the_order_of_rays(lens: str, samples: int, mesh: bool) -> None:
+    """Whatever is late at all is walked again: colours, depths and ids are those of the exact order."""
+    ensure_variant()
+    camera = replace(WIDE, width=50, height=38, **VIEWS[lens])
+    parts = [make_splats(250, seed, scales=(0.02, 0.25)) for seed in (61, 62, 63)]
+    scene: dict[str, Any] = {
+        f"part {number}": make_splats_shape(splats, instance=number) for number, splats in enumerate(parts)
+    }
+    if mesh:
+        scene["card"] = {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, 0.1]).rotate([1, 0, 0], 150).scale(0.4),
+        }
+    quality = replace(RAY, samples=samples, lens_rings=1)
+
+    def shown(tolerance: float) -> Layers:
+        integrator = make_integrator(quality=replace(quality, tolerance=tolerance), shadow="none")
+        return render_layers(integrator, mi.load_dict({"type": "scene", **scene}), camera)
+
+    exact, repaired = shown(0.0), shown(1e-9)
+    for name in ("rgb", "alpha", "captured", "depth"):
+        np.testing.assert_allclose(getattr(repaired, name), getattr(exact, name), atol=2e-5)
+    assert (repaired.instance == exact.instance).mean() > 0.999
+    assert np.abs(shown(math.inf).captured - exact.captured).max() > 1e-3
+
+
+def sheets(colour: Any) -> Splats:
+    """Round Gaussians in three wide, tilted layers, opaque together, whose colour is a function of x."""
+    rng = np.random.default_rng(7)
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 60), np.linspace(-1.2, 1.2, 48)))
+    layers = []
+    for depth in (-0.04, 0.0, 0.04):
+        n = len(x)
+        places = np.column_stack([x, y, depth + 0.2 * x + rng.normal(0, 0.02, n)])
+        layers.append(
+            Splats(
+                means=places,
+                quats=np.tile([0.0, 0, 0, 1], (n, 1)),
+                scales=np.full((n, 3), 0.06),
+                opacities=np.full(n, 0.8),
+                sh=np.repeat(colour(x)[:, None, None], 3, axis=2),
+            )
+        )
+    return Splats.concatenate(layers)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+    """A picture of one colour keeps it, and a ramp has no steps, where every other tile is walked again."""
+    from mitsplat.plugins import march
+
+    judged = march._too_wrong
+
+    def judged_or_black(pixels: list[Any], quality: Quality) -> Any:
+        """Also the black squares of a chequerboard of 24 x 18 tiles."""
+        tile = dr.arange(mi.UInt32, dr.width(pixels[0][0])) // 16
+        return judged(pixels, quality) | ((tile + tile // 24) % 2 == 0)
+
+    monkeypatch.setattr(march, "_too_wrong", judged_or_black)
+    quality = Quality(tolerance=1e-3, alpha_min=1e-4, transmittance_min=1e-5, samples=samples)
+    even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality=quality)
+    assert np.ptp(even.rgb / even.alpha[..., None]) < 1e-5
+    ramp = display(render_splats(sheets(lambda x: 0.8 * x), WIDE, quality=quality))
+    exact = display(render_splats(sheets(lambda x: 0.8 * x), WIDE, quality=replace(quality, tolerance=0.0)))
+    steps = np.abs(np.diff(ramp - exact, axis=1)).max(axis=(0, 2))
+    assert np.ptp(ramp) > 0.3
+    assert steps[3::4].max() < 2e-3  # from the last column of a tile to the first of the next
+
+
+def test_late_by_one_place_is_estimated_exactly() -> None:
+    """Two neighbours that change places change a colour by the product of their opacities times what they differ."""
+    ensure_variant()
+    from mitsplat.plugins.march import ERROR, _blend, _fresh
+
+    colours, opacities = ((0.9, 0.2, 0.1), (0.3, 0.6, 0.4)), (0.6, 0.5)
+    pixel = _fresh(False, True)
+    for colour, opacity, z in zip(colours, opacities, (2.0, 1.0), strict=True):
+        record = {6: colour[0], 7: colour[1], 8: colour[2]}
+        pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, True)
+    assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)

@@ -1,0 +1,137 @@
+"""What a layout holds: draws from pools, classes dealt out in turn, and layouts without anything that is labelled."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.scene.contents import draw_objects, is_empty, split_of
+from mitsplat.scene.scene import Scene, load_scene
+from tests.conftest import WriteScene, box_asset
+
+SceneData = dict[str, Any]
+
+
+@pytest.fixture
+def pool_of_four(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> SceneData:
+    """Four assets of three classes: two are nuts."""
+    box_asset("other_nut", class_name="nut").save(tmp_path / "assets/other_nut")
+    box_asset("pin").save(tmp_path / "assets/pin")
+    names = [f"assets/{name}" for name in ("nut", "other_nut", "bolt", "pin")]
+    scene_data["objects"] = [{"pool": names, "count": [1, 4]}]
+    scene_data["output"] |= {"layouts": 200, "validation": 0.25}
+    return scene_data
+
+
+def drawn(scene: Scene, layout: int) -> list[str]:
+    return [scene.assets[asset].name for asset in draw_objects(scene, layout)[0]]
+
+
+def counted(scene: Scene, split: str | None = None, layouts: int = 200) -> Counter[str]:
+    wanted = (i for i in range(layouts) if split in (None, split_of(i, scene.spec.output.validation)))
+    return Counter(scene.assets[asset].class_name for i in wanted for asset in draw_objects(scene, i)[0])
+
+
+def test_each_object_is_drawn_anew(pool_of_four: SceneData, write_scene: WriteScene) -> None:
+    scene = load_scene(write_scene(pool_of_four))
+    layouts = [drawn(scene, index) for index in range(200)]
+    assert {len(names) for names in layouts} == {1, 2, 3, 4}
+    assert any(len(set(names)) < len(names) for names in layouts)
+    counts = Counter(name for names in layouts for name in names)
+    expected = sum(counts.values()) / 4
+    assert all(abs(count - expected) < 4 * expected**0.5 for count in counts.values())
+
+
+def test_weights_are_relative(pool_of_four: SceneData, write_scene: WriteScene) -> None:
+    pool_of_four["objects"][0]["weights"] = [1, 1, 2, 4]
+    scene = load_scene(write_scene(pool_of_four))
+    counts = Counter(name for index in range(200) for name in drawn(scene, index))
+    for name, share in (("nut", 1 / 8), ("other_nut", 1 / 8), ("bolt", 2 / 8), ("pin", 4 / 8)):
+        expected = share * sum(counts.values())
+        assert abs(counts[name] - expected) < 4 * expected**0.5
+
+
+@pytest.mark.parametrize("layouts", [7, 50, 200])
+def test_balance_deals_classes_out_in_turn(pool_of_four: SceneData, write_scene: WriteScene, layouts: int) -> None:
+    """However many layouts there are, and in each split: no class is ahead by two."""
+    pool_of_four["objects"][0] |= {"balance": True, "weights": [9, 1, 1, 1]}
+    scene = load_scene(write_scene(pool_of_four | {"empty": 0.1}))
+    for split in ("train", "val"):
+        counts = counted(scene, split, layouts)
+        assert max(counts.values()) - min(counts[name] for name in scene.class_names) <= 1
+    names = Counter(name for index in range(200) for name in drawn(scene, index))
+    assert names["nut"] > 4 * names["other_nut"] > 0  # weights choose within a class
+    assert len({tuple(drawn(scene, index)) for index in range(200)}) > 40
+
+
+def test_any_order_of_layouts_draws_the_same(pool_of_four: SceneData, write_scene: WriteScene) -> None:
+    pool_of_four["objects"][0]["balance"] = True
+    path = write_scene(pool_of_four)
+    one, other = load_scene(path), load_scene(path, overrides={"output.layouts": 3})
+    backwards = {index: draw_objects(one, index)[0] for index in range(40, -1, -1)}
+    assert backwards == {index: draw_objects(other, index)[0] for index in range(41)}
+
+
+def test_a_pool_leaves_what_other_entries_draw_alone(scene_data: SceneData, write_scene: WriteScene) -> None:
+    plain = load_scene(write_scene(scene_data))
+    scene_data["objects"].append({"pool": ["assets/nut", "assets/bolt"], "count": [0, 3], "label": False})
+    more = load_scene(write_scene(scene_data))
+    for index in range(20):
+        assets = draw_objects(plain, index)[0]
+        assert draw_objects(more, index)[0][: len(assets)] == assets
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.75])
+def test_each_split_has_its_share_of_empty_layouts(
+    pool_of_four: SceneData, write_scene: WriteScene, share: float
+) -> None:
+    pool_of_four["objects"].append({"asset": "assets/pin", "label": False})
+    scene = load_scene(write_scene(pool_of_four | {"empty": share}))
+    for split in ("train", "val"):
+        layouts = [i for i in range(200) if split_of(i, 0.25) == split]
+        empty = [i for i in layouts if is_empty(scene.spec, i)]
+        assert abs(len(empty) - share * len(layouts)) <= 1
+        for index in layouts:
+            labelled = [a for a in draw_objects(scene, index)[0] if scene.class_index(a) is not None]
+            assert bool(labelled) == (index not in empty)
+            assert scene.pools[1][0] in draw_objects(scene, index)[0]  # distractors lie in all of them
+
+
+def test_classes_are_those_of_what_is_labelled(scene_data: SceneData, write_scene: WriteScene) -> None:
+    scene_data["objects"][0]["label"] = False
+    scene = load_scene(write_scene(scene_data))
+    assert scene.class_names == ("bolt",)
+    assert [scene.class_index(asset) for asset in (0, 1)] == [None, 0]
+
+
+def test_a_pattern_is_what_it_matches(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+    """By name, objects alone, and written into the scene, so that a dataset knows what it was made of."""
+    path = write_scene(scene_data | {"objects": [{"pool": "assets/*", "count": 2}]})
+    box_asset("around").save(tmp_path / "assets/around")
+    folder = tmp_path / "assets/around/asset.yaml"
+    folder.write_text(folder.read_text().replace("kind: object", "kind: environment"))
+    (tmp_path / "assets/notes").mkdir()
+    scene = load_scene(path)
+    assert scene.spec.objects[0].pool == ("assets/bolt", "assets/nut")
+    assert [asset.name for asset in scene.assets] == ["bolt", "nut"]
+    with pytest.raises(InputError, match=r"objects\[0\]\.pool: must be inside the scene's folder"):
+        load_scene(write_scene(scene_data | {"objects": [{"pool": "../*"}]}))
+
+
+def test_a_range_of_scales_is_sizes_of_their_own(scene_data: SceneData, write_scene: WriteScene) -> None:
+    """Each is a whole asset, with mesh, splats, pieces and mass in its size: poses stay rigid."""
+    scene_data["objects"] = [{"pool": ["assets/nut", "assets/bolt"], "scale": [0.5, 2], "count": 3}]
+    scene = load_scene(write_scene(scene_data))
+    assert scene.pools == (range(10),)
+    factors = [0.5, 0.5**0.5, 1, 2**0.5, 2]
+    for asset, factor in zip(scene.assets, factors + factors, strict=True):
+        assert asset.mesh is not None
+        edge = 0.03 if asset.name == "nut" else 0.05
+        assert asset.mesh.extents.max() == pytest.approx(edge * factor)
+        assert asset.pieces[0].extents.max() == pytest.approx(edge * factor)
+        assert abs(asset.splats.means).max() == pytest.approx(edge * factor / 2)
+    assert {asset for index in range(60) for asset in draw_objects(scene, index)[0]} == set(range(10))

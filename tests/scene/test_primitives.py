@@ -1,0 +1,55 @@
+"""Primitives: solids that physics can drop, of splats that cover them, the same for a seed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from mitsplat.scene.primitives import make_primitives
+from mitsplat.scene.scene import load_scene
+from tests.conftest import WriteScene
+
+
+def test_primitives_are_solids_that_their_splats_cover() -> None:
+    primitives = make_primitives(7)
+    assert len({asset.name for asset in primitives}) == 15
+    assert sorted({asset.class_name for asset in primitives}) == ["box", "capsule", "cone", "cylinder", "sphere"]
+    for asset in primitives:
+        assert asset.mesh is not None
+        assert asset.mesh.is_watertight and asset.mesh.is_convex and asset.mesh.volume > 0
+        assert 0.025 <= asset.mesh.extents.max() <= 0.06
+        assert asset.check() == ()
+        area = 4 * np.sqrt(asset.mesh.area / len(asset.splats))
+        places = asset.mesh.sample(500, seed=0)
+        distance, _ = KDTree(asset.splats.means).query(places)
+        assert distance.max() < area
+    colours = {tuple(np.round(asset.splats.sh[0, 0], 3)) for asset in primitives}
+    assert len(colours) == 15
+    assert any(len(np.unique(asset.splats.sh.round(3), axis=0)) == 2 for asset in primitives)
+
+
+def test_a_seed_decides_them() -> None:
+    first, again, other = (make_primitives(seed) for seed in (3, 3, 4))
+    for one, same in zip(first, again, strict=True):
+        assert one.mesh is not None and same.mesh is not None
+        assert (one.mesh.vertices == same.mesh.vertices).all()
+        for array in ("means", "quats", "scales", "sh"):
+            assert (getattr(one.splats, array) == getattr(same.splats, array)).all()
+    assert first[0].splats.sh.tolist() != other[0].splats.sh.tolist()
+
+
+def test_entries_share_primitives_and_size_them(scene_data: dict[str, Any], write_scene: WriteScene) -> None:
+    scene_data["objects"] = [
+        {"asset": "assets/nut"},
+        {"pool": "primitives", "label": False},
+        {"pool": "primitives", "label": False, "scale": 2},
+    ]
+    scene = load_scene(write_scene(scene_data))
+    assert scene.class_names == ("nut",)
+    assert [len(pool) for pool in scene.pools] == [1, 15, 15]
+    for one, larger in zip(scene.assets[1:16], scene.assets[16:], strict=True):
+        assert one.mesh is not None and larger.mesh is not None
+        assert larger.mesh.extents.max() == pytest.approx(2 * one.mesh.extents.max())

@@ -285,7 +285,8 @@ def run_pool(
                 if not staff:
                     raise _too_large(frame, answer.message)
                 gone += 1
-                note(f"memory has run out for frame {frame}: it is made again with {len(staff)} workers")
+                left = f"{len(staff)} worker{'s' * (len(staff) > 1)}"
+                note(f"memory has run out for frame {frame}: it is made again with {left}")
                 if not at_work:
                     assign(next(iter(staff)))
                 continue

@@ -284,8 +284,7 @@ class _Tracer:
         origin = _origin(surface)
         alpha2 = dr.square(dr.square(surface.roughness))
         cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
-        static, casting = self.proxies.static, self.proxies.casting
-        stoppers: tuple[Stopper, ...] = casting if static is None else (static, *casting)
+        static, stoppers = self.proxies.static, self.proxies.stoppers
         known: list[Any] = []
 
         def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:

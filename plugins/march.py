@@ -37,7 +37,7 @@ from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.shares import add_to_tally, new_tally, settle_instances, winner_of_tally
 from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, in_ray_order
-from mitsplat.plugins.walk import Lanes, Pixel, Rays, walk
+from mitsplat.plugins.walk import Lanes, Pixel, Rays, largest, walk
 from mitsplat.quality import Quality
 
 
@@ -227,10 +227,7 @@ def march(
 
 def _too_wrong(pixels: list[Pixel], quality: Quality) -> Any:
     """Whether the estimate of an error exceeds the tolerance in a lane."""
-    largest = pixels[0][ERROR]
-    for pixel in pixels[1:]:
-        largest = dr.maximum(largest, pixel[ERROR])
-    return largest > dr.opaque(mi.Float, quality.tolerance)
+    return largest([pixel[ERROR] for pixel in pixels]) > dr.opaque(mi.Float, quality.tolerance)
 
 
 def _repaired(image: Image, wrong: Any, lists: TileLists, view: View, quality: Quality, z_max: Any | None) -> Image:

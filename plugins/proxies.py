@@ -94,6 +94,11 @@ class Proxies:
         self.casting: tuple[Stopper, ...] = tuple(stopper for stopper in casting if stopper is not None)
         self.apart = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
 
+    @property
+    def stoppers(self) -> tuple[Stopper, ...]:
+        """All that stops light, the static proxies first."""
+        return self.casting if self.static is None else (self.static, *self.casting)
+
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
         """What rays meet first, and what they would meet without the dynamic proxies."""
         static = _TraceScene.nearest(self.static, ray, Hit.nothing())

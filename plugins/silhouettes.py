@@ -26,7 +26,7 @@ from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, prefix_ranges
-from mitsplat.plugins.walk import respond_along
+from mitsplat.plugins.walk import largest, respond_along
 from mitsplat.quality import Quality
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
@@ -203,10 +203,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance
         ]
 
     def undecided(i: Any, through: list[Any]) -> Any:
-        most = through[0]
-        for t in through[1:]:
-            most = dr.maximum(most, t)
-        return (i < stop) & (most >= 0.5)
+        return (i < stop) & (largest(through) >= 0.5)
 
     ones = [mi.Float(1.0) for _ in range(TILE)]
     _, through = dr.while_loop((mi.UInt32(start), ones), undecided, body, label="silhouettes")

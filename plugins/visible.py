@@ -330,8 +330,7 @@ class PathTracer:
         dr.eval(ray, light, key)
         free = dr.max(light) > 0
         free &= ~self.scene.ray_test(ray, active=free)
-        static = self.proxies.static
-        for stopper in (*(() if static is None else (static,)), *self.proxies.casting):
+        for stopper in self.proxies.stoppers:
             dr.eval(free)
             free = free & ~stopper.stop(ray, mi.UInt32(0), key, free)
         _add(result, lane, dr.select(free, light, 0))

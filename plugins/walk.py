@@ -8,8 +8,9 @@ registers run out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -155,6 +156,11 @@ def walk(rays: Rays, order: Order, fresh: Callable[[], Pixel], blend: Blend) -> 
     return ways[order](rays, fresh, blend)
 
 
+def largest(values: Sequence[Any]) -> Any:
+    """Of the values of a lane's rays, by which the lane knows when it is done."""
+    return reduce(dr.maximum, values)
+
+
 @dataclass(frozen=True, eq=False)
 class _Fields:
     """Fields of the records of that number, fetched where they are asked for: rays of a lane meet different ones."""
@@ -207,12 +213,6 @@ def _walk_in_tile_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) ->
     """Blend in the order of the tile's list: that of the peaks along one of its rays."""
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
-    def alive(pixels: list[Pixel]) -> Any:
-        brightest = pixels[0][0]
-        for pixel in pixels[1:]:
-            brightest = dr.maximum(brightest, pixel[0])
-        return brightest > end
-
     def body(i: Any, pixels: list[Pixel]) -> tuple[Any, list[Pixel]]:
         record = dr.gather(
             mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
@@ -228,7 +228,7 @@ def _walk_in_tile_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) ->
 
     _, pixels = dr.while_loop(
         (rays.start, [fresh() for _ in far]),
-        lambda i, pixels: (i < rays.stop) & alive(pixels),
+        lambda i, pixels: (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end),
         body,
         label="march",
     )
@@ -261,10 +261,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
         return blend(pixel, pixel[0] * alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
 
     def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
-        brightest = pixels[0][0]
-        for pixel in pixels[1:]:
-            brightest = dr.maximum(brightest, pixel[0])
-        return (i < rays.stop) & (brightest > end)
+        return (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
 
     def body(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> tuple[Any, list[Pixel], list[_Slots]]:
         number = dr.gather(mi.UInt32, lists.entries, i)

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.mesh_normals import CREASE_ANGLE
+from mitsplat.splats import Splats
 
+_OPACITY = 0.98
 _PACKING = 0.62
 """Points per area r^2 of the sets that :func:`poisson_subset` keeps, measured on a plane (0.70 at saturation)."""
 _CANDIDATES = 5.0
@@ -67,6 +69,16 @@ class Surfels:
     def centres(self) -> Float64Array:
         """Where to put Gaussians so that their outer sides lie on the surface [m], shape (N, 3)."""
         return self.points - 1.5 * self.scales[:, 2:] * self.normals
+
+    def splats(self, sh: Float64Array) -> Splats:
+        """Gaussians of these shapes, all but opaque, with coefficients of SH (N, K, 3)."""
+        return Splats(
+            means=self.centres.astype(np.float32),
+            quats=self.quats.astype(np.float32),
+            scales=self.scales.astype(np.float32),
+            opacities=np.full(len(self), _OPACITY, dtype=np.float32),
+            sh=sh.astype(np.float32),
+        )
 
     @property
     def normals(self) -> Float64Array:

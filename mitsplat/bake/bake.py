@@ -35,11 +35,9 @@ from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant
 from mitsplat.scene.spec import LightSpec
 from mitsplat.spherical_harmonics import sh_basis
-from mitsplat.splats import Splats
 from mitsplat.surfels import Surfels, place_surfels
 from mitsplat.variant import one_at_a_time
 
-_OPACITY = 0.98
 _HIDDEN = 0.01
 """Radiance of a white surface under the uniform light below which nobody sees it."""
 _DETAIL = 7.0
@@ -202,13 +200,7 @@ def bake_asset(
     if not len(surfels):
         raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
     colour = _fit_radiance(scene, surfels, settings, rng, stages.step)
-    splats = Splats(
-        means=surfels.centres.astype(np.float32),
-        quats=surfels.quats.astype(np.float32),
-        scales=surfels.scales.astype(np.float32),
-        opacities=np.full(len(surfels), _OPACITY, dtype=np.float32),
-        sh=_sharpened(surfels, colour, settings.sharpening).astype(np.float32),
-    )
+    splats = surfels.splats(_sharpened(surfels, colour, settings.sharpening))
     if settings.fit_steps:
         stages("path-tracing pictures")
         fit_cameras = fit_cameras or _orbit(surface, settings.fit_views, turn=0.0)

@@ -19,13 +19,11 @@ from mitsplat.asset import Asset
 from mitsplat.scene.spec import NUM_PRIMITIVES
 from mitsplat.scene.streams import random_stream
 from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
 from mitsplat.surfels import Surfels, place_surfels
 
 _KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
 _EXTENT = (0.025, 0.06)  # longest [m]
 _SURFELS = 1200
-_OPACITY = 0.98
 _LINING = 0.97  # size of the second layer
 
 
@@ -46,7 +44,7 @@ def _make(number: int, rng: np.random.Generator) -> Asset:
     return Asset(
         name=f"{kind}_{number}",
         class_name=kind,
-        splats=_splats(surfels, np.array(colours)[second.astype(int)]),
+        splats=surfels.splats((np.array(colours)[second.astype(int)][:, None] - 0.5) / SH_C0),
         mesh=mesh,
         pieces=(mesh,),
         friction=float(rng.uniform(0.3, 0.7)),
@@ -98,14 +96,3 @@ def _pattern(points: Float64Array, rng: np.random.Generator) -> BoolArray:
         return np.asarray(distance < 0.5)
     cells = np.floor(turned[:, :1] if style == "stripes" else turned).astype(int)
     return np.asarray(cells.sum(axis=1) % 2 == 1)
-
-
-def _splats(surfels: Surfels, colours: Float64Array) -> Splats:
-    """Surfels in display-encoded colours (N, 3)."""
-    return Splats(
-        means=surfels.centres.astype(np.float32),
-        quats=surfels.quats.astype(np.float32),
-        scales=surfels.scales.astype(np.float32),
-        opacities=np.full(len(surfels), _OPACITY, dtype=np.float32),
-        sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32),
-    )

@@ -19,6 +19,7 @@ from scipy.spatial.distance import pdist
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import read_mesh
 from mitsplat.audit.described import Cursor, are_objects, differing, is_close
+from mitsplat.audit.owned import labelled_assets
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
 from mitsplat.errors import InputError
@@ -131,8 +132,7 @@ class BopReader:
         except (OSError, ValueError) as error:
             yield file, f"cannot be read ({error})"
             info = None
-        distractors = self._content.get("distractors", ())
-        labelled = [position for position in range(len(self._content["assets"])) if position not in distractors]
+        labelled = labelled_assets(self._content)
         numbers = {str(position + 1) for position in labelled}
         if isinstance(info, dict) and info.keys() - numbers:
             yield file, f"measures {min(info.keys() - numbers)}, which is no object that is labelled"

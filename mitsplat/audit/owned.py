@@ -67,12 +67,17 @@ def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
             yield where, f"lists {file}, which is of no format of the dataset"
 
 
+def labelled_assets(content: Mapping[str, Any]) -> list[int]:
+    """Positions of the assets that labels are of, which are those that have models, in a dataset of this content."""
+    return sorted(set(range(len(content["assets"]))) - set(content.get("distractors", ())))
+
+
 class Owned:
     """Names of all files that something accounts for, 8 bytes each."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._formats = content["scene"]["output"]["formats"]
-        self._models = sorted(set(range(len(content["assets"]))) - set(content.get("distractors", ())))
+        self._models = labelled_assets(content)
         self._names = array("Q")
         self._last = ("", -1)
         for file in self._of_all():

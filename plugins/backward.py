@@ -24,7 +24,7 @@ from mitsplat.plugins.march import march
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import TILE, View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians, bin_records
-from mitsplat.plugins.walk import Lanes
+from mitsplat.plugins.walk import Lanes, largest
 from mitsplat.quality import KERNELS, Quality
 from mitsplat.recorded import Table, recorded
 
@@ -40,27 +40,18 @@ def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[l
     Args:
         cloud: Gaussians from :func:`pack_cloud`, in world space.
         view: Camera; one sample per pixel.
-        quality: Cut-offs and SH degree; the order must be ``tile``.
+        quality: Cut-offs and SH degree; of infinite tolerance.
 
     Gaussians that reach the camera's plane would have no gradient, and are left out: a fit cannot mend them.
 
     Raises:
-        ValueError: If the quality asks for another order, several samples or a kernel that limits opacity.
+        ValueError: If the quality asks for a tolerance, several samples or a kernel that limits opacity.
     """
-    lists = _bin_cloud(cloud, view, quality)
-    rgb, alpha = _march(lists.records, lists, view, quality)
+    _check(view, quality)
+    lists = bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False)
+    # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
+    *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
     return rgb, alpha
-
-
-def render_depth_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[list[Any], Any, Any]:
-    """As :func:`render_differentiable`, and the sum of the centres' depths [m] by their weights in alpha.
-
-    That takes a second march in which depth is a colour.
-    """
-    lists = _bin_cloud(cloud, view, quality)
-    rgb, alpha = _march(lists.records, lists, view, quality)
-    (moment, _, _), _ = _march(_tinted(lists.records), lists, view, quality)
-    return rgb, alpha, moment
 
 
 def _tinted(records: Any) -> Any:
@@ -74,17 +65,6 @@ def _tinted(records: Any) -> Any:
 
 _RED, _DEPTH = 6, 9
 """Places in a view record."""
-
-
-def _march(records: Any, lists: TileLists, view: View, quality: Quality) -> tuple[list[Any], Any]:
-    # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
-    *rgb, alpha = dr.custom(_March, records, lambda: (lists, view, quality))
-    return rgb, alpha
-
-
-def _bin_cloud(cloud: Cloud, view: View, quality: Quality) -> TileLists:
-    _check(view, quality)
-    return bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False)
 
 
 def _check(view: View, quality: Quality) -> None:
@@ -439,10 +419,7 @@ def _gradient(
         return i + 1, new_light, new_rest
 
     def alive(i: Any, light: list[Any], rest: list[Any]) -> Any:
-        brightest = light[0]
-        for t in light[1:]:
-            brightest = dr.maximum(brightest, t)
-        return (i < lanes.stop) & (brightest > end)
+        return (i < lanes.stop) & (largest(light) > end)
 
     state = lanes.start, [mi.Float(1) for _ in us], behind
     dr.while_loop(state, alive, body, label="march backward")

@@ -105,6 +105,11 @@ def test_no_wing_is_too_large_to_know() -> None:
     assert {wing: count for wing, count in lines.items() if count > LARGEST} == {}
 
 
+def test_no_page_has_marks_of_an_unfinished_merge() -> None:
+    for page in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("scenes/*.yaml")]:
+        assert not [line for line in page.read_text().splitlines() if line.startswith(("<<<<<<< ", ">>>>>>> "))], page
+
+
 def test_the_design_names_every_module() -> None:
     design = (ROOT / "docs/design.md").read_text()
     for module, path in MODULES.items():

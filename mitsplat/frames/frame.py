@@ -38,7 +38,7 @@ from mitsplat.render.layers import (
 )
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
-from mitsplat.scene.spec import EnvironmentLight, LightSpec
+from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
 from mitsplat.splats import Splats
 from mitsplat.variant import ensure_variant, one_at_a_time
 

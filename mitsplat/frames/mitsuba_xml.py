@@ -26,7 +26,7 @@ from mitsplat.progress import Note
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import describe_sensor, ensure_variant
 from mitsplat.scene.scene import Scene, layout_of, plan_frame
-from mitsplat.scene.spec import Shape
+from mitsplat.scene.spec_shapes import Shape
 from mitsplat.scene.untrusted_xml import check_xml
 
 

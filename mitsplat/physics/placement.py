@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.mesh_distance import PlacedSurface, Surface, clearance
-from mitsplat.scene.spec import Arrangement, Region
+from mitsplat.scene.spec_objects import Arrangement
+from mitsplat.scene.spec_shapes import Region
 from mitsplat.scene.walls import PILE_HEIGHT
 
 _PLACES = 200  # positions tried for an object before all are drawn anew

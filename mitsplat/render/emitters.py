@@ -10,7 +10,7 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.colour import black_body_colour
-from mitsplat.scene.spec import LightSpec
+from mitsplat.scene.spec_lights import LightSpec
 from mitsplat.variant import ensure_variant
 
 

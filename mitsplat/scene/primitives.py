@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.scene.spec import NUM_PRIMITIVES
+from mitsplat.scene.spec_objects import NUM_PRIMITIVES
 from mitsplat.scene.streams import random_stream
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.surfels import Surfels, place_surfels

@@ -27,22 +27,11 @@ from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.contents import split_of
 from mitsplat.scene.primitives import make_primitives
-from mitsplat.scene.spec import (
-    PRIMITIVES,
-    SCHEMA_VERSION,
-    CameraHemisphere,
-    CameraOrbit,
-    EnvironmentLight,
-    Intrinsics,
-    LightSpec,
-    ObjectSpec,
-    Output,
-    PointLight,
-    Region,
-    SceneSpec,
-    Shape,
-    SpotLight,
-)
+from mitsplat.scene.spec import SCHEMA_VERSION, Output, SceneSpec
+from mitsplat.scene.spec_camera import CameraHemisphere, CameraOrbit, Intrinsics
+from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec, PointLight, SpotLight
+from mitsplat.scene.spec_objects import PRIMITIVES, ObjectSpec
+from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.untrusted_images import check_image
 from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose

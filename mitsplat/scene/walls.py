@@ -10,7 +10,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.scene.spec import Bin, Box, Enclosure, ObjectPose, Region, SceneSpec, Shape
+from mitsplat.scene.spec import SceneSpec
+from mitsplat.scene.spec_objects import ObjectPose
+from mitsplat.scene.spec_shapes import Bin, Box, Enclosure, Region, Shape
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset

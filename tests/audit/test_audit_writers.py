@@ -24,7 +24,8 @@ from mitsplat.formats import bop, coco, colmap, label_studio, maps, voc, yolo
 from mitsplat.formats import registry as writers
 from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec import FORMATS, Intrinsics
+from mitsplat.scene.spec import FORMATS
+from mitsplat.scene.spec_camera import Intrinsics
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 

@@ -150,8 +150,9 @@ def test_code_that_decides_layouts_is_hashed():
         *("arrays.BoolArray", "arrays.Float32Array", "arrays.Float64Array", "arrays.Int64Array", "progress.Note"),
         *("asset.Asset", "errors.InputError", "scene.scene.Scene"),
         *(f"scene.layout.{name}" for name in ("Instance", "Layout", "RestCertificate")),
-        *(f"scene.spec.{name}" for name in ("Arrangement", "Bin", "Box", "Enclosure", "ObjectPose", "Region")),
-        *("scene.spec.SceneSpec", "scene.spec.Shape"),
+        *(f"scene.spec_objects.{name}" for name in ("Arrangement", "ObjectPose")),
+        *(f"scene.spec_shapes.{name}" for name in ("Bin", "Box", "Enclosure", "Region", "Shape")),
+        "scene.spec.SceneSpec",
     }
     given = types | {"cache.cache_folder", "cache.keep_file", "scene.layout.NOTHING_TO_REST", "warp_start.quiet_warp"}
     given |= {"content_hash.ContentHash"}  # names what is kept

@@ -1,0 +1,102 @@
+"""Keys of a scene file about the picture: what varies, how it is composed and drawn."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, NonNegativeFloat
+
+from mitsplat.quality import KernelName, ResponseName
+from mitsplat.scene.spec_types import (
+    JpegQuality,
+    Kelvin,
+    NonNegativeRange,
+    Positive,
+    PositiveRange,
+    Range,
+    StrictModel,
+    Unit,
+    ordered,
+)
+
+
+class Randomise(StrictModel):
+    """Ranges drawn from uniformly, anew for every frame unless stated; a range of equal ends fixes the value."""
+
+    exposure: Range = Field((0.0, 0.0), description="Exposure [stops].")
+    hue: Range = Field((0.0, 0.0), description="Hue shift [degrees].")
+    saturation: NonNegativeRange = Field((1.0, 1.0), description="Factor on saturation.")
+    white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)] = Field(
+        (6504.0, 6504.0), description="Correlated colour temperature that is shown as white [K]."
+    )
+    iso: PositiveRange | None = Field(None, description="Sensitivity of the sensor, hence its noise; none if absent.")
+    vignetting: NonNegativeRange = Field((0.0, 0.0), description="Loss of light in the image's corners [stops].")
+    motion_blur: NonNegativeRange = Field(
+        (0.0, 0.0), description="Length of the camera's motion in the image, in a direction drawn anew [px]."
+    )
+    jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(ordered)] | None = Field(
+        None, description="Quality of a JPEG compression before the image is written; none if absent."
+    )
+    friction: PositiveRange = Field(
+        (1.0, 1.0),
+        description="Factor on the friction of each entry of objects, drawn once for a layout; its square root "
+        "is the factor on contacts with the table.",
+    )
+    light_intensity: PositiveRange = Field((1.0, 1.0), description="Factor on each light, drawn once for a layout.")
+
+
+class Sensor(StrictModel):
+    """What makes noise of ``randomise.iso``."""
+
+    full_well: Positive = Field(20000.0, description="Electrons of display white at ISO 100.")
+    read_noise: NonNegativeFloat = Field(3.0, description="Electrons, 1 sigma.")
+
+
+class ImageShadow(StrictModel):
+    """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2).
+
+    The shadow map is normalised, blurred, bent by a sigmoid and multiplied; where it is brightest, light is added.
+    """
+
+    blur: Positive = Field(5.0, description="Standard deviation of the Gaussian blur [px at a width of 1280].")
+    slope: Positive = Field(10.0, description="Steepness of the sigmoid.")
+    midpoint: Unit = Field(0.5, description="Value of the normalised map that the sigmoid takes to one half.")
+    darkest: Unit = Field(0.35, description="Factor in full shadow.")
+    highlight_start: float = Field(
+        0.85, ge=0, lt=1, description="Value of the normalised map above which the highlight starts."
+    )
+    highlight_gain: NonNegativeFloat = Field(0.06, description="Linear value that the highlight adds at most.")
+
+
+class Composite(StrictModel):
+    """How layers become a picture."""
+
+    shadow: Literal["traced", "image", "none"] = Field(
+        "traced", description="Shadow rays, the image-space approximation, or no shadow."
+    )
+    shadow_error: float = Field(
+        0.03, gt=0, lt=1, description="Standard error of traced light for which shadow rays are spent."
+    )
+    image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of shadow: image.")
+    highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")
+    occluders: Literal["proxies", "splats"] = Field(
+        "proxies", description="What casts traced shadows of objects: their meshes, or the splats of thin, porous ones."
+    )
+    bounce: bool = Field(True, description="Whether objects get the light that the environment reflects to them.")
+    tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
+    sensor: Sensor = Field(Sensor(), description="Noise of the sensor.")
+
+
+class Rendering(StrictModel):
+    """How splats are drawn, whatever the preset; see :class:`mitsplat.quality.Quality`."""
+
+    response: ResponseName = Field(
+        "perspective",
+        description="Every ray's exact perspective, or parallel rays within a Gaussian as in trainers.",
+    )
+    kernel: KernelName = Field(
+        "exact",
+        description="The Gaussian itself, widened by a pixel so that nothing sparkles, or as those trainers dilate it.",
+    )
+    samples: int = Field(1, ge=1, le=8, description="Rays per pixel along each axis: 2 smooths silhouettes.")
+    lens_rings: int = Field(2, ge=1, le=8, description="Rings of points on a thin lens: 1, 2, 3 take 7, 19, 37 images.")

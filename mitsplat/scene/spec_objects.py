@@ -1,0 +1,134 @@
+"""Keys of a scene file about objects: which lie there, and how they come to rest."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from mitsplat.scene.spec_types import CountRange, Positive, Scale, StrictModel, Vec3
+from mitsplat.yaml_input import FieldError
+
+Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
+
+
+class ObjectPose(StrictModel):
+    """Where an object starts."""
+
+    position: Vec3 = Field(description="Origin of the asset [m].")
+    rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
+
+
+PRIMITIVES = "primitives"
+"""The pool that needs no folder, see :mod:`mitsplat.scene.primitives`."""
+
+NUM_PRIMITIVES = 15
+
+SIZES = 5
+"""How many sizes a range of scales has, evenly spaced in ratio: each is a rigid model of its own in every format."""
+
+
+class ObjectSpec(StrictModel):
+    """Objects of one asset, or of a pool that each layout draws from."""
+
+    asset: str | None = Field(None, description="Asset folder, relative to the scene file; this or ``pool``.")
+    pool: str | tuple[str, ...] | None = Field(
+        None,
+        exclude_if=lambda pool: pool is None,
+        description="Asset folders that every object of the entry is drawn from, or a pattern such as ``assets/*`` "
+        "that takes the objects among the folders that it matches, by name. Or ``primitives``: "
+        f"{NUM_PRIMITIVES} boxes, cylinders, spheres, capsules and cones of 25 to 60 mm in random materials, which the "
+        "seed decides and no folder holds.",
+    )
+    count: CountRange = Field((1, 1), description="How many in each layout: a number or an inclusive range.")
+    weights: tuple[Positive, ...] = Field(
+        (),
+        exclude_if=lambda weights: not weights,
+        description="How often each of the pool is drawn, relative to the others; alike if absent.",
+    )
+    balance: bool = Field(
+        False,
+        exclude_if=lambda balance: not balance,
+        description="Whether classes of the pool are dealt out in turn, so that in each split none is ahead of another "
+        "by more than one; weights then choose within a class.",
+    )
+    label: bool = Field(
+        True,
+        exclude_if=lambda label: label,
+        description="Whether it is labelled. What is not hides, shadows and pushes what is, and is in no label file.",
+    )
+    size: Positive | None = Field(None, description="Longest extent [m], for an asset of unknown units only.")
+    scale: Scale = Field(
+        1.0,
+        description="Uniform scale applied to the asset, its mass with its volume; or a range, of which each object "
+        f"has one of {SIZES} sizes evenly spaced in ratio.",
+    )
+    class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
+    poses: tuple[ObjectPose, ...] = Field(
+        (), description="Where each starts, instead of count; from there it settles like the others."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> ObjectSpec:
+        if (self.asset is None) == (self.pool is None):
+            raise FieldError((), "must have either an asset or a pool")
+        if self.pool == ():
+            raise FieldError("pool", "must name at least one asset (got [])")
+        for key in ("weights", "balance"):
+            if self.pool is None and getattr(self, key):
+                raise FieldError(key, "needs a pool")
+        if isinstance(self.pool, tuple) or self.pool == PRIMITIVES:
+            self.check_weights(len(self.names))
+        if self.pool == PRIMITIVES and self.size is not None:
+            raise FieldError("size", "must not be given for primitives, which take a scale")
+        if self.poses:
+            for key in ("count", "pool"):
+                if key in self.model_fields_set:
+                    raise FieldError(key, "must not be given together with poses")
+            if isinstance(self.scale, tuple):
+                raise FieldError("scale", "must be one number together with poses")
+        return self
+
+    def check_weights(self, members: int) -> None:
+        """Refuse weights of another number than the pool's members."""
+        if self.weights and len(self.weights) != members:
+            raise FieldError("weights", f"must be as many as the pool has assets, {members} (got {len(self.weights)})")
+
+    @property
+    def most(self) -> int:
+        """The most objects of it that a layout can have."""
+        return len(self.poses) or self.count[1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Asset folders, or primitives, that it draws from; a loaded scene has no pattern, but what it matched."""
+        if self.asset is not None:
+            return (self.asset,)
+        if self.pool == PRIMITIVES:
+            return tuple(f"{PRIMITIVES} {number}" for number in range(NUM_PRIMITIVES))
+        return self.pool if isinstance(self.pool, tuple) else ()
+
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """Scales that each of them comes in."""
+        if isinstance(self.scale, tuple):
+            return tuple(np.geomspace(*self.scale, SIZES).tolist()) if self.scale[0] < self.scale[1] else self.scale[:1]
+        return (self.scale,)
+
+
+class Settle(StrictModel):
+    """How objects are laid out and come to rest.
+
+    ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes, poured in at
+    1 m/s. ``scatter``: apart, so that none touches another. ``stack``: all of one asset above one another on their
+    largest face. ``upright``: put down as the asset stands, turned about the vertical.
+    """
+
+    arrangement: Arrangement = Field("drop", description="Random drop, pile, sparse scatter, stacks or upright.")
+    max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
+    attempts: int = Field(5, ge=1, description="Redraws before a layout is given up.")
+    timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
+    stepper: Literal["warp", "mujoco"] = Field(
+        "warp", description="Newton's MuJoCo solver on Warp, or MuJoCo in C: double precision and nothing to compile."
+    )

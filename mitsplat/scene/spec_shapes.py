@@ -1,0 +1,81 @@
+"""Keys of a scene file about what does not move: shapes, the drop region, the walls around it."""
+
+from __future__ import annotations
+
+from pydantic import Field, NonNegativeFloat, model_validator
+
+from mitsplat.scene.spec_types import Positive, StrictModel, Unit, Vec3
+from mitsplat.yaml_input import FieldError
+
+
+class Box(StrictModel):
+    """A box, its axes along the world's before ``rotate``."""
+
+    size: tuple[Positive, Positive, Positive] = Field(description="Full edge lengths [m].")
+    position: Vec3 = Field((0, 0, 0), description="Centre [m].")
+    rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
+
+
+class Bin(StrictModel):
+    """A box without lid, open upwards, that objects fall into."""
+
+    size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of its inside [m].")
+    position: Vec3 = Field((0, 0, 0), description="Middle of its inner floor [m].")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+    thickness: Positive = Field(0.004, description="Thickness of floor and walls [m].")
+
+
+class Shape(StrictModel):
+    """A box, a bin or a mesh that is rendered, collides or shades."""
+
+    name: str = Field(min_length=1, description="Name, unique among the shapes.")
+    box: Box | None = Field(None, description="The shape as a box.")
+    bin: Bin | None = Field(None, description="Or as a bin.")
+    mesh: str | None = Field(None, description="Or as a mesh file, relative to the scene file, in world space [m].")
+    visible: bool = Field(False, description="Whether it is rendered.")
+    collider: bool = Field(True, description="Whether objects rest on it and bounce off it.")
+    proxy: bool = Field(
+        False,
+        description="Whether light is traced against it though it is not rendered: a table that only splats show.",
+    )
+    colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
+    friction: NonNegativeFloat = Field(
+        0.6, description="Coulomb friction coefficient; what touches has the geometric mean of both sides'."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Shape:
+        if sum(form is not None for form in (self.box, self.bin, self.mesh)) != 1:
+            raise FieldError("name", f"shape {self.name!r} must have either a box, a bin or a mesh")
+        if not (self.visible or self.collider or self.proxy):
+            raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
+        return self
+
+
+class Region(StrictModel):
+    """Axis-aligned box from whose inside objects are dropped."""
+
+    min: Vec3 = Field(description="Lower corner [m].")
+    max: Vec3 = Field(description="Upper corner [m].")
+
+    @model_validator(mode="after")
+    def _check(self) -> Region:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if not low < high:
+                raise FieldError("max", f"must be above min along {axis} (got {high:g}, min is {low:g})")
+        return self
+
+
+class Enclosure(StrictModel):
+    """Four invisible walls around the drop region, and a lid on it, that keep objects in.
+
+    A layout in which an object comes to rest against one of them is drawn again.
+    """
+
+    margin: NonNegativeFloat | None = Field(
+        None,
+        description="Distance of the walls outside the region's sides [m]; if absent the size of the largest object, "
+        "as far as there are colliders to lie on.",
+    )
+    floor: float = Field(0.0, description="Height of the walls' lower edge [m].")
+    thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")

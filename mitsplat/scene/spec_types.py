@@ -1,0 +1,73 @@
+"""What the models of a scene file are made of: values with their units and rules."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat
+
+
+class StrictModel(BaseModel):
+    """Immutable, without unknown keys, infinities or NaN."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+    """Refuse a range whose ends are swapped."""
+    if bounds[0] > bounds[1]:
+        raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
+    return bounds
+
+
+def _count_range(count: Any) -> Any:
+    """One number n as (n, n); a list as a tuple, since strict mode takes nothing else from here on."""
+    if isinstance(count, int) and not isinstance(count, bool):
+        if count < 1:
+            raise ValueError(f"must be >= 1 (got {count})")
+        return (count, count)
+    if not isinstance(count, list | tuple) or len(count) != 2:
+        shown = "nothing" if count is None else json.dumps(count, default=str)
+        raise ValueError(f"must be a whole number, or [least, most] of them (got {shown})")
+    return tuple(count)
+
+
+def _scale_range(scale: Any) -> Any:
+    """A list as a tuple, once it is known for a range: of a union, the error would be that of its other half."""
+    if not isinstance(scale, list | tuple):
+        return scale
+    if len(scale) != 2 or not all(isinstance(n, int | float) and not isinstance(n, bool) and n > 0 for n in scale):
+        raise ValueError(f"must be a number > 0, or [least, most] of them (got {json.dumps(scale, default=str)})")
+    return ordered((float(scale[0]), float(scale[1])))
+
+
+def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(colour):
+        raise ValueError("must not be black (got [0, 0, 0])")
+    return colour
+
+
+Vec3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+Range = Annotated[tuple[float, float], AfterValidator(ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(ordered)]
+CountRange = Annotated[
+    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
+    AfterValidator(ordered),
+    BeforeValidator(_count_range, json_schema_input_type=int | tuple[int, int]),
+]
+Scale = Annotated[
+    Positive | tuple[Positive, Positive],
+    BeforeValidator(_scale_range, json_schema_input_type=Positive | tuple[Positive, Positive]),
+]
+Elevation = Annotated[float, Field(ge=-90, le=90)]
+Kelvin = Annotated[float, Field(ge=1667, le=25000)]
+JpegQuality = Annotated[float, Field(ge=1, le=100)]
+EmittedColour = Annotated[
+    tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
+    AfterValidator(_some_colour),
+    Field(description="Linear RGB factor on the emission."),
+]

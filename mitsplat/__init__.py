@@ -34,6 +34,7 @@ _HOME = {
     "Splats": "splats",
     "bake_asset": "bake.bake",
     "load_scene": "scene.scene",
+    "remake_frame": "dataset.remake",
     "render_frame": "frames.frame",
     "render_splats": "render.layers",
     "settle_layout": "physics.settle",
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from mitsplat.asset import Asset as Asset
     from mitsplat.bake.bake import bake_asset as bake_asset
     from mitsplat.camera import Camera as Camera
+    from mitsplat.dataset.remake import remake_frame as remake_frame
     from mitsplat.dataset.write import write_dataset as write_dataset
     from mitsplat.device import use_device as use_device
     from mitsplat.errors import InputError as InputError

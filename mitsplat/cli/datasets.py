@@ -18,7 +18,9 @@ from mitsplat.quality import PresetName
 
 if TYPE_CHECKING:
     from mitsplat.dataset.write import DatasetSummary
+    from mitsplat.device import Device
     from mitsplat.findings import Finding
+    from mitsplat.scene.scene import Scene
 
 # Commands import what they need themselves, so that help appears at once.
 
@@ -38,6 +40,13 @@ def render(
         typer.Option("--out", "-o", help="Dataset folder (for .xml: picture); out/<name of SCENE> if absent."),
     ] = None,
     frames: Annotated[int | None, typer.Option("--frames", "-n", help="Only the first so many images.")] = None,
+    only: Annotated[
+        int | None,
+        typer.Option(
+            metavar="FRAME",
+            help="Only this image, from 0, again: into a folder beside --out, and compared with the dataset in --out.",
+        ),
+    ] = None,
     size: FrameSize = None,
     seed: SceneSeed = None,
     quality: Preset = None,
@@ -94,6 +103,9 @@ def render(
     """
     from mitsplat.device import find_device
 
+    if only is not None and any((frames is not None, shard, engine == "ray", workers is not None, overwrite)):
+        raise InputError("--only makes one image, here: give it without -n, --shard, --engine, --workers, --overwrite")
+
     with command_log(json_log, "render") as progress_bars:
         overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
         if out is None:
@@ -102,7 +114,7 @@ def render(
         if chosen is not None and not json_log:
             tell_device(chosen)
         if scene.suffix == ".xml":
-            if overrides or frames is not None or tolerance is not None or shard is not None:
+            if overrides or any(given is not None for given in (frames, only, tolerance, shard)):
                 raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
             from mitsplat.frames.mitsuba_xml import render_apart
 
@@ -139,6 +151,9 @@ def render(
                 )
             typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
             loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
+        if only is not None:
+            _remake(loaded, only, out, device if chosen is None else chosen)
+            return
         with progress_bars() as progress:
             summary = write_dataset(
                 loaded,
@@ -153,6 +168,22 @@ def render(
                 any_device=any_device,
             )
         _tell_dataset(summary, whole=part is None)
+
+
+def _remake(scene: Scene, index: int, dataset: Path, device: str | Device | None) -> None:
+    """Make one frame again; status 1 if it is not what the dataset has."""
+    from mitsplat.dataset.remake import remake_frame
+
+    made = remake_frame(scene, index, Path(f"{dataset}-{index:06d}"), dataset=dataset, device=device)
+    typer.echo(f"frame {index}: {made.path} ({len(made.record['files'])} files)")
+    if not made.compared:
+        typer.echo(f"not compared: {dataset} has no frame {index}")
+    elif not made.differing:
+        typer.echo(f"the same bytes as in {dataset}")
+    else:
+        cause = made.cause or "though both were made from the same"
+        typer.echo(f"not as in {dataset}: {', '.join(made.differing)} ({cause})")
+        raise typer.Exit(1)
 
 
 def merge(

@@ -24,6 +24,7 @@ from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.cli import app, main
+from mitsplat.dataset import remake
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.write import DatasetSummary
 from mitsplat.device import CPU, Device
@@ -114,6 +115,33 @@ def test_render_passes_every_option_on(
     assert lines[0] == f"dataset: {tmp_path / 'out'} (2 train, 1 val; 9 labelled instances)"
     assert lines[1] == "not labelled: 2 small; marked: 1 occluded"
     assert lines[-1] == f"contact sheet: {tmp_path / 'out/contact_sheet.jpg'}"
+
+
+@pytest.mark.parametrize(
+    ("made", "status", "told"),
+    [
+        ({"compared": 2}, 0, "the same bytes as in"),
+        ({}, 0, "has no frame 3"),
+        ({"compared": 2, "differing": ("a.png",), "cause": "seed was 0 and is 1"}, 1, "a.png (seed was 0 and is 1)"),
+    ],
+)
+def test_render_makes_one_frame_again(
+    scene_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    made: dict[str, Any],
+    status: int,
+    told: str,
+) -> None:
+    calls = Calls(remake.RemadeFrame(tmp_path, {"files": {}}, **made))
+    monkeypatch.setattr(remake, "remake_frame", calls)
+    assert run("render", scene_path, "-o", tmp_path / "out", "--only", 3, "--size", "32x24") == status
+    scene, index, out = calls.args
+    assert (scene.spec.output.width, index, out) == (32, 3, tmp_path / "out-000003")
+    assert calls.kwargs["dataset"] == tmp_path / "out"
+    assert told in capsys.readouterr().out
+    assert run("render", scene_path, "--only", 3, "-n", 2) == 2
 
 
 def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_dataset: Calls) -> None:

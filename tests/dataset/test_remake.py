@@ -1,0 +1,84 @@
+"""One frame made again: the bytes of its dataset, whatever was made before it, and what is told where they differ."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.write import write_dataset
+from mitsplat.errors import InputError
+from mitsplat.scene.scene import Scene, load_scene
+from tests.conftest import BOTH, WriteScene, small_scene
+from tests.drawn import large_boxes, render_boxes, scatter_boxes
+
+DRAWN: dict[str, Any] = {"render": render_boxes, "settle": scatter_boxes}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path, large_boxes(), BOTH, layouts=2, views=2, formats=["yolo", "coco", "bop"])
+
+
+@pytest.fixture
+def made(scene: Scene, tmp_path: Path) -> Path:
+    return write_dataset(scene, tmp_path / "out", frames=3, **DRAWN).path
+
+
+def test_rendered_frames_are_made_again_byte_for_byte(
+    scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
+) -> None:
+    """From the scene alone: nothing but the comparison looks at the dataset."""
+    path = write_scene(
+        scene_data
+        | {
+            "randomise": {"exposure": [-1, 1], "iso": [400, 800]},
+            "output": scene_data["output"] | {"layouts": 2, "views": 2, "formats": ["yolo", "depth"]},
+        }
+    )
+    out = write_dataset(load_scene(path), tmp_path / "out", settle=scatter_boxes).path
+    made = remake_frame(load_scene(path), 2, tmp_path / "again", dataset=out, settle=scatter_boxes)
+    assert (made.compared, made.differing, made.cause) == (3, (), "")
+    for file in [*made.record["files"], "layouts/0001.json"]:
+        assert (made.path / file).read_bytes() == (out / file).read_bytes()
+    assert json.loads((made.path / "frame.json").read_text()) == made.record
+
+
+def test_what_differs_is_named_with_its_cause(scene: Scene, made: Path, tmp_path: Path) -> None:
+    line = (made / "manifest.jsonl").read_bytes().splitlines(keepends=True)[1]
+    (made / "layouts/0000.json").write_text("{}")
+    again = remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
+    assert again.differing == ("layouts/0000.json",)
+    other = replace(scene, spec=scene.spec.model_copy(update={"seed": 1}))
+    again = remake_frame(other, 1, tmp_path / "again", dataset=made, **DRAWN)
+    assert set(again.differing) >= {"images/train/000001.png", "manifest.jsonl"}
+    assert again.cause == "scene.seed was 0 and is 1"
+    (made / "manifest.jsonl").write_bytes(line.replace(b'"view":1', b'"view":2'))
+    with pytest.raises(InputError, match=r"manifest\.jsonl: must hold the record of frame 1 \(its checksum"):
+        remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
+
+
+def test_a_frame_that_the_dataset_has_not(scene: Scene, made: Path, tmp_path: Path) -> None:
+    for index, dataset in ((3, made), (1, tmp_path / "none"), (1, None)):
+        again = remake_frame(scene, index, tmp_path / f"again{index}", dataset=dataset, **DRAWN)
+        assert again.compared == 0 and again.record["index"] == index
+
+
+def test_a_folder_of_something_else_is_left_alone(scene: Scene, made: Path) -> None:
+    with pytest.raises(InputError, match="must be absent, empty, or hold a frame that was made again"):
+        remake_frame(scene, 1, made, **DRAWN)
+    with pytest.raises(InputError, match="frame must be in 0 to 3"):
+        remake_frame(scene, 4, made, **DRAWN)
+
+
+def test_the_dataset_is_only_read(scene: Scene, made: Path, tmp_path: Path) -> None:
+    """Another process may be writing it: its last line may be torn."""
+    with (made / "manifest.jsonl").open("ab") as file:
+        file.write(b'{"index":1,"layout"')
+    before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}
+    assert remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN).differing == ()
+    assert before == {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}

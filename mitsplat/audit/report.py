@@ -16,6 +16,7 @@ import numpy as np
 
 from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
 from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.audit.variety import Variety
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import Record, write_text
 from mitsplat.formats.coco import image_file
@@ -59,11 +60,11 @@ class _Statistics:
             counted.add([label[key] for label in labels["instances"]])
 
 
-def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit]:
+def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit, list[str]]:
     """Write the page of a dataset, ``report.html`` in it by default.
 
     Returns:
-        Its path, and the audit that it shows.
+        Its path, the audit that it shows, and its warnings of what a detector cannot learn from the images.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
@@ -75,18 +76,25 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
     records = Records(root, content)
     output = content["scene"]["output"]
     counted = _Statistics((output["width"], output["height"]))
-    audit = audit_dataset(root, counted.add)
+    variety = Variety(content)
+
+    def hear(record: Record) -> None:
+        counted.add(record)
+        variety.add(record)
+
+    audit = audit_dataset(root, hear)
     name = str(content["scene"]["name"])
     parts = [
         f"<h1>{html.escape(name)}</h1>",
         _summary(content, counted, audit, root),
         _audit(audit),
         _samples(root, records.some(SAMPLES)),
+        variety.sections(),
         _charts(counted, _brightness(root, records.some(BRIGHTNESS_IMAGES)), _seconds(root)),
         _details(content),
     ]
     write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
-    return out, audit
+    return out, audit, variety.warnings()
 
 
 def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: Path) -> str:

@@ -65,6 +65,40 @@ def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names
     return _columns(caption, np.asarray(counts), names, ends, axis)
 
 
+def discs(caption: str, counts: Mapping[str, npt.NDArray[np.integer]]) -> str:
+    """Hemispheres seen from above, their cells (rings from the top, sectors from +x to +y) darker the more they count.
+
+    Rings are as wide as makes equal areas of a sphere equal on the disc (Lambert's azimuthal projection).
+    """
+    if not counts:
+        return _figure(caption, "<p>nothing</p>", [])
+    across, side = 4, _WIDTH / 4
+    marks, numbers = [], []
+    for number, (name, cells) in enumerate(counts.items()):
+        cx, cy, radius = (number % across + 0.5) * side, (number // across) * (side + 16) + side / 2, side / 2 - 6
+        edges = radius * np.sqrt(np.arange(len(cells) + 1) / len(cells))
+        marks.append(f'<circle class="frame" cx="{cx:.1f}" cy="{cy:.1f}" r="{radius:.1f}"/>')
+        marks.append(
+            f'<text x="{cx:.1f}" y="{cy + side / 2 + 6:.1f}" text-anchor="middle">{html.escape(_short(name))}</text>'
+        )
+        numbers.append((name, f"{np.count_nonzero(cells)} of {cells.size} directions, {int(cells.sum())} views"))
+        for ring, sector in zip(*np.nonzero(cells), strict=True):
+            angles = 2 * np.pi * np.array([sector, sector + 1]) / cells.shape[1]
+            corners = [
+                (cx + r * np.cos(a), cy - r * np.sin(a))
+                for r, a in zip(edges[[ring, ring, ring + 1, ring + 1]], angles[[0, 1, 1, 0]], strict=True)
+            ]
+            (ax, ay), (bx, by), (dx, dy), (ex, ey) = corners
+            path = (
+                f"M{ax:.1f} {ay:.1f}A{edges[ring]:.1f} {edges[ring]:.1f} 0 0 0 {bx:.1f} {by:.1f}L{dx:.1f} {dy:.1f}"
+                f"A{edges[ring + 1]:.1f} {edges[ring + 1]:.1f} 0 0 1 {ex:.1f} {ey:.1f}Z"
+            )
+            share = np.sqrt(cells[ring, sector] / cells.max())
+            marks.append(f'<path class="bar" d="{path}" fill-opacity="{0.12 + 0.88 * share:.2f}"/>')
+    rows = -(-len(counts) // across)
+    return _figure(caption, _svg(caption, rows * (side + 16) + 4, marks), numbers)
+
+
 class HeatMap:
     """Counts of points (x, y) in a grid over (0, 0) to ``size``, y downwards."""
 

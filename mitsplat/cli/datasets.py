@@ -295,11 +295,14 @@ def report(
 ) -> None:
     """Write a page to look at DATASET by.
 
-    It is one HTML file that needs no network: samples with their labels, statistics, audit, origin.
+    It is one HTML file that needs no network: samples with their labels, statistics, draws, audit, origin. What a
+    detector cannot learn from the images is printed, too.
     """
     from mitsplat.audit.report import write_report
 
-    page, found = write_report(dataset, out)
+    page, found, warnings = write_report(dataset, out)
+    for warning in warnings:
+        typer.echo(f"look  {warning}")
     typer.echo(f"report: {page} ({len(found.violations)} violations)")
 
 

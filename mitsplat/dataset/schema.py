@@ -116,12 +116,20 @@ class _Drawn(_Stored):
     label: bool
 
 
+class _Light(_Stored):
+    position: Point | None = None
+    size: tuple[float, float] | None = None
+    intensity: float | None = None
+    radiance: float | None = None
+
+
 class _Record(_Stored):
     index: Count
     layout: Count
     view: Count
     split: Literal["train", "val"]
     files: dict[str, str]
+    lights: list[_Light] = []
     camera: _Camera
     labels: _Labels
     environment: _Environment | None = None

@@ -47,7 +47,7 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def page(clean: Path, tmp_path: Path) -> Page:
-    path, _ = write_report(clean, tmp_path / "report.html")
+    path, _, _ = write_report(clean, tmp_path / "report.html")
     return Page(path.read_text())
 
 
@@ -93,7 +93,7 @@ def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium on this machine")
-    path, _ = write_report(clean, tmp_path / "report.html")
+    path, _, _ = write_report(clean, tmp_path / "report.html")
     press = (
         "<script>for (const key of ['mask', 'box']) document.querySelector(`[data-overlay=${key}]`).click();"
         "document.body.dataset.shown = [...document.querySelectorAll('.picture .box')]"
@@ -124,7 +124,7 @@ def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:
     (dataset / "images/train/000000.png").unlink()
     with (dataset / "manifest.jsonl").open("a") as file:
         file.write("{\n")
-    page, audit = write_report(dataset)
+    page, audit, _ = write_report(dataset)
     assert len(audit.violations) >= 2
     text = page.read_text()
     assert "Frame 0: its image cannot be read" in text and "line 7 is not the record" in text

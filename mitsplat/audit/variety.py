@@ -1,0 +1,249 @@
+"""What was drawn for a dataset, how its objects were seen, and what a detector cannot learn from it."""
+
+from __future__ import annotations
+
+import html
+import math
+from array import array
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from pycocotools import mask as coco_mask
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.audit.svg_charts import Histogram, bars, discs
+from mitsplat.files import Record
+
+OCCLUDED = 0.05
+"""Share of an instance's pixels in the image that are hidden if it is occluded."""
+FEW, FEW_VIEWS = 20, 100
+"""Images or instances of which nothing is concluded, and instances of an object whose viewpoints are not judged."""
+UNEVEN = 3.0
+"""Factor between the instances of two classes that is warned of."""
+LEAST_OCCLUDED, LEAST_SEEN, ONE_SIDED = 0.1, 0.8, 0.95
+"""Shares of occluded instances, of directions that an object is seen from, and of images lit from one side."""
+RINGS, SECTORS = 3, 8
+"""Cells of a hemisphere: rings of equal height, hence of equal area (Archimedes), cut into sectors; 30 degrees wide."""
+
+_NO_DRAWS = frozenset(
+    {"index", "layout", "view", "split", "seed", "files", "camera", "labels", "environment", "rest", "depth_scale"}
+)
+"""Keys of a frame's record that state no draw, or that are looked at in another way."""
+_NO_VALUES = frozenset({"id", "entry", "asset"})
+_MOST_NUMBERS, _MOST_TEXTS, _MOST_PAIRS = 1 << 16, 1000, 20
+
+
+class Variety:
+    """What is counted while the manifest is read once.
+
+    Args:
+        content: What ``dataset.json`` says.
+    """
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self._classes: list[str] = content["classes"]
+        self._assets: list[str] = content["assets"]
+        self._numbers, self._texts = dict[str, _Sample](), dict[str, Counter[str]]()
+        self._images, self._truncated = Counter[str](), 0
+        self._instances, self._of_split = Counter[str](), Counter[tuple[str, str]]()
+        self._occluded, self._pairs = Counter[str](), Counter[str]()
+        self._seen: dict[str, Int64Array] = {}
+        self._sides, self._lit = Counter[str](), Histogram((-180, 180), bins=24)
+
+    def add(self, record: Record) -> None:
+        """Count a frame."""
+        drawn = {key: value for key, value in record.items() if key not in _NO_DRAWS}
+        for name, value in (*_values(drawn, ""), *_camera_values(record)):
+            if isinstance(value, str):
+                texts = self._texts.setdefault(name, Counter())
+                texts[value if value in texts or len(texts) < _MOST_TEXTS else "others"] += 1
+            elif math.isfinite(value):
+                self._numbers.setdefault(name, _Sample()).add(value)
+        labels = record["labels"]["instances"]
+        self._images[record["split"]] += 1
+        self._instances.update(label["class"] for label in labels)
+        self._of_split.update((label["class"], record["split"]) for label in labels)
+        self._truncated += sum(label["truncation"] > 0 for label in labels)
+        self._add_occlusion(labels, record["labels"]["size"])
+        self._add_directions(record)
+
+    def _add_occlusion(self, labels: list[dict[str, Any]], size: list[int]) -> None:
+        """Count which classes hide which: what is seen of one within the whole outline of the other."""
+        hidden = [label for label in labels if label["visible_fraction"] < 1 - OCCLUDED]
+        self._occluded.update(label["class"] for label in hidden)
+        if not hidden:
+            return
+        whole = [{"size": size[::-1], "counts": label["amodal_rle"]} for label in hidden]
+        seen = [{"size": size[::-1], "counts": label["rle"]} for label in labels]
+        # Where the second is a crowd, their intersection is divided by the area of the first alone.
+        shares = np.asarray(coco_mask.iou(whole, seen, [1] * len(seen))).reshape(len(hidden), len(labels))
+        for label, row in zip(hidden, shares, strict=True):
+            near = {
+                other["class"]
+                for other, share in zip(labels, row, strict=True)
+                if share > OCCLUDED and other is not label
+            }
+            self._pairs.update(f"{other} hides {label['class']}" for other in near)
+
+    def _add_directions(self, record: Record) -> None:
+        """Count where each object is seen from, in its own coordinates, and the image's side that light comes from."""
+        labels, camera = record["labels"]["instances"], np.array(record["camera"]["world_from_camera"])
+        places = []
+        for label in labels:
+            own = np.array(label["world_from_object"])
+            places.append(own[:3, 3])
+            counts = self._seen.setdefault(self._assets[label["asset"]], np.zeros((2 * RINGS, SECTORS), dtype=np.int64))
+            counts[cell_of(own[:3, :3].T @ (camera[:3, 3] - own[:3, 3]))] += 1
+        if places and (light := _key_light(record.get("lights", []), np.mean(places, axis=0))) is not None:
+            x, y, _ = camera[:3, :3].T @ light
+            self._lit.add(math.degrees(math.atan2(-y, x)))
+            self._sides["right" if x > 0 else "left"] += 1
+
+    def warnings(self) -> list[str]:
+        """What a detector cannot learn from these images, a sentence each."""
+        found = [*self._class_warnings(), *self._instance_warnings()]
+        for name, counts in sorted(self._seen.items()):
+            cells = np.count_nonzero(counts[:RINGS])
+            if counts.sum() >= FEW_VIEWS and cells < LEAST_SEEN * RINGS * SECTORS:
+                found.append(f"{name} is seen from {cells} of the {RINGS * SECTORS} directions above it")
+        side, images = max(self._sides.items(), key=lambda item: item[1], default=("", 0))
+        if self._sides.total() >= FEW and images > ONE_SIDED * self._sides.total():
+            found.append(f"light comes from the {side} in {images} of {self._sides.total()} images")
+        return found
+
+    def _class_warnings(self) -> Iterator[str]:
+        most, most_of = max(((self._instances[name], name) for name in self._classes), default=(0, ""))
+        for name in self._classes if most else ():
+            count = self._instances[name]
+            if count == 0:
+                yield f"class {name} has no instance"
+                continue
+            if most >= FEW and most > UNEVEN * count:
+                yield f"class {name} has {most / count:.1f} times fewer instances than {most_of}"
+            if missing := [split for split in sorted(self._images) if not self._of_split[name, split]]:
+                yield f"class {name} has no instance in {' and '.join(missing)}"
+            if count >= FEW and not self._occluded[name]:
+                yield f"class {name} is never occluded"
+
+    def _instance_warnings(self) -> Iterator[str]:
+        total = self._instances.total()
+        if total < FEW:
+            yield f"there are {total} instances, too few to learn from"
+            return
+        if self._occluded.total() < LEAST_OCCLUDED * total:
+            yield f"only {self._occluded.total()} of {total} instances are hidden by more than {OCCLUDED:.0%}"
+        if not self._truncated:
+            yield "no instance is cut off by the image's border"
+
+    def sections(self) -> str:
+        """Parts of the page: warnings and directions, and the histogram of every draw."""
+        warned = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings())
+        warned = f"<ul>{warned}</ul>" if warned else '<p class="good">Nothing to warn of</p>'
+        seen = dict(sorted(self._seen.items()))
+        upper = {name: 100 * np.count_nonzero(counts[:RINGS]) / counts[:RINGS].size for name, counts in seen.items()}
+        lower = {name: 100 * np.count_nonzero(counts[RINGS:]) / counts[RINGS:].size for name, counts in seen.items()}
+        occluded = {name: 100 * self._occluded[name] / count for name, count in sorted(self._instances.items())}
+        charts = [
+            discs(
+                "Directions from above that objects are seen from",
+                {name: cells[:RINGS] for name, cells in seen.items()},
+            ),
+            bars("Upper directions that are covered", upper, unit=" %"),
+            bars("Lower directions that are covered", lower, unit=" %"),
+            bars("Occluded instances of each class", occluded, unit=" %"),
+            bars("Classes that hide each other, most frequent pairs", dict(self._pairs.most_common(_MOST_PAIRS))),
+            self._lit.draw("Where light comes from in the image", "from the right 0, from above 90 [degrees]"),
+        ]
+        drawn, fixed = [], []
+        for name, sample in sorted(self._numbers.items()):
+            low, high = min(sample.values), max(sample.values)
+            if low == high:
+                fixed.append((name, f"{low:.6g}"))
+                continue
+            counted = Histogram((low, high))
+            counted.add(sample.values)
+            drawn.append(counted.draw(name))
+        for name, texts in sorted(self._texts.items()):
+            if len(texts) == 1:
+                fixed.append((name, next(iter(texts))))
+            else:
+                drawn.append(bars(name, dict(texts.most_common(_MOST_PAIRS))))
+        rows = "".join(f'<tr><th scope="row">{html.escape(a)}</th><td>{html.escape(b)}</td></tr>' for a, b in fixed)
+        return (
+            '<section aria-labelledby="variety"><h2 id="variety">Variety</h2>'
+            f'{warned}<div class="charts">{"".join(charts)}</div></section>'
+            '<section aria-labelledby="draws"><h2 id="draws">Draws</h2>'
+            f'<div class="charts">{"".join(drawn)}</div>'
+            f"<details><summary>The same in all images</summary><table>{rows}</table></details></section>"
+        )
+
+
+class _Sample:
+    """Numbers, evenly thinned out where they are too many to keep."""
+
+    def __init__(self) -> None:
+        self.values = array("d")
+        self._step, self._count = 1, 0
+
+    def add(self, value: float) -> None:
+        if self._count % self._step == 0:
+            self.values.append(value)
+            if len(self.values) > _MOST_NUMBERS:
+                del self.values[1::2]
+                self._step *= 2
+        self._count += 1
+
+
+def cell_of(direction: Float64Array) -> tuple[int, int]:
+    """Ring, from the top down, and sector of a direction of any length; both hemispheres have :data:`RINGS` rings."""
+    x, y, z = direction / max(float(np.linalg.norm(direction)), 1e-12)
+    ring = int((1 - z) / 2 * 2 * RINGS)
+    sector = int((math.atan2(y, x) / math.tau % 1) * SECTORS)
+    return min(ring, 2 * RINGS - 1), min(sector, SECTORS - 1)
+
+
+def _values(value: Any, name: str) -> Iterator[tuple[str, float | str]]:
+    """Numbers and texts in a part of a record, by their place in it; what is of an entry counts with that entry."""
+    if isinstance(value, bool | str):
+        yield name, str(value)
+    elif isinstance(value, int | float):
+        yield name, float(value)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            if key not in _NO_VALUES:
+                yield from _values(inner, key if name in ("", "draws") else f"{name}.{key}")
+    elif isinstance(value, list):
+        for position, inner in enumerate(value):
+            number = inner.get("entry", position) if isinstance(inner, dict) else position
+            yield from _values(inner, f"{name}[{number}]")
+
+
+def _camera_values(record: Record) -> Iterator[tuple[str, float]]:
+    """What a camera's pose comes to; azimuth and elevation are where it is, seen from what it looks at."""
+    camera = record["camera"]
+    pose = np.array(camera["world_from_camera"])
+    right, forward = pose[:3, 0], pose[:3, 2]
+    yield from ((f"camera position {axis} [m]", float(value)) for axis, value in zip("xyz", pose[:3, 3], strict=True))
+    yield "camera elevation [degrees]", math.degrees(math.asin(np.clip(-forward[2], -1, 1)))
+    yield "camera azimuth [degrees]", math.degrees(math.atan2(-forward[1], -forward[0])) % 360
+    level = np.cross(forward, (0, 0, 1))
+    if np.linalg.norm(level) > 1e-6:
+        sine, cosine = np.cross(level, right) @ forward, level @ right
+        yield "camera roll [degrees]", math.degrees(math.atan2(sine, cosine))
+    yield "camera focal length [px]", camera["intrinsics"][0][0]
+    yield "camera focus distance [m]", camera["focus_distance"]
+    yield "camera aperture radius [m]", camera["aperture_radius"]
+
+
+def _key_light(lights: list[dict[str, Any]], point: Float64Array) -> Float64Array | None:
+    """Directions to local lights summed, each by its irradiance at a point but for angles; None if there is none."""
+    total = np.zeros(3)
+    for light in lights:
+        if light.get("position") is not None:
+            away = np.subtract(light["position"], point)
+            width, height = light.get("size") or (1.0, 1.0)
+            strength = light.get("intensity") or width * height * (light.get("radiance") or 0.0)
+            total += strength * away / max(float(np.linalg.norm(away)), 1e-9) ** 3
+    return total if total.any() else None

@@ -13,19 +13,18 @@ _WIDTH, _HEIGHT = 420, 190
 _LEFT, _BOTTOM, _TOP = 46, 34, 10
 
 
-def bars(caption: str, values: Mapping[str, float], *, unit: str = "") -> str:
-    """Horizontal bars with a name and a value each."""
+def bars(caption: str, values: Mapping[str, float], *, unit: str = "", name_width: int = 150) -> str:
+    """Horizontal bars with a name, on ``name_width`` of the chart's 420 units, and a value each."""
     if not values:
         return _figure(caption, "<p>nothing</p>", [])
     most = max(values.values()) or 1.0
     row = 22
-    name_width = 150
     marks = []
     for i, (name, value) in enumerate(values.items()):
         length = (_WIDTH - name_width - 70) * value / most
-        y = i * row
+        y, shown = i * row, _short(name, name_width // 7 + 1)
         marks.append(
-            f'<text x="{name_width - 6}" y="{y + 15}" text-anchor="end">{html.escape(_short(name))}</text>'
+            f'<text x="{name_width - 6}" y="{y + 15}" text-anchor="end">{html.escape(shown)}</text>'
             f'<rect class="bar" x="{name_width}" y="{y + 3}" width="{length:.1f}" height="{row - 6}"/>'
             f'<text x="{name_width + length + 5:.1f}" y="{y + 15}">{_number(value)}</text>'
         )
@@ -189,8 +188,8 @@ def _figure(caption: str, drawing: str, numbers: Sequence[tuple[str, str]]) -> s
 def _number(value: float) -> str:
     if abs(value) >= 1e5:
         return f"{value / 1e6:.3g} M"
-    return f"{value:.0f}" if float(value).is_integer() else f"{value:.3g}"
+    return f"{value:.0f}" if float(value).is_integer() or abs(value) >= 1e3 else f"{value:.3g}"
 
 
-def _short(name: str) -> str:
-    return name if len(name) <= 22 else name[:21] + "…"
+def _short(name: str, most: int = 22) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"

@@ -153,7 +153,11 @@ class Variety:
             bars("Upper directions that are covered", upper, unit=" %"),
             bars("Lower directions that are covered", lower, unit=" %"),
             bars("Occluded instances of each class", occluded, unit=" %"),
-            bars("Classes that hide each other, most frequent pairs", dict(self._pairs.most_common(_MOST_PAIRS))),
+            bars(
+                "Classes that hide each other, most frequent pairs",
+                dict(self._pairs.most_common(_MOST_PAIRS)),
+                name_width=240,
+            ),
             self._lit.draw("Where light comes from in the image", "from the right 0, from above 90 [degrees]"),
         ]
         drawn, fixed = [], []

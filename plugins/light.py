@@ -169,7 +169,7 @@ def light_factor(
             places, extra = (dr.gather(mi.UInt32, values, order) for values in (places, extra))
             estimate = tracer.trace(places, estimate, extra, accuracy.most - rays, first=rays)
     lit, base, shine = light_filter.smooth(estimate)
-    share = dr.select(base > 0, lit / base, 1)
+    share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
     shine *= dr.pi / reference
     anew = dr.compress(here.relit)
     if dr.width(anew):

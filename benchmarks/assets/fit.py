@@ -45,13 +45,13 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--edge", type=int, default=800)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--replay", choices=("on", "off"), help="recordings of kernels, which must change nothing")
+    parser.add_argument("--replay", choices=("on", "off"), default="on", help="recordings of kernels")
     parser.add_argument("--gsplat", action="store_true")
     args = parser.parse_args()
     if (args.capture is None) == (args.synthetic is None):
         parser.error("give a capture, or --synthetic")
     device = use_device(args.device)
-    recorded.REPLAY = None if args.replay is None else args.replay == "on"
+    recorded.REPLAY = args.replay == "on"
     with recording("assets.fit", parser, args, gpu=device.kind == "cuda"), tempfile.TemporaryDirectory() as folder:
         settings = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge)
         if args.synthetic:

@@ -17,6 +17,7 @@ from mitsplat.bake.parts import Part, read_parts
 from mitsplat.bake.report import write_bake_report
 from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
+from mitsplat.fit.image_metrics import psnr_of
 
 COLOUR = (200, 120, 40)
 QUICK = BakeSettings(gaussians=300, sh_degree=0, directions=8, samples=4, fit_steps=0, fit_views=1, verify_views=1)
@@ -79,8 +80,8 @@ def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
 def test_one_object_in_any_format_bakes_alike(bakes: dict[str, BakeResult], kind: str) -> None:
     """Of a face that sees nothing but light of radiance 1, the radiance is the albedo: the mean over it agrees."""
     found, wanted = (bakes[name].views[0] for name in (kind, "glb"))
-    assert -10 * np.log10(((found.splats - wanted.splats) ** 2).mean()) > 40
-    assert -10 * np.log10(((found.mesh - wanted.mesh) ** 2).mean()) > 40
+    assert psnr_of(((found.splats - wanted.splats) ** 2).mean()) > 40
+    assert psnr_of(((found.mesh - wanted.mesh) ** 2).mean()) > 40
 
 
 def test_splats_are_as_bright_as_the_texture_of_the_file(bakes: dict[str, BakeResult], tmp_path: Path) -> None:

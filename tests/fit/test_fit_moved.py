@@ -67,11 +67,16 @@ def test_moved_and_larger_is_the_same_within_a_step_of_the_optimiser(capture: Ca
     assert len(splats) == len(expected) > 600 and moved.psnr == pytest.approx(still.psnr, abs=0.01)
     centres = np.array([photo.camera.centre for photo in capture.training])
     extent = 1.7 * 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
-    np.testing.assert_allclose(splats.means, expected.means, atol=SMALL.rate_means * extent)
-    np.testing.assert_allclose(np.log(splats.scales), np.log(expected.scales), atol=SMALL.rate_scales)
     logits = [np.log(s.opacities / (1 - s.opacities)) for s in (splats, expected)]
-    np.testing.assert_allclose(*logits, atol=SMALL.rate_opacities)
-    np.testing.assert_allclose(splats.sh, expected.sh, atol=SMALL.rate_sh)
+    for rate, one, other in (
+        (SMALL.rate_means * extent, splats.means, expected.means),
+        (SMALL.rate_scales, np.log(splats.scales), np.log(expected.scales)),
+        (SMALL.rate_opacities, *logits),
+        (SMALL.rate_sh, splats.sh, expected.sh),
+    ):
+        # Where rounding decides the sign of a gradient, a first step goes one way here and the other way there.
+        steps = np.abs(one - other) / rate
+        assert steps.max() < 2 and (steps > 1 + 1e-6).mean() < 0.002
 
 
 @BOTH

@@ -137,6 +137,7 @@ def test_hundred_instances_on_one_ray() -> None:
     assert wrong == 0 and ties < 8
 
 
+@pytest.mark.cpu(reason="there is nothing else to compare with on a GPU, which is never waited for")
 def test_ids_on_a_device_that_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the look whether any ray is unsure, as on a GPU, nothing changes."""
     from mitsplat.plugins import march

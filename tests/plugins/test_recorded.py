@@ -71,21 +71,29 @@ def test_gradients_of_many_views_are_those_of_traced_ones(
         return [np.array(dr.grad(value)) for value in model.values.values()] + [np.array(seen.moment)]
 
     shifts = [0.0, 0.3, 100.0, 0.7, 1.5, 0.1]
+    monkeypatch.setattr(recorded, "REPLAY", True)
     replayed = [gradients(shift) for shift in (*shifts, *shifts)]
     monkeypatch.setattr(recorded, "REPLAY", False)
     traced = [gradients(shift) for shift in shifts]
     assert 0 in pairs and len(set(pairs)) > 4 and np.abs(traced[0][0]).max() > 0
     for turn, found in enumerate(replayed):
         for one, other in zip(found, traced[turn % len(shifts)], strict=True):
+            # GPUs divide by a number that is known when a kernel is compiled otherwise than by one that is not.
+            rounding = 0.0 if mi.variant().startswith("llvm") else 1e-5 * np.abs(other).max(initial=0.0)
+            np.testing.assert_allclose(one, other, rtol=0, atol=rounding)
+    for first, second in zip(replayed[: len(shifts)], replayed[len(shifts) :], strict=True):
+        for one, other in zip(first, second, strict=True):
             np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.cpu(reason="what GPUs round otherwise grows over the steps of a fit")
 def test_a_fit_has_the_bytes_of_a_traced_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With all that changes its kernels: sizes, degrees, depths, numbers of Gaussians and colour corrections."""
     ensure_variant()
     (tmp_path / "photos").mkdir()
     capture = seeing(photograph(tmp_path / "photos"))
     settings = replace(SMALL, sh_degree=2, coarse=0.3, exposure=True, iterations=50)
+    monkeypatch.setattr(recorded, "REPLAY", True)
     replayed = fit_capture(capture, tmp_path / "replayed", settings)
     monkeypatch.setattr(recorded, "REPLAY", False)
     fit_capture(capture, tmp_path / "traced", settings)

@@ -42,7 +42,7 @@ def scatter_boxes(scene: Any, index: int, *, progress: Any) -> Layout:
 
 def render_boxes(scene: Any, index: int, *, layout: Layout) -> Any:
     """Every box is the hull of its corners' pixels, at the depth of its middle; nearer ones hide others."""
-    plan = plan_frame(scene, index)
+    plan = plan_frame(scene, index, layout)
     camera = plan.camera
     shape = camera.height, camera.width
     ids, depth = np.zeros(shape, dtype=np.uint16), np.full(shape, 1.5)

@@ -77,13 +77,15 @@ class SceneReader:
             if axis @ wanted < (1 - _NEAR) * np.linalg.norm(wanted):
                 yield "its camera does not look where the scene's path says"
             return
-        offset = eye - camera["target"]
+        target, room = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _NEAR
+        if frame.record.get("viewpoint") is not None:  # it looks at what lies there, and says what that is
+            target, room = frame.record["viewpoint"]["target"], _NEAR
+        offset = eye - target
         if camera["kind"] == "orbit":
             room = _SIGMAS * camera["jitter"] + _NEAR
             off = float(np.hypot(np.hypot(*offset[:2]) - camera["radius"], offset[2] - camera["height"]))
             low = high = float(np.hypot(camera["radius"], camera["height"]))
         else:
-            room = _SIGMAS * camera["target_jitter"] + _NEAR
             low, high = camera["radius"]
             off = max(low - np.linalg.norm(offset), np.linalg.norm(offset) - high, 0.0)
         if off > room:

@@ -7,7 +7,6 @@ for a scene that is refused wrongly cannot be rendered at all.
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -16,12 +15,14 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
+from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import Scene, plan_frame
+from mitsplat.scene.sight import solid_around
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds
 
 MOST_OBJECTS = 65535
@@ -39,7 +40,6 @@ PIXEL_BYTES, PROCESS_GIB = 400, 0.5
 FRAME_BYTES = 8192
 """Least room on the disk of a frame: an image and a label, a block each."""
 _CELLS = 24  # of a region along each axis, in which is looked for room
-_PAIRS = 1_000_000  # of a point and a triangle that are looked at together
 
 
 def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
@@ -188,7 +188,7 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
         yield Finding("labels", False, text, "make output.width and height larger")
         return
     cameras = _cameras(scene, frames)
-    hidden = [name for camera in cameras if (name := _solid_around(scene, camera.centre))]
+    hidden = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
     if len(hidden) == len(cameras):
         text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
         yield Finding("sight", False, text, "move camera out of it")
@@ -216,7 +216,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
     """What a run survives but was hardly meant: some views from inside of solids, lights inside of them, small bins."""
     spec = scene.spec
     cameras = _cameras(scene, range(min(scene.num_frames, MOST_FRAMES)))
-    inside = [name for camera in cameras if (name := _solid_around(scene, camera.centre))]
+    inside = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
     low, high = _reach(scene)
     blind = sum(not sees(camera, low, high) for camera in cameras)
     yield Finding(
@@ -227,7 +227,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
     )
     for number, light in enumerate(spec.lights):
         position = getattr(light, "position", None)
-        if position is not None and (name := _solid_around(scene, np.array(position))):
+        if position is not None and (name := solid_around(scene, np.array(position))):
             text = f"lights[{number}] is inside of shape {name!r}"
             yield Finding("lights", False, text, "move it out: it lights nothing")
     for shape in spec.shapes:
@@ -238,28 +238,6 @@ def doubts(scene: Scene) -> Iterator[Finding]:
             if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
                 text = f"{asset.name!r} does not fit into {shape.name!r}"
                 yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
-
-
-def points_inside(mesh: trimesh.Trimesh, points: Float64Array) -> BoolArray:
-    """Which of some points (N, 3) are inside a mesh: around which it winds, as often as not (Jacobson et al. 2013).
-
-    The solid angles of its triangles are those of Van Oosterom and Strackee (1983).
-    :class:`mitsplat.mesh_distance.Surface` finds the same faster, once physics has been started, for which no check
-    should wait.
-    """
-    low, high = mesh.bounds
-    inside = ((points > low) & (points < high)).all(axis=1)
-    triangles = np.asarray(mesh.triangles, dtype=np.float64)
-    nearby = np.flatnonzero(inside)
-    for chunk in np.array_split(nearby, math.ceil(len(nearby) * len(triangles) / _PAIRS) or 1):
-        corners = triangles[None] - points[chunk][:, None, None]
-        a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]
-        la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
-        volume = np.einsum("pti,pti->pt", a, np.cross(b, c))
-        ab, bc, ca = (np.einsum("pti,pti->pt", *sides) for sides in ((a, b), (b, c), (c, a)))
-        angles = 2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
-        inside[chunk] = np.abs(angles.sum(axis=1)) > 2 * np.pi
-    return np.asarray(inside)
 
 
 def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
@@ -348,12 +326,3 @@ def _most_pixels(camera: Camera, size: float, depth: float) -> float:
     steepest = float(np.linalg.norm(camera.ray_slopes(corners), axis=1).max())
     stretch = (1 + steepest**2) ** 1.5 * (4.0 if camera.distortion else 1.0)
     return float(stretch * np.pi / 4 * camera.fx * camera.fy * (size / depth) ** 2)
-
-
-def _solid_around(scene: Scene, point: Float64Array) -> str:
-    """Name of a visible shape that a point is in and the region is not, or empty."""
-    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
-    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
-        if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
-            return shape.name
-    return ""

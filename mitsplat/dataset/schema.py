@@ -123,6 +123,23 @@ class _Light(_Stored):
     radiance: float | None = None
 
 
+class _Predicted(_Stored):
+    """What a view was chosen by: labelled objects in view, partly hidden and cut by the border, as was predicted."""
+
+    in_view: Count
+    hidden: Count
+    cut: Count
+
+
+class _Viewpoint(_Stored):
+    """What a camera looks at [m], the object that it is the middle of, and which of the frame's tries it is."""
+
+    target: Point
+    object: Annotated[int, Field(ge=1, le=65535)] | None
+    attempt: Count = 0
+    predicted: _Predicted | None = None
+
+
 class _Record(_Stored):
     index: Count
     layout: Count
@@ -135,6 +152,7 @@ class _Record(_Stored):
     environment: _Environment | None = None
     depth_scale: Annotated[float, Field(gt=0)] | None = None
     objects: list[_Drawn] | None = None
+    viewpoint: _Viewpoint | None = None
     empty: bool = False
 
 

@@ -87,6 +87,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
     }
     if catalogue.drawn:
         record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
+    if plan.viewpoint:
+        record["viewpoint"] = dict(plan.viewpoint)
     if spec.empty:
         record["empty"] = is_empty(spec, plan.layout)
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"

@@ -206,10 +206,11 @@ class Renderer:
         if mi.variant() != self._variant:
             raise InputError(f"the renderer was made in Mitsuba's variant {self._variant} (got {mi.variant()} by now)")
         seconds: dict[str, float] = {}
-        plan = plan_frame(self.scene, index)
         if layout is None:
             with _timed(seconds, "settle"):
-                layout = self._settle(plan.layout)
+                layout = self._settle(layout_of(self.scene, index))
+        with _timed(seconds, "place"):
+            plan = plan_frame(self.scene, index, layout)
         with _timed(seconds, "place"):
             # Its few parts are made sooner than threads are woken.
             mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights), parallel=False)

@@ -42,8 +42,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     ensure_variant()
     path = Path(path)
     files = path.with_name(f"{path.stem}_files")
-    plan = plan_frame(scene, index)
     layout = settle_layout(scene, layout_of(scene, index))
+    plan = plan_frame(scene, index, layout)
     files.mkdir(parents=True, exist_ok=True)
     shapes: dict[str, Any] = {}
     if scene.environment is not None:

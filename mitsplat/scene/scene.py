@@ -17,23 +17,22 @@ from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 import trimesh
-from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import Float64Array
 from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
-from mitsplat.camera import Camera, interpolate_poses, look_at_pose
+from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.contents import split_of
+from mitsplat.scene.layout import Layout
 from mitsplat.scene.primitives import make_primitives
-from mitsplat.scene.spec import SCHEMA_VERSION, Output, SceneSpec
-from mitsplat.scene.spec_camera import CameraHemisphere, CameraOrbit, Intrinsics
+from mitsplat.scene.spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec, PointLight, SpotLight
 from mitsplat.scene.spec_objects import PRIMITIVES, ObjectSpec
 from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.untrusted_images import check_image
+from mitsplat.scene.viewpoints import camera_at, view_of
 from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
@@ -99,6 +98,7 @@ class FramePlan:
         lights: Lights as they are in this frame: paths and random factors applied.
         draws: Random values by name, see :func:`mitsplat.frames.camera_response.develop`.
         seed: Seed of the pixel noise.
+        viewpoint: What the camera was drawn or chosen by, see :class:`mitsplat.scene.viewpoints.View`.
     """
 
     index: int
@@ -110,6 +110,7 @@ class FramePlan:
     lights: tuple[LightSpec, ...]
     draws: dict[str, float]
     seed: int
+    viewpoint: Mapping[str, Any] = field(default_factory=dict)
 
 
 def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
@@ -294,7 +295,7 @@ def _check_lens(spec: SceneSpec, path: Path) -> None:
     """Refuse intrinsics that no camera of the image's size can have, such as a fisheye's that sees behind itself."""
     with _blaming(path, "camera", "intrinsics"):
         try:
-            _camera_at(np.eye(4), spec.camera.intrinsics, spec.output)
+            camera_at(np.eye(4), spec.camera.intrinsics, spec.output)
         except ValueError as error:
             raise InputError(str(error)) from error
 
@@ -319,27 +320,38 @@ def layout_of(scene: Scene, index: int) -> int:
     return index // scene.spec.output.views
 
 
-def plan_frame(scene: Scene, index: int) -> FramePlan:
-    """The plan of frame ``index``, from (seed, index) alone."""
+def plan_frame(scene: Scene, index: int, layout: Layout | None = None) -> FramePlan:
+    """The plan of frame ``index``, from the seed and the index alone, which decide its layout as well.
+
+    Args:
+        scene: The scene.
+        index: Index of the frame.
+        layout: Where its objects lie. Without it, cameras that are chosen by what lies there are ones that may be.
+
+    Raises:
+        InputError: If there is no such frame, or none of its views is as the scene file says that they must be.
+    """
     index = whole(index, "frame")
-    spec, layout = scene.spec, layout_of(scene, index)
-    view = index - layout * spec.output.views
+    spec, number = scene.spec, layout_of(scene, index)
+    view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
+    here = view_of(scene, index, layout)
     return FramePlan(
         index=index,
-        layout=layout,
+        layout=number,
         view=view,
-        split=split_of(layout, spec.output.validation),
-        camera=_camera(spec, view, index),
-        next_camera=_camera(spec, view + 1, index + 1) if view + 1 < spec.output.views else None,
-        lights=tuple(_light_at(spec, position, time, layout) for position in range(len(spec.lights))),
+        split=split_of(number, spec.output.validation),
+        camera=here.camera,
+        next_camera=view_of(scene, index + 1, layout).camera if view + 1 < spec.output.views else None,
+        lights=tuple(_light_at(spec, position, time, number) for position in range(len(spec.lights))),
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))
             for name in _DRAWN
             if (bounds := (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)) is not None
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
+        viewpoint=here.drawn,
     )
 
 
@@ -411,66 +423,3 @@ def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> Light
     factors = random_stream(spec.seed, f"light intensity {position}", layout)
     state[strength] *= float(factors.uniform(*spec.randomise.light_intensity))
     return light.model_copy(update=state)
-
-
-def _camera(spec: SceneSpec, view: int, index: int) -> Camera:
-    """Camera of frame ``index``, which is ``view`` of its layout."""
-    camera, views = spec.camera, spec.output.views
-    if isinstance(camera, CameraHemisphere):
-        pose = _hemisphere_pose(camera, spec.seed, index)
-    else:
-        if isinstance(camera, CameraOrbit):
-            pose = _orbit_pose(camera, view, views)
-        else:
-            keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
-            pose = interpolate_poses(keys, view / max(1, views - 1))[0]
-        pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
-    return _camera_at(pose, camera.intrinsics, spec.output)
-
-
-def _camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Camera:
-    width, height = intrinsics.size or (output.width, output.height)
-    if intrinsics.fov_x is not None:
-        fx = 0.5 * width / float(np.tan(0.5 * np.radians(intrinsics.fov_x)))
-    else:
-        fx = float(intrinsics.fx or 0.0)
-    camera = Camera(
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fx if intrinsics.fy is None else intrinsics.fy,
-        cx=width / 2 if intrinsics.cx is None else intrinsics.cx,
-        cy=height / 2 if intrinsics.cy is None else intrinsics.cy,
-        world_from_camera=pose,
-        distortion=intrinsics.distortion,
-        near=intrinsics.near,
-        lens=intrinsics.lens,
-        aperture_radius=intrinsics.aperture,
-        focus_distance=intrinsics.focus,
-    )
-    return camera.resized(output.width, output.height)
-
-
-def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
-    """A full circle ends one step before its start; a part of one ends at its end."""
-    steps = views if abs(camera.sweep) == 360 else max(1, views - 1)
-    azimuth = np.radians(camera.start + camera.sweep * view / steps)
-    offset = (camera.radius * np.cos(azimuth), camera.radius * np.sin(azimuth), camera.height)
-    return look_at_pose(np.add(camera.target, offset), camera.target)
-
-
-def _hemisphere_pose(camera: CameraHemisphere, seed: int, index: int) -> Float64Array:
-    def draw(name: str, low: float, high: float) -> float:
-        return float(random_stream(seed, f"camera {name}", index).uniform(low, high))
-
-    radius = draw("radius", *camera.radius)
-    azimuth, roll = np.radians(draw("azimuth", *camera.azimuth)), np.radians(draw("roll", *camera.roll))
-    # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
-    sine = draw("elevation", *np.sin(np.radians(camera.elevation)))
-    cosine = np.sqrt(1.0 - sine * sine)
-    jitter = camera.target_jitter * random_stream(seed, "camera target", index).standard_normal(3)
-    target = np.add(camera.target, jitter)
-    eye = target + radius * np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
-    pose = look_at_pose(eye, target)
-    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll).as_matrix()
-    return pose

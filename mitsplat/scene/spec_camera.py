@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, NonNegativeFloat, model_validator
 
 from mitsplat.camera import Lens
-from mitsplat.scene.spec_types import Elevation, Positive, PositiveRange, Range, StrictModel, Vec3, ordered
+from mitsplat.scene.spec_types import Elevation, Positive, PositiveRange, Range, StrictModel, Unit, Vec3, ordered
 from mitsplat.yaml_input import FieldError
 
 
@@ -89,6 +89,39 @@ class CameraOrbit(Viewpoint):
     jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
 
 
+TRIES = 16
+
+UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
+
+
+class Acceptance(StrictModel):
+    """What a view must show and keep off. A camera inside of a visible shape or an object is never accepted."""
+
+    in_view: Unit = Field(
+        0.0, description="Least share of the labelled objects of which half of the surface or more is in the image."
+    )
+    extent: NonNegativeFloat = Field(
+        0.0, description="Least longer side of the box around each labelled object that is in view [px]."
+    )
+    clearance: NonNegativeFloat = Field(
+        0.0, description="Least distance of the camera from objects, visible shapes and the environment's mesh [m]."
+    )
+
+
+class Occlusion(StrictModel):
+    """How many of the labelled objects in view should be partly hidden."""
+
+    share: Unit = Field(description="Share of the objects in view that is aimed at.")
+    visible: UnitRange = Field((0.2, 0.9), description="Range of visible fractions that counts as partly hidden.")
+
+
+class Truncation(StrictModel):
+    """How many of the labelled objects in view the image's border should cut."""
+
+    share: Unit = Field(description="Share of the objects in view that is aimed at.")
+    cut: UnitRange = Field((0.05, 0.8), description="Range of shares beyond the border that counts as cut.")
+
+
 class CameraHemisphere(Viewpoint):
     """Views drawn at random, uniform by area on spheres around a target."""
 
@@ -101,6 +134,52 @@ class CameraHemisphere(Viewpoint):
     azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
     roll: Range = Field((0.0, 0.0), description="Range of rotations about the line of sight [degrees].")
     target_jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the target, 1 sigma [m].")
+    look_at: Literal["target", "objects", "clusters"] = Field(
+        "target",
+        exclude_if=lambda look_at: look_at == "target",
+        description="What is in the middle of a view: the target, or the middle of a labelled object that is drawn "
+        "anew for every view, alone or with the two nearest to it. Layouts without one are seen at the target.",
+    )
+    coverage: Literal["random", "even"] = Field(
+        "random",
+        exclude_if=lambda coverage: coverage == "random",
+        description="Whether azimuth, sine of the elevation and radius are drawn independently, or follow a sequence "
+        "of low discrepancy over the frames, which leaves smaller gaps between them.",
+    )
+    accept: Acceptance | None = Field(
+        None,
+        exclude_if=lambda accept: accept is None,
+        description="What every view must fulfil; others are drawn again.",
+    )
+    occlusion: Occlusion | None = Field(
+        None,
+        exclude_if=lambda occlusion: occlusion is None,
+        description="Share of partly hidden objects, for which one of the tries is chosen.",
+    )
+    truncation: Truncation | None = Field(
+        None,
+        exclude_if=lambda truncation: truncation is None,
+        description="Share of objects cut by the border, for which one of the tries is chosen; every other try looks "
+        "past what it would look at, so that it is near the border.",
+    )
+    tries: int = Field(
+        TRIES,
+        ge=1,
+        le=1000,
+        exclude_if=lambda tries: tries == TRIES,
+        description="How many views are drawn for a frame at most, to accept or choose from.",
+    )
+
+    @property
+    def chosen(self) -> bool:
+        """Whether a frame's view is one of several tries, which depends on what lies there."""
+        return not (self.accept is None and self.occlusion is None and self.truncation is None)
+
+    @model_validator(mode="after")
+    def _check_tries(self) -> CameraHemisphere:
+        if "tries" in self.model_fields_set and not self.chosen:
+            raise FieldError("tries", "needs accept, occlusion or truncation")
+        return self
 
 
 CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]

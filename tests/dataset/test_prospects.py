@@ -13,10 +13,11 @@ from mitsplat.camera import Camera
 from mitsplat.checks.preflight import check_scene
 from mitsplat.dataset import prospects
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.prospects import doubts, points_inside, refuse, run_faults, sees
+from mitsplat.dataset.prospects import doubts, refuse, run_faults, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.frames import speed_accuracy as chart
+from mitsplat.mesh_points import points_inside
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
 from mitsplat.scene.scene import load_scene
 from tests.bodies import pose_at

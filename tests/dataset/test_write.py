@@ -52,7 +52,7 @@ def settle(scene, index, *, progress):
 
 def render(scene, index, *, layout):
     """A disc per object on noise."""
-    plan = plan_frame(scene, index)
+    plan = plan_frame(scene, index, layout)
     camera = plan.camera
     rng = np.random.default_rng(plan.seed)
     ids = np.zeros((camera.height, camera.width), dtype=np.int32)

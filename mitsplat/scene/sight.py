@@ -1,0 +1,295 @@
+"""What a camera would see of a layout, before anything is rendered: a cheap prediction to choose views by.
+
+Surfaces are points, spread evenly over the proxy meshes. An object's visible fraction is predicted from a raster as
+coarse as the points are dense: of its cells in the image, those in which no point of another object is nearer. What
+visible shapes hide is found by rays from the points to the camera. The environment hides nothing here. All of it is
+worked out by NumPy on the CPU, so that views do not depend on the device that renders them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+from mitsplat.camera import Camera
+from mitsplat.mesh_points import points_inside
+from mitsplat.scene.spec_camera import Acceptance, Occlusion, Truncation
+
+if TYPE_CHECKING:
+    from mitsplat.scene.layout import Layout
+    from mitsplat.scene.scene import Scene
+
+_POINTS = 40_000
+"""Of all objects of a layout together, at most."""
+_FINEST = 800
+"""Of the object with the largest surface, at most."""
+_FEWEST = 100
+_CELL = 1.25
+"""Size of a raster's cells, in spacings of the points."""
+_TESTS = 2_000_000
+"""Pairs of a ray and a triangle that are looked at together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prospect:
+    """What a view is predicted to show of the labelled objects of a layout.
+
+    Attributes:
+        within: Share of the surface of each that is in front of the camera and in the image, shape (N,).
+        extents: Longer side of the box around each in the image [px], 0 for what is not in it, shape (N,).
+        visible: Visible fraction of each, 0 for what is not in the image, shape (N,).
+        beyond: Share of each beyond the image's border, shape (N,).
+        in_view: How many have enough visible pixels to be labelled.
+        hidden, cut: How many of those are partly hidden, and cut by the border, as the scene file says.
+    """
+
+    within: Float64Array
+    extents: Float64Array
+    visible: Float64Array
+    beyond: Float64Array
+    in_view: int
+    hidden: int
+    cut: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The counts, as a dataset states them."""
+        return {"in_view": self.in_view, "hidden": self.hidden, "cut": self.cut}
+
+
+class Sight:
+    """The surfaces of a layout.
+
+    Attributes:
+        ids: Instance ids, shape (N,).
+        labelled: Which of the instances are labelled, shape (N,).
+        centres: Middle of the box around each [m], shape (N, 3).
+    """
+
+    def __init__(self, scene: Scene, layout: Layout) -> None:
+        self._scene, self._layout = scene, layout
+        instances = layout.instances
+        self.ids = np.array([one.id for one in instances], dtype=np.int64)
+        self.labelled = np.array([one.class_index is not None for one in instances], dtype=bool)
+        samples = [_surface_points(scene)[one.asset] for one in instances]
+        step = 1 + sum(map(len, samples)) // _POINTS
+        samples = [points[::step] for points in samples]
+        poses = [one.world_from_object for one in instances]
+        placed = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(samples, poses, strict=True)]
+        meshes = [_mesh(scene, one.asset) for one in instances]
+        middles = [
+            mesh.bounds.mean(axis=0) @ pose[:3, :3].T + pose[:3, 3] for mesh, pose in zip(meshes, poses, strict=True)
+        ]
+        self.centres: Float64Array = np.array(middles, dtype=np.float64).reshape(-1, 3)
+        self._points: Float64Array = np.concatenate(placed) if placed else np.zeros((0, 3))
+        self._owner = np.repeat(np.arange(len(instances)), [len(points) for points in placed])
+        self._spacing = _spacing(scene) * float(np.sqrt(step))
+        shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
+        self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
+
+    @staticmethod
+    @lru_cache(maxsize=2)
+    def of(scene: Scene, layout: Layout) -> Sight:
+        """The surfaces of a layout, kept for its next frame."""
+        return Sight(scene, layout)
+
+    def prospect(
+        self, camera: Camera, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
+    ) -> Prospect:
+        """What a camera would show of the labelled objects."""
+        count = len(self.ids)
+        pixel, depth = camera.project(self._points)
+        front = depth > camera.near
+        size = np.array([camera.width, camera.height])
+        with np.errstate(invalid="ignore"):
+            inside = front & ((pixel >= 0) & (pixel < size)).all(axis=1)
+            # Distortion of what is far outside is anybody's guess, and the raster needs an end.
+            raster = front & ((pixel >= -size) & (pixel < 2 * size)).all(axis=1)
+        owner = self._owner
+        total = np.bincount(owner, minlength=count)
+        within = np.bincount(owner[inside], minlength=count) / np.maximum(total, 1)
+        if count:  # points are in the order of their owners, who all have some
+            starts = np.searchsorted(owner, np.arange(count))
+            low, high = (
+                pick.reduceat(np.where(inside[:, None], pixel, none), starts)
+                for pick, none in ((np.minimum, np.inf), (np.maximum, -np.inf))
+            )
+            extents = np.where(within > 0, (high - low).max(axis=1), 0.0)
+        else:
+            extents = np.zeros(0)
+        edge = (
+            _CELL * self._spacing * max(camera.fx, camera.fy) / max(float(np.median(depth[front])), camera.near)
+            if front.any()
+            else 1.0
+        )
+        visible, beyond, seen = self._cells(camera, pixel, depth, raster, edge)
+        lost = 1.0 - np.bincount(owner[raster], minlength=count) / np.maximum(total, 1)
+        beyond = lost + (1.0 - lost) * beyond
+        shown = self.labelled & (seen * edge**2 >= min_pixels)
+        hidden = cut = 0
+        if occlusion is not None:
+            hidden = int(np.count_nonzero(shown & _among(visible, occlusion.visible)))
+        if truncation is not None:
+            cut = int(np.count_nonzero(shown & _among(beyond, truncation.cut)))
+        ours = self.labelled
+        return Prospect(
+            within[ours], extents[ours], visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut
+        )
+
+    def _cells(
+        self, camera: Camera, pixel: Float64Array, depth: Float64Array, raster: BoolArray, edge: float
+    ) -> tuple[Float64Array, Float64Array, Int64Array]:
+        """Visible fraction and share beyond the border of each object, by cells of ``edge`` pixels; its seen cells."""
+        count = len(self.ids)
+        across = int(3 * camera.width / edge) + 2
+        cell = np.floor(pixel[raster] / edge).astype(np.int64)
+        key = (cell[:, 0] + across // 3 + 1) + across * (cell[:, 1] + int(camera.height / edge) + 2)
+        among = np.flatnonzero(raster)
+        order = np.lexsort((depth[among], key))
+        among, key, cell = among[order], key[order], cell[order]
+        first = np.ones(len(key), dtype=bool)
+        first[1:] = key[1:] != key[:-1]
+        # Of each cell, every object in it once, by its nearest point there, and the one in front of the others.
+        _, place = np.unique(key * count + self._owner[among], return_index=True)
+        nearest, owner = among[place], self._owner[among[place]]
+        centre = (cell[place] + 0.5) * edge
+        shown = ((centre >= 0) & (centre < (camera.width, camera.height))).all(axis=1)
+        seen = first[place] & shown
+        triangles = _between(self._triangles, camera.centre, self._points)
+        if len(triangles):
+            seen[seen] = ~_crossed(camera.centre, self._points[nearest[seen]], triangles)
+        seen_cells, own, everywhere = (
+            np.bincount(owner[some], minlength=count) for some in (seen, shown, np.ones(len(owner), dtype=bool))
+        )
+        beyond = np.where(everywhere > 0, 1.0 - own / np.maximum(everywhere, 1), 1.0)
+        return seen_cells / np.maximum(own, 1), beyond, seen_cells
+
+    def faults(self, camera: Camera, prospect: Prospect, rules: Acceptance) -> list[tuple[float, str]]:
+        """By what share a view misses each rule that it does not fulfil, and the same in words."""
+        found = []
+        share = float(np.mean(prospect.within >= 0.5)) if len(prospect.within) else 1.0
+        if share < rules.in_view:
+            text = f"shows {share:.3g} of the labelled objects, where in_view is {rules.in_view:g}"
+            found.append((1 - share / rules.in_view, text))
+        least = float(prospect.extents[prospect.within > 0].min(initial=np.inf))
+        if least < rules.extent:
+            found.append((1 - least / rules.extent, f"shows one of {least:.3g} px, where extent is {rules.extent:g}"))
+        away = self._clearance(camera.centre, rules.clearance)
+        if name := self._around(camera.centre):
+            found.append((1.0, f"is from inside of {name}"))
+        elif away < rules.clearance:
+            text = f"is {away:.3g} m from what is nearest, where clearance is {rules.clearance:g}"
+            found.append((1 - away / rules.clearance, text))
+        return found
+
+    def _around(self, eye: Float64Array) -> str:
+        """What a point is inside of, or empty."""
+        if name := solid_around(self._scene, eye):
+            return f"shape {name!r}"
+        for one in self._layout.instances:
+            mesh = _mesh(self._scene, one.asset)
+            if points_inside(mesh, _local(eye, one.world_from_object)[None])[0]:
+                return f"object {one.id}"
+        return ""
+
+    def _clearance(self, eye: Float64Array, reach: float) -> float:
+        """Distance of a point to the surface that is nearest [m], or ``reach`` if none is as near."""
+        scene = self._scene
+        shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
+        around = scene.environment.mesh if scene.environment is not None else None
+        distances = [_distance(mesh, eye, reach) for mesh in (*shapes, around) if mesh is not None]
+        for one in self._layout.instances:
+            mesh = _mesh(scene, one.asset)
+            distances.append(_distance(mesh, _local(eye, one.world_from_object), reach))
+        return min(distances, default=reach)
+
+
+def solid_around(scene: Scene, point: Float64Array) -> str:
+    """Name of a visible shape that a point [m] is in and the region is not, or empty."""
+    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
+    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+        if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
+            return shape.name
+    return ""
+
+
+@lru_cache(maxsize=2)
+def _surface_points(scene: Scene) -> tuple[Float64Array, ...]:
+    """Points on the surface of each asset, in its frame [m], as dense on all of them."""
+    spacing = _spacing(scene)
+    points = []
+    for asset in range(len(scene.assets)):
+        mesh = _mesh(scene, asset)
+        samples, _ = trimesh.sample.sample_surface(mesh, max(_FEWEST, round(mesh.area / spacing**2)), seed=0)
+        points.append(np.asarray(samples, dtype=np.float64))
+    return tuple(points)
+
+
+def _spacing(scene: Scene) -> float:
+    """About how far apart points on surfaces are [m]."""
+    return float(np.sqrt(max(asset.mesh.area for asset in scene.assets if asset.mesh is not None) / _FINEST))
+
+
+def _mesh(scene: Scene, asset: int) -> trimesh.Trimesh:
+    return cast(trimesh.Trimesh, scene.assets[asset].mesh)  # no object is loaded without, for it must be dropped
+
+
+def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
+    return np.asarray((point - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
+
+
+def _among(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
+    return np.asarray((values >= bounds[0]) & (values <= bounds[1]))
+
+
+def _distance(mesh: trimesh.Trimesh, point: Float64Array, reach: float) -> float:
+    """Distance of a point to a mesh's triangles, or ``reach`` if none is as near."""
+    low, high = mesh.bounds
+    if np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high))) >= reach:
+        return reach
+    triangles = np.asarray(mesh.triangles)
+    # Of a triangle's box and the point, whatever is nearer than the reach along every axis.
+    apart = np.maximum(triangles.min(axis=1) - point, point - triangles.max(axis=1))
+    near = triangles[(apart < reach).all(axis=1)]
+    if not len(near):
+        return reach
+    closest = trimesh.triangles.closest_point(near, np.broadcast_to(point, (len(near), 3)))
+    return min(reach, float(np.linalg.norm(closest - point, axis=1).min()))
+
+
+def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:
+    """Triangles that can cross a line of sight: in whose plane, or on whose other side, some point's box is."""
+    if not len(triangles) or not len(points):
+        return triangles[:0]
+    low, high = points.min(axis=0), points.max(axis=0)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    corners = np.stack(np.meshgrid(*np.stack([low, high]).T, indexing="ij"), axis=-1).reshape(-1, 3)
+    here = np.einsum("ti,ti->t", normals, eye - triangles[:, 0])
+    there = np.einsum("ti,tci->tc", normals, corners - triangles[:, :1])
+    # Objects sink into what they lie on by less than a tenth of a millimetre.
+    slack = 1e-4 * np.linalg.norm(normals, axis=1)
+    other = there * np.sign(here)[:, None] < -slack[:, None]
+    return np.asarray(triangles[other.any(axis=1) & (np.abs(here) > 0)])
+
+
+def _crossed(eye: Float64Array, points: Float64Array, triangles: Float64Array) -> BoolArray:
+    """Which lines of sight from an eye to points (N, 3) cross a triangle on their way (Möller and Trumbore 1997)."""
+    crossed = np.zeros(len(points), dtype=bool)
+    one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    start = eye - triangles[:, 0]
+    turned = np.cross(start, one)
+    height = np.einsum("ti,ti->t", two, turned)
+    for part in np.array_split(np.arange(len(points)), 1 + len(points) * len(triangles) // _TESTS):
+        ray = points[part] - eye
+        across = np.cross(ray[:, None], two[None])
+        volume = np.einsum("pti,ti->pt", across, one)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("pti,ti->pt", across, start) / volume
+            v = ray @ turned.T / volume
+            along = height / volume
+        crossed[part] = ((u >= 0) & (v >= 0) & (u + v <= 1) & (along > 0) & (along < 1 - 1e-3)).any(axis=1)
+    return crossed

@@ -12,6 +12,7 @@ KernelName = Literal["exact", "mip", "3dgs", "gsplat"]
 ResponseName = Literal["perspective", "ewa"]
 PresetName = Literal["fast", "balanced", "exact"]
 Order = Literal["tile", "window", "ray"]
+Samples = int | Literal["edges"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Quality:
         alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
         transmittance_min: A ray ends when less than this share of the light behind would still be seen.
         sh_degree: Highest spherical-harmonic band that is evaluated.
-        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered).
+        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered); ``edges`` for one, and 2 x 2
+            where instances border on each other, see :mod:`mitsplat.plugins.edges`.
         lens_rings: Rings of points around the centre of a thin lens that are looked through: 1, 2, 3 take 7, 19, 37
             images. Where blur is wide, its points stand apart, and more rings make it smooth.
     """
@@ -65,7 +67,7 @@ class Quality:
     alpha_min: float = 1.0 / 255.0
     transmittance_min: float = 1e-3
     sh_degree: int = 3
-    samples: int = 1
+    samples: Samples = 1
     lens_rings: int = 2
 
     def __post_init__(self) -> None:
@@ -81,10 +83,15 @@ class Quality:
             raise InputError(f"quality: transmittance_min must be in [0, 1) (got {self.transmittance_min})")
         if self.sh_degree not in (0, 1, 2, 3):
             raise InputError(f"quality: sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
-        if type(self.samples) is not int or not 1 <= self.samples <= 8:
-            raise InputError(f"quality: samples must be from 1 to 8 (got {self.samples})")
+        if self.samples != "edges" and (type(self.samples) is not int or not 1 <= self.samples <= 8):
+            raise InputError(f"quality: samples must be from 1 to 8, or 'edges' (got {self.samples!r})")
         if type(self.lens_rings) is not int or not 1 <= self.lens_rings <= 8:
             raise InputError(f"quality: lens_rings must be from 1 to 8 (got {self.lens_rings})")
+
+    @property
+    def grid(self) -> int:
+        """Rays of every pixel along each axis."""
+        return 1 if self.samples == "edges" else self.samples
 
     @property
     def order(self) -> Order:

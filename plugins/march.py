@@ -225,6 +225,25 @@ def march(
     return image if wrong is None else _repaired(image, wrong, lists, view, quality, z_max)
 
 
+def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | None = None) -> Image:
+    """The pixels of some tiles, 16 of each, tile after tile, by one ray through the centre of each.
+
+    Arguments are those of :func:`march`, but nothing is repaired: the order is per tile or per ray.
+    """
+    lanes = Lanes(lists, view, TILE if quality.order == "tile" else 1, apart=True)
+    places = zip(lanes.pixel, lanes.inside, strict=True)
+    far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
+    if quality.order == "ray":
+        dr.eval(lists.nearest)
+    state = {"several": lists.instance is None, "estimated": False}
+    where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
+    rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
+    found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
+    image, _ = _collect(found, lanes, lists.instance)
+    dr.eval(image)
+    return image
+
+
 def _too_wrong(pixels: list[Pixel], quality: Quality) -> Any:
     """Whether the estimate of an error exceeds the tolerance in a lane."""
     return largest([pixel[ERROR] for pixel in pixels]) > dr.opaque(mi.Float, quality.tolerance)

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.plugins.chosen import ChosenTiles
 from mitsplat.plugins.device import concatenated, wrapped
 from mitsplat.plugins.gaussian import (
     LOG2_E_HALF,
@@ -178,7 +179,9 @@ class Projector:
         centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
         response, opacity = project_gaussian(**shape), g["opacity"]
         if kernel.variance > 0:
-            covariance = view.pixel_covariance(response.u0, response.v0, kernel.variance)
+            # A filter is as wide as the view's pixels; what trainers add is of the picture's, however fine the view is.
+            variance = kernel.variance * (1 if kernel.keeps_light else view.zoom**2)
+            covariance = view.pixel_covariance(response.u0, response.v0, variance)
             response, det = response.filtered(*covariance)
             if kernel.keeps_light:
                 opacity = opacity * dr.rsqrt(det)
@@ -210,12 +213,14 @@ class Projector:
             visible &= ~near
         return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
-    def cull(self, owner: Any, local: Any) -> tuple[Any, Any]:
-        """Whether Gaussians are in view, and whether they reach the camera's plane."""
+    def cull(self, owner: Any, local: Any, chosen: ChosenTiles | None = None) -> tuple[Any, Any]:
+        """Whether Gaussians are in view, or near some tiles of it, and whether they reach the camera's plane."""
         g = self._load(owner, local)
         _, _, _, near, visible, box, _ = self._bounds(g)
         x0, x1, y0, y1 = self.view.tile_box(*box)
         visible, near = dr.detach(visible & (x1 > x0) & (y1 > y0)), dr.detach(near)
+        if chosen is not None:
+            visible &= chosen.any_in(x0, x1, y0, y1, visible)
         dr.eval(visible, near)
         return visible, near
 

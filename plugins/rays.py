@@ -31,6 +31,7 @@ class View:
         samples: Rays per pixel along each axis.
         lens: Model of the lens.
         aperture_radius, focus_distance: Of a thin lens [m].
+        zoom: How many of its pixels lie along one of the picture's, see :meth:`finer`.
         shift: What the slopes of rays lack of those through the lens's centre; of a view through another of its points.
     """
 
@@ -48,6 +49,7 @@ class View:
     aperture_radius: float = 0.0
     focus_distance: float = 1.0
     shift: tuple[float, float] = (0.0, 0.0)
+    zoom: int = 1
     _opaque: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -108,6 +110,11 @@ class View:
     def sampled(self, samples: int) -> View:
         """The same view with ``samples`` x ``samples`` rays per pixel."""
         return self if samples == self.samples else replace(self, samples=samples)
+
+    def finer(self, zoom: int) -> View:
+        """The same view in ``zoom`` x ``zoom`` pixels for each of its own."""
+        numbers: dict[str, Any] = {n: zoom * getattr(self, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
+        return replace(self, zoom=zoom * self.zoom, **numbers)
 
     @property
     def camera(self) -> Camera:

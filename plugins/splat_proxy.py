@@ -14,8 +14,9 @@ import numpy as np
 from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.bounce import RadianceGrid
+from mitsplat.plugins.edges import Edges
 from mitsplat.plugins.emitters import reference_irradiance
-from mitsplat.plugins.gaussian import Cloud, srgb_to_linear, upload_cloud
+from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, light_factor
 from mitsplat.plugins.lit_surface import Seen, lit_surface
 from mitsplat.plugins.march import Image, trace
@@ -26,6 +27,7 @@ from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
 from mitsplat.plugins.proxies import Occluder, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.sensors import view_of
+from mitsplat.plugins.shown import Shown
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.still import StillLayer
 from mitsplat.plugins.tiles import CrowdedError
@@ -89,7 +91,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - samples
        - |int|
-       - Rays per pixel along each axis, 1 to 8. (Default: 1)
+       - Rays per pixel along each axis, 1 to 8; or the |string| ``edges``: one, and 2 x 2 where instances or visible
+         meshes border on each other. (Default: 1)
 
      * - lens_rings
        - |int|
@@ -245,44 +248,25 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     ) -> dict[str, Any]:
         """The layers that one point of the lens sees."""
         rays = view.rays()
-        behind = contents.meshes.trace(view, rays) if contents.meshes else None
-        lamps = None if self.hide_emitters else SeenLights.trace(scene, view, rays)
-        z_max = behind.depth if behind else None
-        if lamps:
-            z_max = lamps.depth if z_max is None else dr.minimum(z_max, lamps.depth)
+        behind, lamps, z_max = self._behind(contents, scene, view, rays)
         splat = self._trace_splats(contents, scene, view, z_max)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
         dr.eval(splat, proxy_depth, hit, static)
 
-        covered = dr.maximum(splat.alpha, 1e-6)
-        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
-        alpha, depth, instance = splat.alpha, splat.depth, splat.instance
-        solid, plain = mi.Bool(False), mi.Bool(False)
-        if behind:
-            solid = behind.valid & (behind.depth <= z_max)
-            plain = solid & behind.plain
-            colour += dr.select(plain, behind.reflectance * (1 - splat.alpha), 0)
-            alpha = dr.select(solid, 1, alpha)
-        # What is lit where this is seen: light in it is traced already.
-        glow = self._glow(contents, scene, view, rays, behind, solid, splat.alpha, lamps, paths, seed)
-        if lamps:
-            alpha = dr.select(solid | lamps.everywhere | (lamps.depth < dr.inf), 1, alpha)
-        if z_max is not None:
-            front = (z_max < dr.inf) & (splat.centre_alpha < 0.5)
-            depth = dr.select(front, z_max, depth)
-            instance = dr.select(front, 0, instance)
+        white = self._white(scene) if scene.emitters() else mi.Color3f(dr.opaque(mi.Float, float(np.pi)))
+        shown = Shown.of(splat, behind, lamps, z_max, dr.pi / white)
+        radiance = self._radiance(contents, scene, view, rays, behind, shown, white, paths, seed)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
-        lit_alpha = dr.select(plain, 1, splat.alpha)
         if self.shadow == "traced" and scene.emitters():
-            shown = plain & (splat.centre_alpha < 0.5)
+            mesh = shown.plain & shown.front
             seen = Seen(
                 rays.d,
-                lit_alpha,
-                dr.select(shown, behind.depth, splat.depth) if behind else splat.depth,
-                dr.select(shown, 0, splat.instance),
+                shown.cover,
+                dr.select(mesh, behind.depth, splat.depth) if behind else splat.depth,
+                dr.select(mesh, 0, splat.instance),
                 contents.traits.seen(self._by_shape(contents, view, z_max), splat.instance),
-                shown,
+                mesh,
             )
             # Light is traced at visible meshes as at static proxies, also where splats touch them.
             ground = behind.before(static) if behind else static
@@ -295,50 +279,85 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 accuracy=accuracy,
                 seed=seed,
                 point=self.reference,
-                reference=self._white(scene),
+                reference=white,
                 grid=contents.grid if self.bounce else None,
             )
         if not self.highlight:
             highlight = mi.Color3f(0)
+        rgb, captured = shown.lit(light, highlight, radiance)
         layers = {
-            "rgb": dr.maximum(colour * light + highlight * lit_alpha, 0) + glow,
-            "alpha": alpha,
-            "captured": colour + glow,
-            "depth": depth,
-            "instance": instance,
+            "rgb": rgb,
+            "alpha": shown.alpha,
+            "captured": captured,
+            "depth": splat.depth if z_max is None else dr.select(shown.front, z_max, splat.depth),
+            "instance": splat.instance if z_max is None else dr.select(shown.front, 0, splat.instance),
             "proxy_depth": proxy_depth,
             "proxy_instance": hit.instance,
             "normal": mi.Vector3f(hit.normal),
             "light": light,
             "highlight": highlight,
         }
-        dr.eval(layers)
+        dr.eval(layers, shown.key)
+        if self.quality.samples == "edges":
+            layers |= self._smooth_edges(contents, scene, view, layers, shown.key, radiance, white)
         return layers
 
-    def _glow(
+    def _smooth_edges(
+        self, contents: _Contents, scene: Any, view: View, layers: dict[str, Any], key: Any, radiance: Any, white: Any
+    ) -> dict[str, Any]:
+        """Colours and opacity of ``layers``, averaged over several rays where pixels that differ in ``key`` meet."""
+        edges = Edges.find(key, view)
+        if edges is None:
+            return {}
+        rays = edges.rays()
+        behind, lamps, z_max = self._behind(contents, scene, view, rays)
+        splat = Image.empty(dr.width(rays.d))
+        if contents.clouds is not None:
+            splat = edges.trace(contents.clouds, contents.placements, self.quality, z_max)
+        shown = Shown.of(splat, behind, lamps, z_max, dr.pi / white)
+        pixel = edges.alike(key, shown.key)
+
+        def near(values: Any) -> Any:
+            """What the nearest pixel has that shows the same."""
+            return values if dr.width(values) == 1 else dr.gather(type(values), values, pixel)
+
+        lights = near(layers["light"]), near(layers["highlight"])
+        rgb, captured = shown.lit(*lights, None if radiance is None else near(radiance))
+        fine = {"rgb": rgb, "alpha": shown.alpha, "captured": captured}
+        dr.eval(fine)
+        smooth = {name: edges.averaged(layers[name], values) for name, values in fine.items()}
+        dr.eval(smooth)
+        return smooth
+
+    def _behind(
+        self, contents: _Contents, scene: Any, view: View, rays: Any
+    ) -> tuple[Behind | None, SeenLights | None, Any | None]:
+        """Visible meshes and emitters that rays meet, and the depths [m] of the nearest of them."""
+        behind = contents.meshes.trace(view, rays) if contents.meshes else None
+        lamps = None if self.hide_emitters else SeenLights.trace(scene, view, rays)
+        z_max = behind.depth if behind else None
+        if lamps:
+            z_max = lamps.depth if z_max is None else dr.minimum(z_max, lamps.depth)
+        return behind, lamps, z_max
+
+    def _radiance(
         self,
         contents: _Contents,
         scene: Any,
         view: View,
         rays: Any,
         behind: Behind | None,
-        solid: Any,
-        alpha: Any,
-        lamps: SeenLights | None,
+        shown: Shown,
+        white: Any,
         paths: int,
         seed: int,
-    ) -> Any:
-        """Emitters and path-traced meshes behind splats of opacity ``alpha``, in the picture's scale (Color3f)."""
-        glow = mi.Color3f(0)
-        lights = bool(scene.emitters())
-        white = self._white(scene) if lights else mi.Color3f(dr.opaque(mi.Float, float(np.pi)))
-        if lamps:
-            glow = dr.select(solid, 0, lamps.radiance * (dr.pi / white) * (1 - alpha))
+    ) -> Any | None:
+        """What path-traced meshes send along the rays that show them, in the picture's scale (Color3f)."""
         if behind is None or contents.meshes is None or contents.meshes.plain is None:
-            return glow
-        pixel = dr.compress(solid & ~behind.plain & (alpha < 1 - 1e-3))
+            return None
+        pixel = dr.compress(shown.solid & ~shown.plain & (shown.veil < 1 - 1e-3))
         if not dr.width(pixel):
-            return glow
+            return None
         ray, hit = (dr.gather(type(v), v, pixel) for v in (mi.Ray3f(rays), behind.hit))
         tracer = PathTracer(
             contents.meshes,
@@ -351,11 +370,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             bounce=self.bounce,
             seed=seed,
         )
-        radiance = tracer.radiance(view, ray, hit, pixel, paths) * (1 - dr.gather(mi.Float, alpha, pixel))
-        glow = mi.Color3f(dr.zeros(mi.Float, dr.width(alpha))) + glow
-        dr.eval(glow)
-        dr.scatter(glow, radiance, pixel)
-        return glow
+        found = tracer.radiance(view, ray, hit, pixel, paths)
+        radiance = mi.Color3f(dr.zeros(mi.Float, dr.width(shown.veil)))
+        dr.eval(radiance, found)
+        dr.scatter(radiance, found, pixel)
+        return radiance
 
     def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
         """Every instance above 0 as it would be seen alone, by its splats or its proxies (``source``).
@@ -384,13 +403,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """Which of an instance's shapes a pixel shows, where these are not lit alike; see :class:`Traits`."""
         if contents.traits.placements is None or contents.clouds is None:
             return None
-        fine = view.sampled(self.quality.samples)
+        fine = view.sampled(self.quality.grid)
         return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
 
     def _trace_splats(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
-        fine = view.sampled(self.quality.samples)
+        fine = view.sampled(self.quality.grid)
         still = self._still_layer(contents, scene, fine, z_max)
         if still is not None:
             objects = [p for p in contents.placements if p.instance]

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import drjit as dr
@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import MissingResourceError
+from mitsplat.plugins.chosen import ChosenTiles
 from mitsplat.plugins.device import concatenated
 from mitsplat.plugins.gaussian import RECORD, conic_touches_rectangle, ellipse_span
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
@@ -79,7 +80,13 @@ class TileLists:
 
 
 def bin_gaussians(
-    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, *, at_camera: bool = True
+    clouds: CloudSet,
+    placements: Sequence[Placement],
+    view: View,
+    quality: Quality,
+    *,
+    at_camera: bool = True,
+    chosen: ChosenTiles | None = None,
 ) -> TileLists:
     """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
 
@@ -89,17 +96,18 @@ def bin_gaussians(
         view: The camera.
         quality: Order, cut-offs and kernel.
         at_camera: Whether Gaussians that reach the camera's plane are seen.
+        chosen: The only tiles that have lists; all of the view's if None.
 
     Raises:
         CrowdedError: If the view has too many pairs to hold.
     """
-    tiles = view.tiles_x * view.tiles_y
+    tiles = view.tiles_x * view.tiles_y if chosen is None else chosen.count
     table, owner, local = placement_table(clouds, placements, view)
     if dr.width(local) == 0:
         return _empty(tiles)
     source = Projector(clouds, table, view, quality, at_camera)
 
-    visible, near = source.cull(owner, local)
+    visible, near = source.cull(owner, local, chosen)
     index = dr.compress(visible)
     if dr.width(index) == 0:
         return _empty(tiles)
@@ -109,22 +117,29 @@ def bin_gaussians(
 
     records, near_rows, least, box = source.records(owner, local, near)
     ids = {placement.instance for placement in placements}
-    return bin_records(records, near_rows, least, box, view, quality, ids.pop() if len(ids) == 1 else None)
+    return bin_records(records, near_rows, least, box, view, quality, ids.pop() if len(ids) == 1 else None, chosen)
 
 
 def bin_records(
-    records: Any, near: Any, least: Any, box: Any, view: View, quality: Quality, only: int | None
+    records: Any,
+    near: Any,
+    least: Any,
+    box: Any,
+    view: View,
+    quality: Quality,
+    only: int | None,
+    chosen: ChosenTiles | None = None,
 ) -> TileLists:
     """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
 
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    tiles = view.tiles_x * view.tiles_y
-    pairs = _pair(dr.detach(records), least, box, view, quality)
+    tiles, own = (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
+    pairs = _pair(dr.detach(records), least, box, view, quality, chosen)
     if pairs is None:
-        return _empty(tiles, records)
-    return _listed(records, near, pairs, least, dr.width(least), tiles, view, only)
+        return replace(_empty(tiles, records), tiles=own)
+    return _listed(records, near, pairs, least, dr.width(least), tiles, view, only, own)
 
 
 def _listed(
@@ -242,8 +257,10 @@ class _Pairs:
     first: Any
 
 
-def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _Pairs | None:
-    """Pairs of every record with the tiles it meets, or None if there are none.
+def _pair(
+    records: Any, least: Any, box: Any, view: View, quality: Quality, chosen: ChosenTiles | None
+) -> _Pairs | None:
+    """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
 
     Raises:
         CrowdedError: If there are more than :data:`PAIRS_MAX`.
@@ -264,9 +281,12 @@ def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _
     def one_row(y: Any) -> tuple[Any]:
         lo, hi = span_of(y)
         row = row_of + (y - y0)
+        begin, size = y * view.tiles_x + lo, dr.select(hi > lo, hi - lo, 0)
+        if chosen is not None:
+            begin, size = chosen.among(begin, size)
         dr.scatter(owner, order, row, mode=dr.ReduceMode.Permute)
-        dr.scatter(first_tile, y * view.tiles_x + lo, row, mode=dr.ReduceMode.Permute)
-        dr.scatter(length, dr.select(hi > lo, hi - lo, 0), row, mode=dr.ReduceMode.Permute)
+        dr.scatter(first_tile, begin, row, mode=dr.ReduceMode.Permute)
+        dr.scatter(length, size, row, mode=dr.ReduceMode.Permute)
         return (y + 1,)
 
     dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
@@ -281,7 +301,7 @@ def _pair(records: Any, least: Any, box: Any, view: View, quality: Quality) -> _
 
     def one_tile(k: Any) -> tuple[Any]:
         tile, pair = first_tile + k, pair_of + k
-        slopes = view.tile_slopes(tile)
+        slopes = view.tile_slopes(tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile))
         if quality.order == "ray":
             depth = _least_depth(record, ellipsoid, slopes)
         else:

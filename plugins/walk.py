@@ -42,11 +42,15 @@ class Lanes:
     Attributes:
         pixel: Number of each of the lane's pixels, row-major.
         inside: Whether it is in the image.
+        count: Of all pixels.
         start, stop: Range of the tile's list.
     """
 
-    def __init__(self, lists: TileLists, view: View, rows: int = TILE) -> None:
-        """Lanes of ``rows`` pixels each, a divisor of the tile's."""
+    def __init__(self, lists: TileLists, view: View, rows: int = TILE, *, apart: bool = False) -> None:
+        """Lanes of ``rows`` pixels each, a divisor of the tile's.
+
+        Tiles that are taken ``apart`` from their view have pixels of their own, tile after tile and row by row.
+        """
         count = view.tiles_x * view.tiles_y if lists.tiles is None else dr.width(lists.tiles)
         per_tile = TILE * TILE // rows
         lane = dr.arange(mi.UInt32, count * per_tile)
@@ -56,7 +60,12 @@ class Lanes:
         self.view, self.rows = view, rows
         self.x = (tile - tile_y * view.tiles_x) * TILE + lane % TILE
         self.y = tile_y * TILE + lane % per_tile // TILE * rows
-        self.pixel = [(self.y + k) * view.width + self.x for k in range(rows)]
+        self.count = count * TILE * TILE if apart else view.width * view.height
+        if apart:
+            first = own * (TILE * TILE) + lane % per_tile // TILE * (rows * TILE) + lane % TILE
+            self.pixel = [first + k * TILE for k in range(rows)]
+        else:
+            self.pixel = [(self.y + k) * view.width + self.x for k in range(rows)]
         self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(rows)]
         self.start = dr.gather(mi.UInt32, lists.start, own)
         self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, own), self.start)
@@ -74,7 +83,7 @@ class Lanes:
 
     def image(self, kind: Any, values: list[Any]) -> Any:
         """Row-major array of type ``kind`` of a value for each of the lane's pixels."""
-        target = dr.empty(kind, self.view.width * self.view.height)
+        target = dr.empty(kind, self.count)
         for value, number, mask in zip(values, self.pixel, self.inside, strict=True):
             dr.scatter(target, kind(value), number, mask, mode=dr.ReduceMode.Permute)
         return target

@@ -8,7 +8,7 @@ worker there is taken to need as much of the GPU's memory, and as much of the ma
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     splats = {id(one): one for one in (*static, *(one for pool in pools for one in pool))}.values()
     stored = sum(getattr(one, f.name).nbytes for one in splats for f in fields(one))
     count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
-    samples = {**vars(resolve_quality(spec.quality)), **spec.rendering.model_dump()}["samples"]
+    samples = replace(resolve_quality(spec.quality), **spec.rendering.model_dump()).grid
     pixels = spec.output.width * spec.output.height
     cameras = [plan_frame(scene, int(i)).camera for i in np.linspace(0, scene.num_frames - 1, _VIEWS)]
     pairs = max(

@@ -98,5 +98,8 @@ class Rendering(StrictModel):
         "exact",
         description="The Gaussian itself, widened by a pixel so that nothing sparkles, or as those trainers dilate it.",
     )
-    samples: int = Field(1, ge=1, le=8, description="Rays per pixel along each axis: 2 smooths silhouettes.")
+    samples: Annotated[int, Field(ge=1, le=8)] | Literal["edges"] = Field(
+        "edges",
+        description="Rays per pixel along each axis; `edges` for one, and 2 x 2 where objects border on each other.",
+    )
     lens_rings: int = Field(2, ge=1, le=8, description="Rings of points on a thin lens: 1, 2, 3 take 7, 19, 37 images.")

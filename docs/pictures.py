@@ -108,6 +108,25 @@ def _render_xml(name: str, folder: Path) -> Any:
     return cv2.imread(str(render_xml(SCENES / name, folder / "picture.png")))[..., ::-1]
 
 
+def _write_skies(folder: Path) -> None:
+    """Two panoramas with a sun each, z up in the middle of the upper edge: at noon, and before the evening."""
+    import mitsuba as mi
+    import numpy as np
+
+    folder.mkdir()
+    for name, height, sun, zenith, horizon in (
+        ("day", 55, (900, 850, 780), (0.25, 0.4, 0.8), (0.7, 0.75, 0.8)),
+        ("evening", 15, (900, 420, 130), (0.15, 0.2, 0.4), (0.9, 0.5, 0.25)),
+    ):
+        up, around = np.meshgrid(np.linspace(90, -90, 128), np.linspace(-180, 180, 256), indexing="ij")
+        share = np.clip(up / 90, 0, 1)[..., None] ** 0.5
+        sky = share * zenith + (1 - share) * np.array(horizon)
+        sky[up < 0] = 0.15
+        beside = around * np.cos(np.radians(height))
+        sky += np.exp(-0.5 * (np.hypot(up - height, beside) / 3) ** 2)[..., None] * 0.5 * np.array(sun)
+        mi.Bitmap(sky.astype(np.float32)).write(str(folder / f"{name}.exr"))
+
+
 def main() -> None:
     """Make the pictures that are asked for, or all."""
     import cv2
@@ -136,6 +155,7 @@ def main() -> None:
         folder = Path(name)
         (folder / "assets").symlink_to(SCENES / "assets")
         trimesh.creation.torus(0.05, 0.015).apply_translation((0, 0, 0.015)).export(folder / "ring.ply")
+        _write_skies(folder / "skies")
         failed = []
         for file, (key, make) in work.items():
             if (wanted and key not in wanted) or (options.missing and file.exists()):

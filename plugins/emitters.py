@@ -22,6 +22,9 @@ REFERENCE_LATTICE = (4181, 2584)
 LEAST_CHANCE = 0.1
 """Share of the rays that goes to all emitters alike, however little light they send to the reference point."""
 
+_ENDS = 4
+"""Numbers of emitters are rounded up to multiples of it."""
+
 
 def receiver(position: Any, normal: Any) -> Any:
     """Surface interaction that light is sampled for."""
@@ -65,19 +68,21 @@ class Emitters:
         emitters = scene.emitters()
         self.pointers = scene.emitters_dr()
         skies = [i for i, e in enumerate(emitters) if _is_sky(e)]
-        self.sky = skies[0] if skies else None
-        self.even_sky = self.sky is not None and emitters[self.sky].class_name() == "ConstantBackgroundEmitter"
+        sky = skies[0] if skies else None
+        self.even_sky = sky is not None and emitters[sky].class_name() == "ConstantBackgroundEmitter"
+        # Where it is among several emitters is no part of kernels: it changes with the number of lights.
+        self.sky = None if sky is None else mi.UInt32(0) if len(emitters) == 1 else dr.opaque(mi.UInt32, sky)
         point = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in reference])
         fluence = self._survey(len(emitters), point)
         share = LEAST_CHANCE / len(emitters) + (1 - LEAST_CHANCE) * fluence / max(fluence.sum(), 1e-30)
         self.choice = _Choice(share)
-        local = np.where(np.arange(len(emitters)) == self.sky, 0, share)
+        local = np.where(np.arange(len(emitters)) == sky, 0, share)
         self.local_choice = _Choice(local) if len(emitters) > len(skies) else None
         infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
         self.infinite = mi.UInt32([int(v) for v in infinite])
         self.sky_colour = None
         if self.even_sky:
-            pointer = dr.gather(mi.EmitterPtr, self.pointers, mi.UInt32(self.sky))
+            pointer = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
             self.sky_colour = self._sky_radiance(receiver(point, mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0, 1), pointer)
             dr.make_opaque(self.sky_colour)
         dr.make_opaque(self.infinite)
@@ -132,7 +137,7 @@ class Emitters:
             choice = self.local_choice
             total += self._integrate(si, active, OPEN_LATTICE, lambda u: self._local_light(si, choice, u, active))
         if self.sky is not None:
-            emitter = dr.gather(mi.EmitterPtr, self.pointers, mi.UInt32(self.sky))
+            emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
             if self.even_sky:
                 total += dr.pi * self.sky_colour
             else:
@@ -161,7 +166,11 @@ class _Choice:
     def __init__(self, share: Any) -> None:
         """Chances in proportion to ``share`` (N,)."""
         chance = share / share.sum()
-        self.ends = [dr.opaque(mi.Float, float(end)) for end in np.cumsum(chance)[:-1]]
+        # A kernel serves two to four things, five to eight and so on: nothing lies behind the ends at infinity.
+        ends = np.cumsum(chance)[:-1]
+        if len(chance) > 1:
+            ends = np.concatenate([ends, np.full(-len(chance) % _ENDS, np.inf)])
+        self.ends = [dr.opaque(mi.Float, float(end)) for end in ends]
         self.starts = wrapped(mi.Float, np.concatenate([[0], np.cumsum(chance)[:-1]]).astype(np.float32))
         self.chances = wrapped(mi.Float, chance.astype(np.float32))
         dr.make_opaque(self.starts, self.chances)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import trimesh
 
 from mitsplat.content_hash import ContentHash, file_hash
+from mitsplat.scene.spec_lights import EnvironmentLight
 from mitsplat.splats import Splats
 
 if TYPE_CHECKING:
@@ -38,8 +39,10 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
     for i, mesh in enumerate(scene.shape_meshes):
         found[f"shapes[{i}]"] = described.value(mesh)
     for i, light in enumerate(scene.spec.lights):
-        if image := getattr(light, "image", None):
-            found[f"lights[{i}].image"] = file_hash(scene.images[image])
+        if isinstance(light, EnvironmentLight):
+            for number, image in enumerate(light.names):
+                key = "image" if light.image is not None else f"pool[{number}]"
+                found[f"lights[{i}].{key}"] = file_hash(scene.images[image])
     return found
 
 

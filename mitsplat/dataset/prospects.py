@@ -21,8 +21,9 @@ from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.mesh_points import points_inside
-from mitsplat.scene.scene import Scene, plan_frame
+from mitsplat.scene.scene import FramePlan, Scene, plan_frame
 from mitsplat.scene.sight import solid_around
+from mitsplat.scene.spec_lights import LocalLight
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds
 
 MOST_OBJECTS = 65535
@@ -215,7 +216,8 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
 def doubts(scene: Scene) -> Iterator[Finding]:
     """What a run survives but was hardly meant: some views from inside of solids, lights inside of them, small bins."""
     spec = scene.spec
-    cameras = _cameras(scene, range(min(scene.num_frames, MOST_FRAMES)))
+    plans = _plans(scene, range(min(scene.num_frames, MOST_FRAMES)))
+    cameras = [plan.camera for plan in plans]
     inside = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
     low, high = _reach(scene)
     blind = sum(not sees(camera, low, high) for camera in cameras)
@@ -226,10 +228,15 @@ def doubts(scene: Scene) -> Iterator[Finding]:
         "move camera, its keys or its ranges: such images have no labels",
     )
     for number, light in enumerate(spec.lights):
-        position = getattr(light, "position", None)
-        if position is not None and (name := solid_around(scene, np.array(position))):
+        if isinstance(light, LocalLight) and not light.moved and (name := _light_inside(scene, light)):
             text = f"lights[{number}] is inside of shape {name!r}"
             yield Finding("lights", False, text, "move it out: it lights nothing")
+    if any(isinstance(light, LocalLight) and light.moved for light in spec.lights):
+        lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
+        names = [name for light in lights if (name := _light_inside(scene, light))]
+        if names:
+            text = f"{len(names)} of {len(lights)} lights that were drawn are inside of a shape, such as {names[0]!r}"
+            yield Finding("lights", False, text, "narrow lights[].draw: they light nothing")
     for shape in spec.shapes:
         if shape.bin is None:
             continue
@@ -276,8 +283,18 @@ def _blind(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> 
 
 def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:
     """Cameras of some of the frames."""
+    return [plan.camera for plan in _plans(scene, frames)]
+
+
+def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
+    """Plans of some of the frames."""
     chosen = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
-    return [plan_frame(scene, frames[position]).camera for position in sorted(chosen)]
+    return [plan_frame(scene, frames[position]) for position in sorted(chosen)]
+
+
+def _light_inside(scene: Scene, light: LocalLight) -> str:
+    """Name of a visible shape that a light is in and the region is not, or empty."""
+    return solid_around(scene, np.array(light.position))
 
 
 def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:

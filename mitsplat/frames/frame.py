@@ -27,7 +27,7 @@ from mitsplat.physics.settle import settle_layout
 from mitsplat.plugins.device import plain_mesh
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.render.deferred import Deferred
-from mitsplat.render.emitters import emitter_dict
+from mitsplat.render.emitters import emitter_dict, movable
 from mitsplat.render.layers import (
     Layers,
     host_array,
@@ -37,6 +37,7 @@ from mitsplat.render.layers import (
     render_silhouettes,
 )
 from mitsplat.scene.layout import Layout
+from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
 from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
 from mitsplat.splats import Splats
@@ -186,12 +187,13 @@ class Renderer:
         self._static = self._static_shapes()
         self._placed: tuple[Layout, dict[str, Any]] | None = None
         self._settled: dict[int, Layout] = {}
+        self._sky: tuple[str, Any] | None = None
 
     def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.integrator, self._static, self._placed = None, {}, None
+        self.integrator, self._static, self._placed, self._sky = None, {}, None, None
         self._settled.clear()
 
     @one_at_a_time
@@ -263,13 +265,27 @@ class Renderer:
                 asset = self.scene.assets[instance.asset]
                 objects[f"instance_{instance.id}"] = _asset_shape(asset, instance.world_from_object, instance.id)
             self._placed = layout, objects
-        emitters = {f"light_{i}": self._emitter(light) for i, light in enumerate(lights)}
+        emitters = {f"light_{i}": self._made(self._emitter(light)) for i, light in enumerate(lights)}
         return {"type": "scene", **self._static, **self._placed[1], **emitters}
 
     def _emitter(self, light: LightSpec) -> dict[str, Any]:
         if isinstance(light, EnvironmentLight) and light.image is not None:
             light = light.model_copy(update={"image": str(self.scene.images[light.image])})
         return emitter_dict(light)
+
+    def _made(self, emitter: dict[str, Any]) -> Any:
+        """An emitter; that of the last image if it has the same one, for to read a large one takes longer than a frame.
+
+        Lights that are drawn are made so that no kernel is compiled when they move.
+        """
+        if emitter["type"] != "envmap":
+            return movable(emitter) if any(light.draw for light in written_out(self.scene.spec)) else emitter
+        if self._sky is None or self._sky[0] != emitter["filename"]:
+            self._sky = emitter["filename"], mi.load_dict(emitter)
+        state = mi.traverse(self._sky[1])
+        state["scale"], state["to_world"] = emitter["scale"], emitter["to_world"]
+        state.update()
+        return self._sky[1]
 
     def _static_shapes(self) -> dict[str, Any]:
         shapes: dict[str, Any] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -46,6 +47,22 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]
         "to_world": pose @ mi.ScalarTransform4f().scale([0.5 * light.size[0], 0.5 * light.size[1], 1.0]),
         "emitter": {"type": "area", "radiance": _rgb(light.radiance * colour)},
     }
+
+
+def movable(description: dict[str, Any]) -> Any:
+    """An emitter that is somewhere else in every frame: a rectangle is made here, so that kernels do not contain where.
+
+    Its frame is then computed on the device, which may differ in the last bit from one that is a constant of kernels.
+    """
+    if description["type"] != "rectangle":  # of all others nothing but data says where they are
+        return description
+    shape = mi.load_dict(description)
+    state = mi.traverse(shape)
+    pose = state["to_world"]
+    dr.make_opaque(pose)
+    state["to_world"] = pose
+    state.update()
+    return shape
 
 
 def _rgb(value: Float64Array) -> dict[str, Any]:

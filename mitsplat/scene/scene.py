@@ -25,13 +25,14 @@ from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.scene.contents import split_of
 from mitsplat.scene.layout import Layout
+from mitsplat.scene.lights import lights_at, written_out
 from mitsplat.scene.primitives import make_primitives
 from mitsplat.scene.spec import SCHEMA_VERSION, SceneSpec
-from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec, PointLight, SpotLight
+from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
 from mitsplat.scene.spec_objects import PRIMITIVES, ObjectSpec
 from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.untrusted_images import check_image
+from mitsplat.scene.untrusted_images import IMAGES, check_images
 from mitsplat.scene.viewpoints import camera_at, view_of
 from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
@@ -48,7 +49,8 @@ class Scene:
     """A scene file with everything that it refers to.
 
     Attributes:
-        spec: What the file says, its enclosure written out as shapes and patterns of pools as what they match.
+        spec: What the file says, its enclosure written out as shapes, rooms as lights, and patterns of pools as what
+            they match.
         path: The scene file.
         environment: The surroundings, or None.
         assets: Assets of each entry of ``spec.objects`` in turn, in each of its scales, with its class name.
@@ -130,6 +132,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     if not allow_outside:
         _confine(spec, path)
     spec = _matched(spec, path, allow_outside=allow_outside)
+    spec = _matched_images(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     named = _read_named(spec, path)
     _check_images(spec, path, named)
@@ -137,6 +140,8 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         environment = None if named.environment is None else _metric(named.environment)
     assets = _sized_objects(spec, path, named)
     spec, shape_meshes = _walled(spec, named, assets)
+    if (lights := written_out(spec)) != spec.lights:
+        spec = spec.model_copy(update={"lights": lights})
     return Scene(
         spec=spec,
         path=path,
@@ -174,19 +179,28 @@ def _read_named(spec: SceneSpec, path: Path) -> _Named:
     for position, shape in enumerate(spec.shapes):
         with _blaming(path, "shapes", position, "mesh"):
             shape_meshes.append(_shape_mesh(shape, folder))
-    names = [light.image for light in spec.lights if isinstance(light, EnvironmentLight) and light.image is not None]
-    return _Named(environment, assets, tuple(shape_meshes), {name: folder / name for name in names})
+    images = {name: folder / name for _, name in _light_images(spec)}
+    return _Named(environment, assets, tuple(shape_meshes), images)
+
+
+def _light_images(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Key and file of every image that is named for lights."""
+    for position, light in enumerate(spec.lights):
+        if isinstance(light, EnvironmentLight):
+            for number, name in enumerate(light.names):
+                yield ("lights", position, *(("image",) if light.image is not None else ("pool", number))), name
 
 
 def _check_images(spec: SceneSpec, path: Path, named: _Named) -> None:
     """Refuse images of lights that are absent, or that Mitsuba should not be given."""
-    for position, light in enumerate(spec.lights):
-        if isinstance(light, EnvironmentLight) and light.image is not None:
-            image = named.images[light.image]
-            with _blaming(path, "lights", position, "image"):
-                if not image.is_file():
-                    raise InputError(f"{image}: no such file")
-                check_image(image)
+    asked = list(_light_images(spec))
+    for keys, name in asked:
+        with _blaming(path, *keys):
+            if not named.images[name].is_file():
+                raise InputError(f"{named.images[name]}: no such file")
+    for (keys, _), reason in zip(asked, check_images([named.images[name] for _, name in asked]), strict=True):
+        if reason is not None:
+            raise InputError(f"{key_place(path, keys)}: {reason}")
 
 
 def _sized_objects(spec: SceneSpec, path: Path, named: _Named) -> tuple[Asset, ...]:
@@ -245,19 +259,54 @@ def _matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
 
 def _matches(folder: Path, pattern: str, *, allow_outside: bool) -> tuple[str, ...]:
     """Asset folders of objects that a pattern matches, relative to a folder."""
-    absolute = Path(pattern).is_absolute()
-    try:
-        found = sorted(Path("/").glob(pattern.lstrip("/")) if absolute else folder.glob(pattern))
-    except (ValueError, NotImplementedError) as error:
-        raise InputError(f"must be a pattern of folders ({error}; got {pattern!r})") from error
-    named = [path for path in found if (path / ASSET_FILE).is_file()]
-    if not allow_outside:
-        for path in named:
-            _refuse_outside(folder, str(path.absolute()))
-    objects = [path for path in named if read_spec(path).kind == "object"]
+    named = [path for path in _globbed(folder, pattern) if (path / ASSET_FILE).is_file()]
+    objects = [path for path in _inside(folder, named, allow_outside) if read_spec(path).kind == "object"]
     if not objects:
         raise InputError(f"must match at least one folder of an object's asset (got {pattern!r}, which matches none)")
-    return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in objects)
+    return _relative(folder, pattern, objects)
+
+
+def _matched_images(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
+    """The specification with patterns of skies replaced by the images that they match, by name.
+
+    Raises:
+        InputError: If there are none or not as many as weights, or one is a link to where none may be named.
+    """
+    lights = list(spec.lights)
+    for position, light in enumerate(lights):
+        if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
+            with _blaming(path, "lights", position, "pool"):
+                found = [file for file in _globbed(path.parent, light.pool) if file.suffix.lower() in IMAGES]
+                if not found:
+                    raise InputError(f"must match at least one image (got {light.pool!r}, which matches none)")
+                names = _relative(path.parent, light.pool, _inside(path.parent, found, allow_outside))
+            try:
+                light.check_weights(len(names))
+            except FieldError as error:
+                raise InputError(f"{key_place(path, ('lights', position, *error.key))}: {error}") from error
+            lights[position] = light.model_copy(update={"pool": names})
+    return spec.model_copy(update={"lights": tuple(lights)}) if lights != list(spec.lights) else spec
+
+
+def _globbed(folder: Path, pattern: str) -> list[Path]:
+    """What a pattern matches, by name."""
+    try:
+        return sorted(Path("/").glob(pattern.lstrip("/")) if Path(pattern).is_absolute() else folder.glob(pattern))
+    except (ValueError, NotImplementedError) as error:
+        raise InputError(f"must be a pattern of files or folders ({error}; got {pattern!r})") from error
+
+
+def _inside(folder: Path, paths: list[Path], allow_outside: bool) -> list[Path]:
+    """These paths, refused if one leads to where none may be named."""
+    for path in () if allow_outside else paths:
+        _refuse_outside(folder, str(path.absolute()))
+    return paths
+
+
+def _relative(folder: Path, pattern: str, paths: list[Path]) -> tuple[str, ...]:
+    """Paths as a scene file in a folder would name them."""
+    absolute = Path(pattern).is_absolute()
+    return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in paths)
 
 
 def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
@@ -279,7 +328,9 @@ def _confine(spec: SceneSpec, path: Path) -> None:
     patterns = ((i, entry.pool) for i, entry in enumerate(spec.objects))
     named += [(("objects", i, "pool"), pattern) for i, pattern in patterns if isinstance(pattern, str)]
     named += [(("shapes", position, "mesh"), shape.mesh) for position, shape in enumerate(spec.shapes)]
-    named += [(("lights", i, "image"), getattr(light, "image", None)) for i, light in enumerate(spec.lights)]
+    named += _light_images(spec)
+    skies = ((i, getattr(light, "pool", None)) for i, light in enumerate(spec.lights))
+    named += [(("lights", i, "pool"), pattern) for i, pattern in skies if isinstance(pattern, str)]
     for keys, name in named:
         if name is not None:
             with _blaming(path, *keys):
@@ -344,7 +395,7 @@ def plan_frame(scene: Scene, index: int, layout: Layout | None = None) -> FrameP
         split=split_of(number, spec.output.validation),
         camera=here.camera,
         next_camera=view_of(scene, index + 1, layout).camera if view + 1 < spec.output.views else None,
-        lights=tuple(_light_at(spec, position, time, number) for position in range(len(spec.lights))),
+        lights=lights_at(spec, number, index, time),
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))
             for name in _DRAWN
@@ -401,25 +452,3 @@ def _shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
         return read_mesh(folder / str(shape.mesh))
     box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=stated_pose(shape.box))
     return box
-
-
-def _light_at(spec: SceneSpec, position: int, time: float, layout: int) -> LightSpec:
-    """Light ``position`` at ``time`` in [0, 1] of its path, times the layout's random factor."""
-    light = spec.lights[position]
-    strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
-    state: dict[str, Any] = {strength: getattr(light, strength)}
-    if not isinstance(light, EnvironmentLight) and light.path:
-        times = np.linspace(0.0, 1.0, len(light.path))
-        strengths = [key.intensity or state[strength] for key in light.path]
-        positions = np.array([key.position or light.position for key in light.path])
-        state = {
-            strength: float(np.interp(time, times, strengths)),
-            "position": tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3)),
-            "path": (),
-        }
-        if light.temperature is not None:
-            warmth = [1.0 / (key.temperature or light.temperature) for key in light.path]
-            state["temperature"] = float(1.0 / np.interp(time, times, warmth))
-    factors = random_stream(spec.seed, f"light intensity {position}", layout)
-    state[strength] *= float(factors.uniform(*spec.randomise.light_intensity))
-    return light.model_copy(update=state)

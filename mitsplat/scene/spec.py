@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from mitsplat.quality import PresetName
 from mitsplat.scene.spec_camera import CameraSpec
 from mitsplat.scene.spec_image import Composite, Randomise, Rendering
-from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
+from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec_objects import ObjectSpec, Settle
 from mitsplat.scene.spec_shapes import Enclosure, Region, Shape
 from mitsplat.scene.spec_types import StrictModel, Unit
@@ -99,7 +99,7 @@ class SceneSpec(StrictModel):
     enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
     settle: Settle = Field(Settle(), description="How objects come to rest.")
     camera: CameraSpec = Field(description="Where images are taken from.")
-    lights: tuple[LightSpec, ...] = Field((), description="Light sources.")
+    lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
     labels: LabelRules = Field(LabelRules(), description="What is labelled.")
@@ -115,9 +115,13 @@ class SceneSpec(StrictModel):
             if shape.name in seen:
                 raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
             seen.add(shape.name)
-        skies = [position for position, light in enumerate(self.lights) if isinstance(light, EnvironmentLight)]
+        skies = [i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)]
         if len(skies) > 1:
-            raise FieldError(("lights", skies[1], "kind"), "must not be a second environment light")
+            raise FieldError(("lights", skies[1], "kind"), "must not be a second environment light, which rooms have")
+        if self.lights and not any(isinstance(light, RoomLight) or light.sure for light in self.lights):
+            raise FieldError(
+                ("lights", 0, "draw", "count"), "must be at least 1 where no other light is in every frame (got 0)"
+            )
         if self.enclosure is not None and self.enclosure.floor >= self.region.max[2]:
             raise FieldError(
                 ("enclosure", "floor"),

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from mitsplat.scene.spec_types import CountRange, Positive, Scale, StrictModel, Vec3
+from mitsplat.scene.spec_types import CountRange, Positive, Scale, StrictModel, Vec3, check_weights
 from mitsplat.yaml_input import FieldError
 
 Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
@@ -92,8 +92,7 @@ class ObjectSpec(StrictModel):
 
     def check_weights(self, members: int) -> None:
         """Refuse weights of another number than the pool's members."""
-        if self.weights and len(self.weights) != members:
-            raise FieldError("weights", f"must be as many as the pool has assets, {members} (got {len(self.weights)})")
+        check_weights(self.weights, members, "assets")
 
     @property
     def most(self) -> int:

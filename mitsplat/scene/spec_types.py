@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat
+
+from mitsplat.yaml_input import FieldError
+
+Vector = TypeVar("Vector", bound=tuple[float, ...])
 
 
 class StrictModel(BaseModel):
@@ -19,6 +23,19 @@ def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
         raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
     return bounds
+
+
+def _each_ordered(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """Refuse a range of vectors that any component of has its ends swapped."""
+    if any(low > high for low, high in zip(*bounds, strict=True)):
+        raise ValueError(f"must be [low, high] with low <= high in each component (got {json.dumps(bounds)})")
+    return bounds
+
+
+def check_weights(weights: tuple[float, ...], members: int, what: str) -> None:
+    """Refuse weights of another number than the members of the pool that they are of."""
+    if weights and len(weights) != members:
+        raise FieldError("weights", f"must be as many as the pool has {what}, {members} (got {len(weights)})")
 
 
 def _count_range(count: Any) -> Any:
@@ -53,6 +70,8 @@ Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 Range = Annotated[tuple[float, float], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_each_ordered)]
+SizeRange = Annotated[tuple[tuple[Positive, Positive], tuple[Positive, Positive]], AfterValidator(_each_ordered)]
 NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(ordered)]
 CountRange = Annotated[
     tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
@@ -64,7 +83,9 @@ Scale = Annotated[
     BeforeValidator(_scale_range, json_schema_input_type=Positive | tuple[Positive, Positive]),
 ]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
+ElevationRange = Annotated[tuple[Elevation, Elevation], AfterValidator(ordered)]
 Kelvin = Annotated[float, Field(ge=1667, le=25000)]
+KelvinRange = Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)]
 JpegQuality = Annotated[float, Field(ge=1, le=100)]
 EmittedColour = Annotated[
     tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],

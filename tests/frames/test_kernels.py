@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -12,6 +13,7 @@ from mitsplat.frames.frame import Renderer
 from mitsplat.render.layers import render_layers, render_silhouettes
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.spec_lights import AreaLight, EnvironmentLight, LightDraw
 
 WORKCELL = Path(__file__).parents[2] / "scenes/workcell.yaml"
 
@@ -55,3 +57,22 @@ def test_another_layout_compiles_nothing() -> None:
             run, new = compiled(renderer, index, layout)
             assert run > 50
             assert new == 0, f"frame {index}: {new} of {run} kernels"
+
+
+def test_lights_that_are_drawn_compile_nothing() -> None:
+    """Where they are, how large and bright, and how many up to four: once each set of kinds has been seen."""
+    scene = load_scene(WORKCELL)
+    sides = LightDraw(vary="frame", count=(0, 3), distance=(0.5, 1.5), size=((0.1, 0.1), (0.4, 0.2)))
+    lights = (AreaLight(draw=sides), EnvironmentLight(draw=LightDraw(vary="frame", radiance=(0.3, 1.0))))
+    scene = replace(scene, spec=scene.spec.model_copy(update={"lights": lights}))
+    numbers = [len(plan_frame(scene, index).lights) for index in range(40)]
+    layout = strewn(0, [0, 1, 2, 3, 3])
+    with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.flush_kernel_cache()
+        for number in (1, 2):  # the second view of a layout makes what its other views share
+            for _ in range(2):
+                compiled(renderer, numbers.index(number), layout)
+        for number in (1, 2, 3, 4):
+            last = max(index for index, lights in enumerate(numbers) if lights == number)
+            run, new = compiled(renderer, last, layout)
+            assert run > 50 and new == 0, f"{number} lights: {new} of {run} kernels"

@@ -6,7 +6,7 @@ import errno
 import os
 import shutil
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,14 @@ from mitsplat.errors import InputError, MissingResourceError
 Record = dict[str, Any]
 """The line of one frame in ``manifest.jsonl``."""
 
-SPLITS = ("train", "val")
+SPLITS = ("train", "val", "test")
+"""A dataset has the last one if its scene asks for it."""
+
+
+def splits_of(output: Mapping[str, Any]) -> tuple[str, ...]:
+    """Splits of a dataset whose scene says this as ``output``."""
+    return SPLITS if output.get("test") else SPLITS[:2]
+
 
 IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError)
 """What Pillow raises on damaged images, and on those of more pixels than a file should hold."""

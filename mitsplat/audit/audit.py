@@ -33,7 +33,7 @@ from mitsplat.audit.scene import SceneReader
 from mitsplat.audit.truth import TrueFrame
 from mitsplat.content_hash import file_hash
 from mitsplat.dataset.schema import Records, read_content
-from mitsplat.files import SPLITS, Record
+from mitsplat.files import SPLITS, Record, splits_of
 
 _SHARE = 1e-5
 """Difference of shares that are stored with six decimals."""
@@ -116,11 +116,12 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
 
 def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
     """What reads the files that describe all frames, and what compares frames with each other and the scene."""
+    splits = splits_of(content["scene"]["output"])
     make: dict[str, Callable[[], list[Reader]]] = {
-        "coco": lambda: [InstancesReader(root, content, "instances", split) for split in SPLITS],
-        "amodal": lambda: [InstancesReader(root, content, "amodal", split) for split in SPLITS],
-        "panoptic": lambda: [PanopticReader(root, content, split) for split in SPLITS],
-        "poses": lambda: [PosesReader(root, content, split) for split in SPLITS],
+        "coco": lambda: [InstancesReader(root, content, "instances", split) for split in splits],
+        "amodal": lambda: [InstancesReader(root, content, "amodal", split) for split in splits],
+        "panoptic": lambda: [PanopticReader(root, content, split) for split in splits],
+        "poses": lambda: [PosesReader(root, content, split) for split in splits],
         "voc": lambda: [VocReader(root, content)],
         "label-studio": lambda: [ConfigReader(root, content)],
         "bop": lambda: [BopReader(root, content)],
@@ -208,7 +209,7 @@ class _Whole:
 
     def add(self, record: Record) -> list[tuple[str, str]]:
         """Remember a frame; what is wrong if it has a line already."""
-        self._splits.append(2 * record["layout"] + SPLITS.index(record["split"]))
+        self._splits.append(len(SPLITS) * record["layout"] + SPLITS.index(record["split"]))
         self._pictures.append(_picture(record) or 0)
         repeated = record["index"] == self._last
         self._last = record["index"]
@@ -216,9 +217,11 @@ class _Whole:
 
     def check(self, records: Records) -> Violations:
         """What follows from all frames."""
-        layouts = np.unique(np.array(self._splits, dtype=np.uint64)) // 2
-        for layout in layouts[1:][layouts[1:] == layouts[:-1]]:
-            yield "manifest.jsonl", f"views of layout {layout} are in both {' and '.join(SPLITS)}"
+        places = np.unique(np.array(self._splits, dtype=np.uint64)).astype(np.int64)
+        layouts = places // len(SPLITS)
+        for layout in np.unique(layouts[1:][layouts[1:] == layouts[:-1]]):
+            found = [SPLITS[place % len(SPLITS)] for place in places[layouts == layout]]
+            yield "manifest.jsonl", f"views of layout {layout} are in both {' and '.join(found)}"
         pictures, counts = np.unique(np.array(self._pictures, dtype=np.uint64), return_counts=True)
         same = {int(picture) for picture in pictures[counts > 1]} - {0}
         first: dict[int, str] = {}

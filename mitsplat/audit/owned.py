@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from array import array
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mitsplat.audit.read_back import Violations
-from mitsplat.files import SPLITS, Record
+from mitsplat.files import Record, splits_of
 
 YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
 """Where Ultralytics' tasks have their folders: labels lie beside the images that they are of."""
@@ -23,6 +24,7 @@ _FOLDERS = (
     *("panoptic", "voc", "label-studio", "bop", "colmap", "depth", "normals", "instances", "semantic", "flow"),
 )
 """Folders that hold nothing else than a dataset's files."""
+_FOLD = re.compile(r"fold[0-9]+(_train|_val)?\.(txt|yaml)")
 
 
 def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]:
@@ -77,6 +79,7 @@ class Owned:
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._formats = content["scene"]["output"]["formats"]
+        self._splits = splits_of(content["scene"]["output"])
         self._models = labelled_assets(content)
         self._names = array("Q")
         self._last = ("", -1)
@@ -87,10 +90,10 @@ class Owned:
         """Files that describe all frames."""
         for name, described in _ANNOTATIONS.items():
             if name in self._formats:
-                yield from (f"annotations/{described}_{split}.json" for split in SPLITS)
+                yield from (f"annotations/{described}_{split}.json" for split in self._splits)
         yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in self._formats)
         if "voc" in self._formats:
-            yield from ("voc/labelmap.txt", *(f"voc/ImageSets/Main/{split}.txt" for split in SPLITS))
+            yield from ("voc/labelmap.txt", *(f"voc/ImageSets/Main/{split}.txt" for split in self._splits))
         if "label-studio" in self._formats:
             yield "label-studio/config.xml"
         if "bop" in self._formats:
@@ -121,11 +124,11 @@ class Owned:
         for top in sorted(_FOLDERS):
             for folder, folders, names in os.walk(root / top):
                 folders.sort()
-                # Ultralytics leaves a cache of what it read beside the labels.
+                # Ultralytics leaves a cache of what it read beside the labels; folds are lists of what is checked.
                 files = [
                     (Path(folder) / name).relative_to(root).as_posix()
                     for name in sorted(names)
-                    if name != ".lock" and not name.endswith(".cache")
+                    if name != ".lock" and not name.endswith(".cache") and not _FOLD.match(name)
                 ]
                 hashes = np.array([_hash(file) for file in files], dtype=np.uint64)
                 found = np.searchsorted(known, hashes, side="right") > np.searchsorted(known, hashes)

@@ -22,6 +22,7 @@ class SceneReader:
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._camera, self._output = content["scene"]["camera"], content["scene"]["output"]
         self._distractors = set(content.get("distractors", ()))
+        self._held_out = _held_out(content["scene"])
 
     def check(self, frame: TrueFrame) -> Violations:
         """Whether the frame's camera can be one of the scene's, and its labels are of what is labelled."""
@@ -36,6 +37,8 @@ class SceneReader:
         drawn = frame.record.get("objects")
         for label in frame.instances:
             asset = label.entry["asset"]
+            if asset in self._held_out and frame.split != "test":
+                yield f"{label.name} is of an asset that is held out for the test split"
             if asset in self._distractors:
                 yield f"{label.name} is labelled, though the scene says that it is not"
             if drawn is not None and not any(
@@ -93,3 +96,16 @@ class SceneReader:
         beside = float(np.linalg.norm(np.cross(axis, offset)))
         if beside > room or (axis @ offset > 0 and high > room):
             yield f"its camera looks past the scene's target by {beside:.3g} m"
+
+
+def _held_out(scene: Mapping[str, Any]) -> set[int]:
+    """Positions, among the assets of a scene's objects in turn, of those that only the test split may have."""
+    names = set(scene.get("hold_out", {}).get("assets", ()))
+    found, position = set[int](), 0
+    for entry in scene.get("objects", ()) if names else ():
+        pool = [f"primitives {n}" for n in range(15)] if entry.get("pool") == "primitives" else entry.get("pool")
+        sizes = 5 if isinstance(entry["scale"], list) and entry["scale"][0] < entry["scale"][1] else 1
+        for name in pool or [entry["asset"]]:
+            found.update(range(position, position + sizes) if name in names else ())
+            position += sizes
+    return found

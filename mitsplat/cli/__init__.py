@@ -29,6 +29,7 @@ app = typer.Typer(
 for _command in (
     datasets.render,
     datasets.merge,
+    datasets.split,
     datasets.chart,
     datasets.audit,
     datasets.report,

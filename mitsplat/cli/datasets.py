@@ -206,6 +206,21 @@ def merge(
     _tell_dataset(summary)
 
 
+def split(
+    dataset: DatasetFolder,
+    folds: Annotated[int, typer.Option(help="How many; each validates with another part of the layouts.")] = 5,
+) -> None:
+    """List the images of DATASET for cross-validation.
+
+    Layouts stay whole, classes are spread evenly over the folds as far as that allows, and the test split is left out.
+    """
+    from mitsplat.dataset.folds import write_folds
+
+    for number, fold in enumerate(write_folds(dataset, folds), start=1):
+        counts = _counts(fold.instances)
+        typer.echo(f"fold{number}: validates with {fold.images} images of {fold.layouts} layouts ({counts})")
+
+
 def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
     """Say what a dataset holds; without any label it is not what was asked for, unless it is a part of one."""
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())

@@ -7,8 +7,18 @@ same bytes. Scenes that can come to nothing are refused before work starts (:mod
 from __future__ import annotations
 
 from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.folds import Fold, write_folds
 from mitsplat.dataset.remake import RemadeFrame, remake_frame
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 
-__all__ = ["DatasetSummary", "RemadeFrame", "Shard", "merge_shards", "remake_frame", "write_dataset"]
+__all__ = [
+    "DatasetSummary",
+    "Fold",
+    "RemadeFrame",
+    "Shard",
+    "merge_shards",
+    "remake_frame",
+    "write_dataset",
+    "write_folds",
+]

@@ -41,7 +41,7 @@ _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part
 """Names of what may be in a folder before ``dataset.json`` is."""
 _ENTRIES = (
     *(entry for format in TABLE.values() for entry in format.entries),
-    *("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
+    *("images", "layouts", "scene", "folds", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
 )
 
 
@@ -279,8 +279,12 @@ def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[s
 
 def _remove_dataset(out: Path) -> None:
     """Remove what mitsplat writes and nothing else; its mark last, so that an interruption can be repeated."""
-    for name in _ENTRIES:
-        entry = out / name
+    for entry in (
+        *(out / name for name in _ENTRIES),
+        *out.glob("fold[0-9]*_train.txt"),
+        *out.glob("fold[0-9]*_val.txt"),
+    ):
+        name = entry.name
         if entry.is_dir() and not entry.is_symlink():
             shutil.rmtree(entry)
         elif name not in (LOCK, CONTENT):

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mitsplat.camera import Camera, Lens
 from mitsplat.dataset.manifest import parse_line
 from mitsplat.errors import InputError
-from mitsplat.files import Record
+from mitsplat.files import Record, splits_of
 from mitsplat.format_version import FORMAT_VERSIONS, check_format_version
 from mitsplat.scene.spec import LabelRules, Output
 from mitsplat.scene.spec_camera import CameraSpec
@@ -144,7 +144,7 @@ class _Record(_Stored):
     index: Count
     layout: Count
     view: Count
-    split: Literal["train", "val"]
+    split: Literal["train", "val", "test"]
     files: dict[str, str]
     lights: list[_Light] = []
     camera: _Camera
@@ -251,6 +251,8 @@ def _check_record(record: Record, content: dict[str, Any]) -> None:
     """
     if not any(file.startswith("images/") for file in record["files"]):
         raise ValueError("files must list the frame's image")
+    if record["split"] not in splits_of(content["scene"]["output"]):
+        raise ValueError(f"split must be among the dataset's (got {record['split']})")
     camera = record["camera"]
     Camera.from_json(camera)  # refuses what is none
     if record["labels"]["size"] != [camera["width"], camera["height"]]:

@@ -213,7 +213,7 @@ class FrameCounts:
             path=out,
             frames=self.images.total(),
             rendered=rendered,
-            images={split: self.images[split] for split in SPLITS},
+            images={split: self.images[split] for split in SPLITS if split != "test" or self.images[split]},
             instances=dict(sorted(self.instances.items())),
             dropped=dict(self.dropped),
             marked=dict(sorted(self.marked.items())),

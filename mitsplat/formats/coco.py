@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
-from mitsplat.files import SPLITS, Record
+from mitsplat.files import Record
 from mitsplat.formats.format import Catalogue, Describer, FrameFiles
 from mitsplat.json_stream import ListsFile
 from mitsplat.labels.labels import UNLABELLED, Labels
@@ -101,19 +101,30 @@ def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
 
 
 class InstancesWriter:
-    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``."""
+    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``.
+
+    Names of images are without folders, which are those of the file's split, unless ``folders`` is set: then they are
+    relative to ``images/``.
+    """
 
     def __init__(
-        self, path: Path, class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]], *, amodal: bool
+        self,
+        path: Path,
+        class_names: Sequence[str],
+        keypoint_names: Sequence[Sequence[str]],
+        *,
+        amodal: bool = False,
+        folders: bool = False,
     ) -> None:
         self.file = ListsFile(
             path, ("images", "annotations"), after={"categories": _categories(class_names, keypoint_names)}
         )
-        self._keypoint_names, self._amodal = keypoint_names, amodal
+        self._keypoint_names, self._amodal, self._folders = keypoint_names, amodal, folders
 
     def add(self, record: Record) -> None:
         """Describe a frame."""
-        self.file.append("images", _image(record))
+        name = {"file_name": image_file(record).removeprefix("images/")} if self._folders else {}
+        self.file.append("images", _image(record) | name)
         first = self.file.count("annotations") + 1
         for annotation in annotations_of(record, self._keypoint_names, first=first, amodal=self._amodal):
             self.file.append("annotations", annotation)
@@ -155,8 +166,8 @@ class _OfSplit(Protocol):
 class _OfSplits:
     """A file of annotations for each split."""
 
-    def __init__(self, root: Path, name: str, make: Callable[[Path], _OfSplit]) -> None:
-        self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in SPLITS}
+    def __init__(self, root: Path, name: str, catalogue: Catalogue, make: Callable[[Path], _OfSplit]) -> None:
+        self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in catalogue.splits}
 
     def add(self, record: Record) -> None:
         self._writers[record["split"]].add(record)
@@ -174,18 +185,18 @@ def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False
     """Writes ``instances_<split>.json``, or ``amodal_<split>.json``."""
     names = catalogue.class_names, catalogue.keypoint_names
     return _OfSplits(
-        root, "amodal" if amodal else "instances", lambda path: InstancesWriter(path, *names, amodal=amodal)
+        root, "amodal" if amodal else "instances", catalogue, lambda path: InstancesWriter(path, *names, amodal=amodal)
     )
 
 
 def describe_panoptic(root: Path, catalogue: Catalogue) -> Describer:
     """Writes ``panoptic_<split>.json``."""
-    return _OfSplits(root, "panoptic", lambda path: PanopticWriter(path, catalogue.class_names))
+    return _OfSplits(root, "panoptic", catalogue, lambda path: PanopticWriter(path, catalogue.class_names))
 
 
 def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
     """Writes ``poses_<split>.json``."""
-    return _OfSplits(root, "poses", lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets))
+    return _OfSplits(root, "poses", catalogue, lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets))
 
 
 def write_panoptic(files: FrameFiles) -> None:

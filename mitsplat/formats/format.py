@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.errors import InputError
-from mitsplat.files import Record, link_file, write_file
+from mitsplat.files import SPLITS, Record, link_file, splits_of, write_file
 from mitsplat.formats import maps
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class Catalogue:
         meshes: Their proxy meshes [m].
         distractors: Positions of the assets that are in no label.
         drawn: Of a scene that draws its objects, what the manifest states of an instance of each asset; else empty.
+        splits: Names of the dataset's splits.
     """
 
     class_names: Sequence[str]
@@ -41,6 +42,7 @@ class Catalogue:
     meshes: Sequence[trimesh.Trimesh]
     distractors: Sequence[int] = ()
     drawn: Sequence[Mapping[str, Any]] = ()
+    splits: Sequence[str] = SPLITS[:2]
 
     @classmethod
     def of(cls, scene: Scene) -> Catalogue:
@@ -73,7 +75,8 @@ class Catalogue:
         meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
         distractors = [position for position, kind in enumerate(kinds) if kind is None]
         assets = [asset.name for asset in scene.assets]
-        return cls(scene.class_names, keypoint_names, assets, meshes, distractors, _drawn(scene))
+        splits = splits_of(scene.spec.output.model_dump())
+        return cls(scene.class_names, keypoint_names, assets, meshes, distractors, _drawn(scene), splits)
 
     @property
     def num_keypoints(self) -> int:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
-from mitsplat.files import SPLITS, GrowingFile, Record
+from mitsplat.files import GrowingFile, Record
 from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.labels.labels import InstanceLabel, Labels
 
@@ -65,7 +65,7 @@ class SetsWriter:
     """Writes which images belong to which split, and what classes there are."""
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
-        self._files = {split: GrowingFile(root / f"voc/ImageSets/Main/{split}.txt") for split in SPLITS}
+        self._files = {split: GrowingFile(root / f"voc/ImageSets/Main/{split}.txt") for split in catalogue.splits}
         self._classes = GrowingFile(root / "voc/labelmap.txt")
         names = ("background", *catalogue.class_names)
         self._classes.write("".join(["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in names)]))

@@ -103,11 +103,16 @@ def data_yaml(
     present = [split for split in SPLITS if split in splits]
     lines = ["# Paths are relative to this file."]
     for split in SPLITS:
-        if split in present or not present:
+        if split in present or (not present and split != "test"):
             lines.append(f"{split}: images/{split}")
-        else:
+        elif split != "test":
             lines.append(f"{split}: images/{present[0]} # there are no images for {split}; Ultralytics wants some")
-    lines += ["names:", *(f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names))]
+    return "\n".join(lines) + "\n" + names_yaml(class_names, keypoint_names)
+
+
+def names_yaml(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]] | None = None) -> str:
+    """What a description says of classes, and of the keypoints of every class for ``yolo-pose``."""
+    lines = ["names:", *(f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names))]
     if keypoint_names is not None:
         count = max(map(len, keypoint_names), default=0)
         lines += [f"kpt_shape: [{count}, 3]", "kpt_names:"]

@@ -134,8 +134,8 @@ def _scene_hash(scene: Scene) -> str:
         digest.add((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
-    if spec.empty or any(entry.balance for entry in spec.objects):  # which depend on a layout's split
-        add(spec.empty, spec.output.validation)
+    if spec.empty or spec.hold_out.assets or any(entry.balance for entry in spec.objects):  # which depend on splits
+        add(spec.empty, spec.output.validation, spec.output.test, spec.hold_out.assets)
     for mesh in scene.shape_meshes:
         add_mesh(mesh)
     surroundings = [scene.environment] if spec.environment_collides and scene.environment is not None else []

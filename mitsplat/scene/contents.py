@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.files import SPLITS
 from mitsplat.scene.spec import SceneSpec
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import stated_pose
@@ -21,27 +22,45 @@ if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
 
 
-def split_of(layout: int, validation: float) -> Literal["train", "val"]:
+Split = Literal["train", "val", "test"]
+
+
+def split_of(layout: int, validation: float, test: float = 0.0) -> Split:
     """Split of a layout, the same however many follow it: the second layout is the first of the smaller split.
 
-    Among the first n layouts, floor(1 + (n - 2) share) belong to the smaller split.
+    Of n layouts, floor(1 + (n - 2) share) belong to the smaller of two splits. With a test split, the layouts are first
+    parted into that and the others, and these likewise into training and validation.
     """
-    after, before = _in_smaller_split(layout + 1, validation), _in_smaller_split(layout, validation)
-    return "val" if (after > before) == (validation <= 0.5) else "train"
+    return _place_in_split(layout, validation, test)[0]
 
 
-def _in_smaller_split(layouts: int, validation: float) -> int:
-    """How many of the first layouts are in the smaller split, but for a constant."""
-    return math.floor(1.0 + (layouts - 2) * min(validation, 1.0 - validation))
+def _place_in_split(layout: int, validation: float, test: float) -> tuple[Split, int]:
+    """Split of a layout, and how many earlier ones are in it."""
+    if test:
+        apart, layout = _parted(layout, test)
+        if apart:
+            return "test", layout
+        validation = min(1.0, validation / (1.0 - test))
+    apart, rank = _parted(layout, validation)
+    return "val" if apart else "train", rank
+
+
+def _parted(number: int, share: float) -> tuple[bool, int]:
+    """Whether a number from 0 is among the share that is taken of all, and how many smaller ones are on its side."""
+
+    def taken(count: int) -> int:
+        """How many of the first numbers are on the smaller side, but for a constant."""
+        return math.floor(1.0 + (count - 2) * min(share, 1.0 - share))
+
+    smaller, before = taken(number + 1) > taken(number), taken(number) - taken(0)
+    return smaller == (share <= 0.5), before if smaller else number - before
 
 
 def is_empty(spec: SceneSpec, layout: int) -> bool:
     """Whether nothing that is labelled lies in a layout: evenly spread over the layouts of each split."""
     if not spec.empty:
         return False
-    split = split_of(layout, spec.output.validation)
-    smaller = _in_smaller_split(layout, spec.output.validation) - _in_smaller_split(0, spec.output.validation)
-    rank = smaller if (split == "val") == (spec.output.validation <= 0.5) else layout - smaller
+    split, rank = _place_in_split(layout, spec.output.validation, spec.output.test)
     phase = _phase(spec.seed, split)
     return math.floor((rank + 1) * spec.empty + phase) > math.floor(rank * spec.empty + phase)
 
@@ -68,11 +87,18 @@ def _counts(spec: SceneSpec, layout: int) -> list[int]:
     """How many objects of each entry a layout has."""
     counts = random_stream(spec.seed, "object counts", layout)
     drawn = [(len(entry.poses), int(counts.integers(*entry.count, endpoint=True))) for entry in spec.objects]
-    empty = is_empty(spec, layout)
+    empty, held_out = is_empty(spec, layout), _held_out(spec, layout)
     return [
-        0 if empty and entry.label else given or count
+        0 if (empty and entry.label) or held_out.issuperset(entry.names) else given or count
         for entry, (given, count) in zip(spec.objects, drawn, strict=True)
     ]
+
+
+def _held_out(spec: SceneSpec, layout: int) -> frozenset[str]:
+    """Names of assets that a layout must not have, because they are for the test split alone."""
+    if not spec.hold_out.assets or split_of(layout, spec.output.validation, spec.output.test) == "test":
+        return frozenset()
+    return frozenset(spec.hold_out.assets)
 
 
 def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[int]:
@@ -80,13 +106,18 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
     spec, entry, pool = scene.spec, scene.spec.objects[position], scene.pools[position]
     if len(pool) == 1:
         return [pool[0]] * count
-    weights = np.repeat(entry.weights or np.ones(len(pool) // len(entry.scales)), len(entry.scales))
+    if not count:
+        return []
+    held_out = _held_out(spec, layout)
+    allowed = [name not in held_out for name in entry.names]
+    weights = np.repeat(np.multiply(entry.weights or np.ones(len(allowed)), allowed), len(entry.scales))
     rng = random_stream(spec.seed, f"object pool {position}", layout)
     if not entry.balance:
         return [pool[i] for i in rng.choice(len(pool), count, p=weights / weights.sum())]
     members = defaultdict[str, list[int]](list)
     for i, asset in enumerate(pool):
-        members[scene.assets[asset].class_name].append(i)
+        if weights[i]:
+            members[scene.assets[asset].class_name].append(i)
     names = sorted(members)
     drawn = []
     for kind in _dealt(spec, position, layout, count, len(names)):
@@ -98,7 +129,7 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
 
 def _dealt(spec: SceneSpec, position: int, layout: int, count: int, kinds: int) -> list[int]:
     """Classes of a layout's objects, from decks of one card for each class that are dealt out to a split's layouts."""
-    split = split_of(layout, spec.output.validation)
+    split = split_of(layout, spec.output.validation, spec.output.test)
     known = max(layout + 1, min(1 << layout.bit_length(), spec.output.layouts))
     first = int(_dealt_before(spec, position, known)[layout])
     decks = {
@@ -111,10 +142,10 @@ def _dealt(spec: SceneSpec, position: int, layout: int, count: int, kinds: int) 
 @lru_cache(maxsize=8)
 def _dealt_before(spec: SceneSpec, position: int, layouts: int) -> Int64Array:
     """How many objects of an entry the earlier layouts of its split have, for each of the first layouts."""
-    totals = {"train": 0, "val": 0}
+    totals = dict.fromkeys(SPLITS, 0)
     before = np.zeros(layouts, dtype=np.int64)
     for layout in range(layouts):
-        split = split_of(layout, spec.output.validation)
+        split = split_of(layout, spec.output.validation, spec.output.test)
         before[layout] = totals[split]
         totals[split] += _counts(spec, layout)[position]
     return before

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, Literal, SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 import trimesh
@@ -23,7 +23,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
-from mitsplat.scene.contents import split_of
+from mitsplat.scene.contents import Split, split_of
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import lights_at, written_out
 from mitsplat.scene.primitives import make_primitives
@@ -106,7 +106,7 @@ class FramePlan:
     index: int
     layout: int
     view: int
-    split: Literal["train", "val"]
+    split: Split
     camera: Camera
     next_camera: Camera | None
     lights: tuple[LightSpec, ...]
@@ -134,6 +134,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     spec = _matched(spec, path, allow_outside=allow_outside)
     spec = _matched_images(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
+    _check_held_out(spec, path)
     named = _read_named(spec, path)
     _check_images(spec, path, named)
     with _blaming(path, "environment"):
@@ -351,6 +352,15 @@ def _check_lens(spec: SceneSpec, path: Path) -> None:
             raise InputError(str(error)) from error
 
 
+def _check_held_out(spec: SceneSpec, path: Path) -> None:
+    """Refuse to hold out what no entry of objects names."""
+    named = {name for _, name, _ in _object_assets(spec)}
+    for number, name in enumerate(spec.hold_out.assets):
+        if name not in named:
+            place = key_place(path, ("hold_out", "assets", number))
+            raise InputError(f"{place}: must be among the assets of objects, {', '.join(sorted(named))} (got {name})")
+
+
 def whole(index: SupportsIndex, name: str) -> int:
     """An index that an integer of any kind gives.
 
@@ -392,7 +402,7 @@ def plan_frame(scene: Scene, index: int, layout: Layout | None = None) -> FrameP
         index=index,
         layout=number,
         view=view,
-        split=split_of(number, spec.output.validation),
+        split=split_of(number, spec.output.validation, spec.output.test),
         camera=here.camera,
         next_camera=view_of(scene, index + 1, layout).camera if view + 1 < spec.output.views else None,
         lights=lights_at(spec, number, index, time),

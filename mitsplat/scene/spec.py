@@ -60,6 +60,28 @@ class Output(StrictModel):
     validation: Unit = Field(
         0.2, description="Share of layouts for validation; the second layout is the first of the smaller split."
     )
+    test: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        exclude_if=lambda test: test == 0,
+        description="Share of layouts for a test split; the second layout is its first, and the others are parted into "
+        "training and validation.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Output:
+        if self.validation + self.test > 1 + 1e-9:
+            raise FieldError("test", f"must be at most 1 - validation, {1 - self.validation:g} (got {self.test:g})")
+        return self
+
+
+class HoldOut(StrictModel):
+    """What a detector must meet in the test split for the first time."""
+
+    assets: tuple[str, ...] = Field(
+        (), description="Asset folders of objects, as ``objects`` names them, that no other split has."
+    )
 
 
 class LabelRules(StrictModel):
@@ -104,6 +126,11 @@ class SceneSpec(StrictModel):
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
     labels: LabelRules = Field(LabelRules(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
+    hold_out: HoldOut = Field(
+        HoldOut(),
+        exclude_if=lambda held: held == HoldOut(),
+        description="What is in the test split alone.",
+    )
     quality: PresetName = Field("balanced", description="Rendering preset.")
     rendering: Rendering = Field(Rendering(), description="How splats are drawn.")
     seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
@@ -122,6 +149,8 @@ class SceneSpec(StrictModel):
             raise FieldError(
                 ("lights", 0, "draw", "count"), "must be at least 1 where no other light is in every frame (got 0)"
             )
+        if self.hold_out != HoldOut() and not self.output.test:
+            raise FieldError("hold_out", "needs a test split: give output.test")
         if self.enclosure is not None and self.enclosure.floor >= self.region.max[2]:
             raise FieldError(
                 ("enclosure", "floor"),

@@ -401,7 +401,8 @@ def test_a_damaged_manifest_is_found(dataset: Path) -> None:
         (("environment",), None, "environment must be a segment"),
         (("depth_scale",), None, "depth_scale must be stated"),
         (("files",), {}, "files must list the frame's image"),
-        (("split",), "test", "split: Input should be 'train' or 'val'"),
+        (("split",), "test", "split must be among the dataset's (got test)"),
+        (("split",), "exam", "split: Input should be 'train', 'val' or 'test'"),
     ],
 )
 def test_a_record_that_nothing_can_rely_on_is_one_violation(

@@ -138,7 +138,7 @@ class TestContent:
         for record in Manifest(tmp_path / "out/manifest.jsonl"):
             splits.setdefault(record["layout"], set()).add(record["split"])
         assert all(len(found) == 1 for found in splits.values())
-        assert {split for found in splits.values() for split in found} == set(SPLITS)
+        assert {split for found in splits.values() for split in found} == set(SPLITS[:2])
 
     def test_images_are_the_pixels_that_were_rendered(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
@@ -167,7 +167,7 @@ class TestContent:
 
     def test_coco_reads_back_the_masks(self, scene, tmp_path, capsys):
         write(scene, tmp_path / "out")
-        for split in SPLITS:
+        for split in SPLITS[:2]:
             coco = COCO(tmp_path / f"out/annotations/instances_{split}.json")
             records = {record["index"]: record for record in Manifest(tmp_path / "out/manifest.jsonl")}
             assert sorted(coco.imgs) == [index for index, record in records.items() if record["split"] == split]

@@ -135,3 +135,65 @@ def test_a_range_of_scales_is_sizes_of_their_own(scene_data: SceneData, write_sc
         assert asset.pieces[0].extents.max() == pytest.approx(edge * factor)
         assert abs(asset.splats.means).max() == pytest.approx(edge * factor / 2)
     assert {asset for index in range(60) for asset in draw_objects(scene, index)[0]} == set(range(10))
+
+
+@pytest.mark.parametrize(("validation", "test"), [(0.2, 0.1), (0.25, 0.25), (0.0, 0.3), (0.7, 0.3), (0.1, 0.6)])
+def test_three_splits_have_their_shares(validation: float, test: float) -> None:
+    """However many layouts there are: never off by more than one for each of the two partings."""
+    splits = [split_of(layout, validation, test) for layout in range(500)]
+    assert splits[1 if test <= 0.5 else 0] == "test"
+    for count in (10, 37, 500):
+        shares = {"train": 1 - validation - test, "val": validation, "test": test}
+        for name, share in shares.items():
+            assert abs(splits[:count].count(name) - share * count) < 2, (name, count)
+    assert [split_of(layout, validation) for layout in range(500)] == [split_of(i, validation, 0.0) for i in range(500)]
+
+
+def test_each_of_three_splits_is_balanced_and_has_its_empty_layouts(
+    pool_of_four: SceneData, write_scene: WriteScene
+) -> None:
+    pool_of_four["objects"][0]["balance"] = True
+    pool_of_four["output"] |= {"validation": 0.2, "test": 0.2}
+    scene = load_scene(write_scene(pool_of_four | {"empty": 0.25}))
+    splits = {index: split_of(index, 0.2, 0.2) for index in range(200)}
+    for split in ("train", "val", "test"):
+        layouts = [index for index in splits if splits[index] == split]
+        counts = Counter(scene.assets[a].class_name for index in layouts for a in draw_objects(scene, index)[0])
+        assert len(counts) == 3 and max(counts.values()) - min(counts.values()) <= 1
+        assert abs(sum(is_empty(scene.spec, index) for index in layouts) - len(layouts) / 4) <= 1
+
+
+@pytest.mark.parametrize("balance", [False, True])
+def test_what_is_held_out_is_in_the_test_split_alone(
+    pool_of_four: SceneData, write_scene: WriteScene, balance: bool
+) -> None:
+    """Members of pools, and entries of their own, which then have nothing to draw; the number of others stays."""
+    pool_of_four["objects"] = [pool_of_four["objects"][0] | {"balance": balance}, {"asset": "assets/pin", "count": 2}]
+    pool_of_four["output"] |= {"test": 0.25}
+    plain = load_scene(write_scene(pool_of_four))
+    scene = load_scene(write_scene(pool_of_four | {"hold_out": {"assets": ["assets/pin", "assets/other_nut"]}}))
+    seen: dict[bool, set[str]] = {True: set(), False: set()}
+    for index in range(200):
+        is_test = split_of(index, 0.25, 0.25) == "test"
+        names = drawn(scene, index)
+        seen[is_test] |= set(names)
+        assert len(drawn(plain, index)) - len(names) == (0 if is_test else 2)
+    assert seen == {True: {"nut", "other_nut", "bolt", "pin"}, False: {"nut", "bolt"}}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"hold_out": {"assets": ["assets/nut"]}}, r"hold_out: needs a test split: give output\.test"),
+        (
+            {"hold_out": {"assets": ["assets/nail"]}, "output": {"test": 0.1}},
+            r"hold_out\.assets\[0\]: must be among the assets of objects, assets/bolt, assets/nut \(got assets/nail\)",
+        ),
+        ({"output": {"validation": 0.5, "test": 0.6}}, r"test: must be at most 1 - validation, 0\.5 \(got 0\.6\)"),
+    ],
+)
+def test_splits_that_cannot_be_are_refused(
+    scene_data: SceneData, write_scene: WriteScene, change: SceneData, sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        load_scene(write_scene(scene_data | change))

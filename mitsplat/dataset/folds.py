@@ -1,0 +1,136 @@
+"""Lists of a finished dataset's images for cross-validation: in each of k folds, another k-th of them validates.
+
+::
+
+    fold1_train.txt, fold1_val.txt, fold2_train.txt, ...        images, as ./images/train/000000.png
+    folds/fold1.yaml                                            for Ultralytics; other tasks have both in their folders
+    folds/fold1_train.json, fold1_val.json                      COCO's, if the dataset has it; names are below images/
+
+Folds part layouts, because views of one layout show the same objects in the same places, and leave out the test split.
+Ultralytics takes paths that begin with ``./`` from the list's own folder, so that lists lie beside ``images/``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from mitsplat.dataset.folder import open_finished
+from mitsplat.dataset.schema import read_content
+from mitsplat.errors import InputError
+from mitsplat.files import GrowingFile, storage_errors, write_text
+from mitsplat.formats.coco import InstancesWriter, image_file
+from mitsplat.formats.yolo import TASKS, names_yaml
+from mitsplat.json_stream import ListsFile
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What validates in one fold.
+
+    Attributes:
+        layouts: How many layouts.
+        images: How many images of them.
+        instances: Labelled instances by class.
+    """
+
+    layouts: int
+    images: int
+    instances: dict[str, int]
+
+
+def write_folds(root: str | Path, folds: int) -> list[Fold]:
+    """Write the lists of a dataset's images for cross-validation.
+
+    Args:
+        root: The dataset, which nobody is writing.
+        folds: How many; layouts of each class are evenly spread over them as far as whole layouts allow.
+
+    Raises:
+        InputError: If it is no dataset, is being written, or has fewer layouts than folds.
+    """
+    root = Path(root)
+    content = read_content(root)
+    formats = content["scene"]["output"]["formats"]
+    classes, keypoints = content["classes"], content["keypoints"]
+    tasks = [task for task in TASKS if task in formats]
+    with open_finished(root) as records, storage_errors(root), ExitStack() as undone:
+        layouts: defaultdict[int, Counter[str]] = defaultdict(Counter)
+        images = Counter[int]()
+        for record in records:
+            if record["split"] != "test":
+                layouts[record["layout"]].update(label["class"] for label in record["labels"]["instances"])
+                images[record["layout"]] += 1
+        if not 2 <= folds <= len(layouts):
+            raise InputError(f"folds must be 2 to {len(layouts)}, the layouts of {root} (got {folds})")
+        fold_of = assign_folds(layouts, folds)
+        names = [f"fold{fold + 1}" for fold in range(folds)]
+        folders = [TASKS[task].folder for task in tasks if TASKS[task].folder]
+        lists = {
+            (name, split): [GrowingFile(root / f"{folder}{name}_{split}.txt") for folder in ("", *folders)]
+            for name in names
+            for split in ("train", "val")
+        }
+        described = {
+            key: InstancesWriter(root / f"folds/{key[0]}_{key[1]}.json", classes, keypoints, folders=True)
+            for key in (lists if "coco" in formats else ())
+        }
+        files: list[GrowingFile | ListsFile] = [file for found in lists.values() for file in found]
+        files += [writer.file for writer in described.values()]
+        for file in files:
+            undone.callback(file.discard)
+        for record in records:
+            for fold, name in enumerate(names) if record["split"] != "test" else ():
+                key = name, "val" if fold_of[record["layout"]] == fold else "train"
+                for names_file in lists[key]:
+                    names_file.write(f"./{image_file(record)}\n")
+                if described:
+                    described[key].add(record)
+        for file in files:
+            file.keep()
+        for task in tasks:
+            for name in names:
+                text = f"# Paths are relative to this file.\ntrain: ../{name}_train.txt\nval: ../{name}_val.txt\n"
+                text += names_yaml(classes, keypoints if task == "yolo-pose" else None)
+                write_text(root / f"{TASKS[task].folder}folds/{name}.yaml", text)
+    found = []
+    for fold in range(folds):
+        own = [layout for layout in layouts if fold_of[layout] == fold]
+        instances = sum((layouts[layout] for layout in own), Counter[str]())
+        found.append(Fold(len(own), sum(images[layout] for layout in own), dict(sorted(instances.items()))))
+    return found
+
+
+def assign_folds(layouts: Mapping[int, Counter[str]], folds: int) -> dict[int, int]:
+    """Fold of each layout, of which every fold has as many as the others, or one more.
+
+    Layouts with the rarest classes go first, as in the iterative stratification of Sechidis et al. (2011, "On the
+    stratification of multi-label data"), each to the fold where the squares of what is lacking fall most: of instances
+    of each class and of layouts, as shares of what a fold should have.
+
+    Args:
+        layouts: Instances by class of each layout.
+        folds: How many.
+    """
+    room = [len(layouts) // folds + (fold < len(layouts) % folds) for fold in range(folds)]
+    total = sum(layouts.values(), Counter[str]())
+    lacking = [dict.fromkeys(total, 1.0) for _ in range(folds)]  # shares of a fold's own part
+    rarity = {layout: min((total[name], name) for name in found) for layout, found in layouts.items() if found}
+    most = (total.total() + 1, "")
+    fold_of: dict[int, int] = {}
+    for layout in sorted(layouts, key=lambda layout: (rarity.get(layout, most), -layouts[layout].total(), layout)):
+        shares = {name: folds * count / total[name] for name, count in layouts[layout].items()}
+        gains = [
+            sum(share * lacking[fold][name] for name, share in shares.items())
+            + room[fold] * (folds / len(layouts)) ** 2
+            for fold in range(folds)
+        ]
+        chosen = max((fold for fold in range(folds) if room[fold]), key=lambda fold: (gains[fold], -fold))
+        fold_of[layout] = chosen
+        room[chosen] -= 1
+        for name, share in shares.items():
+            lacking[chosen][name] -= share
+    return fold_of

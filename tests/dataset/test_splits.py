@@ -1,0 +1,134 @@
+"""Datasets with a test split and with folds: no layout in two of them, classes spread, files that can be read."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pycocotools.coco import COCO
+from ruamel.yaml import YAML
+
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.dataset.folds import assign_folds, write_folds
+from mitsplat.dataset.write import write_dataset
+from mitsplat.errors import InputError
+from mitsplat.scene.scene import load_scene
+from mitsplat.scene.spec import FORMATS, HoldOut
+from tests.audit.test_audit import records_of, store
+from tests.cli.test_cli import run
+from tests.conftest import box_asset, small_scene
+from tests.dataset.test_distractors import scatter_drawn
+from tests.drawn import large_boxes, render_boxes
+
+FORMATS_HERE = [name for name in FORMATS if name != "colmap"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("splits")
+    objects = [{"pool": ["assets/nut", "assets/bolt", "assets/crate"], "count": [2, 4]}]
+    assets = [*large_boxes(), box_asset("crate", (0.1, 0.1, 0.1))]
+    small_scene(folder, assets, objects, layouts=8, views=2, formats=FORMATS_HERE, validation=0.25, test=0.25)
+    scene = load_scene(folder / "scene.yaml")
+    scene = replace(scene, spec=scene.spec.model_copy(update={"hold_out": HoldOut(assets=("assets/crate",))}))
+    return write_dataset(scene, folder / "out", render=render_boxes, settle=scatter_drawn).path
+
+
+def test_every_format_has_three_splits_that_the_audit_finds_whole(made: Path) -> None:
+    records = records_of(made)
+    assert Counter(record["split"] for record in records) == {"train": 8, "val": 4, "test": 4}
+    assert audit_dataset(made).violations == ()
+    for name in ("instances", "amodal", "panoptic", "poses"):
+        assert (made / f"annotations/{name}_test.json").is_file()
+    assert len(COCO(made / "annotations/instances_test.json").imgs) == 4
+    assert (made / "voc/ImageSets/Main/test.txt").read_text().split() == [
+        f"{record['index']:06d}" for record in records if record["split"] == "test"
+    ]
+    assert YAML(typ="safe").load(made / "data.yaml")["test"] == "images/test"
+    assert {record["split"] for record in records if shows_a_crate(record)} == {"test"}
+
+
+def shows_a_crate(record: dict[str, Any]) -> bool:
+    return any(label["class"] == "crate" for label in record["labels"]["instances"])
+
+
+def test_the_audit_finds_what_is_held_out_elsewhere(made: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    records = records_of(copy)
+    next(record for record in records if shows_a_crate(record))["split"] = "train"
+    store(copy, records)
+    found = [text for _, text in audit_dataset(copy).violations]
+    assert any("is of an asset that is held out for the test split" in text for text in found)
+    assert any("are in both train and test" in text for text in found)
+
+
+def test_folds_are_lists_that_lead_to_images_and_labels(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("split", made, "--folds", 3) == 0
+    assert capsys.readouterr().out.count("validates with 4 images of 2 layouts") == 3
+    records = [record for record in records_of(made) if record["split"] != "test"]
+    images = {next(file for file in record["files"] if file.startswith("images/")): record for record in records}
+    validated = []
+    for fold in ("fold1", "fold2", "fold3"):
+        for task in ("", "yolo-detect/", "yolo-obb/", "yolo-pose/"):
+            described = made / task / "folds" / f"{fold}.yaml"
+            data = YAML(typ="safe").load(described)
+            assert data["names"] == {0: "bolt", 1: "crate", 2: "nut"} and ("kpt_shape" in data) == (
+                task == "yolo-pose/"
+            )
+            lists = {split: (described.parent / data[split]).resolve() for split in ("train", "val")}
+            named = {split: [str(line) for line in path.read_text().splitlines()] for split, path in lists.items()}
+            assert sorted(named["train"] + named["val"]) == sorted(f"./{image}" for image in images)
+            for split, path in lists.items():
+                for line in named[split]:
+                    image = Path(line.replace("./", f"{path.parent}/"))  # as Ultralytics does
+                    assert image.is_file()
+                    assert Path(str(image).replace("/images/", "/labels/")).with_suffix(".txt").is_file()
+        layouts = {s: {images[line.removeprefix("./")]["layout"] for line in lines} for s, lines in named.items()}
+        assert not layouts["train"] & layouts["val"]
+        validated += sorted(layouts["val"])
+        for split in ("train", "val"):
+            coco = COCO(made / f"folds/{fold}_{split}.json")
+            assert [f"./images/{image['file_name']}" for image in coco.imgs.values()] == named[split]
+            shown = [images[line.removeprefix("./")] for line in named[split]]
+            assert len(coco.anns) == sum(len(record["labels"]["instances"]) for record in shown)
+    assert sorted(validated) == sorted({record["layout"] for record in records})
+    assert audit_dataset(made).violations == ()
+    with pytest.raises(InputError, match=r"folds must be 2 to 6, the layouts of .* \(got 7\)"):
+        write_folds(made, 7)
+
+
+def test_overwriting_removes_folds(tmp_path: Path) -> None:
+    scene = small_scene(
+        tmp_path, large_boxes(), [{"asset": "assets/nut"}, {"asset": "assets/bolt"}], layouts=2, views=1
+    )
+    out = write_dataset(scene, tmp_path / "out", render=render_boxes, settle=scatter_drawn).path
+    write_folds(out, 2)
+    (out / "notes.txt").write_text("mine")
+    write_dataset(scene, out, render=render_boxes, settle=scatter_drawn, overwrite=True)
+    assert not list(out.glob("fold*")) and (out / "notes.txt").is_file()
+
+
+@pytest.mark.parametrize("folds", [2, 5, 7])
+def test_folds_spread_classes_and_layouts(folds: int) -> None:
+    """Layouts to one; what is in as many layouts as there are folds is in each, and the rest within a few."""
+    rng = np.random.default_rng(folds)
+    layouts = {i: Counter({"nut": int(rng.integers(0, 4)), "bolt": int(rng.integers(1, 3))}) for i in range(101)}
+    for number in rng.choice(101, folds, replace=False):
+        layouts[int(number)]["gear"] = 1
+    fold_of = assign_folds(layouts, folds)
+    assert sorted(fold_of) == list(range(101))
+    sizes = Counter(fold_of.values())
+    assert max(sizes.values()) - min(sizes.values()) <= 1
+    counts = {
+        name: [sum(layouts[i][name] for i in layouts if fold_of[i] == fold) for fold in range(folds)]
+        for name in ("nut", "bolt", "gear")
+    }
+    assert counts["gear"] == [1] * folds
+    for name in ("nut", "bolt"):
+        assert max(counts[name]) - min(counts[name]) <= 6
+    assert assign_folds(dict(reversed(layouts.items())), folds) == fold_of

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 FLOORS = (
     ("cli",),
+    ("report",),
     ("audit", "checks"),
     ("dataset",),
     ("bake", "formats", "reconstruct"),

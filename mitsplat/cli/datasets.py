@@ -313,7 +313,7 @@ def report(
     It is one HTML file that needs no network: samples with their labels, statistics, draws, audit, origin. What a
     detector cannot learn from the images is printed, too.
     """
-    from mitsplat.audit.report import write_report
+    from mitsplat.report.report import write_report
 
     page, found, warnings = write_report(dataset, out)
     for warning in warnings:

@@ -12,11 +12,11 @@ import pytest
 from pycocotools import mask as coco_mask
 from scipy.spatial.transform import Rotation
 
-from mitsplat.audit import variety
-from mitsplat.audit.report import write_report
-from mitsplat.audit.svg_charts import discs
-from mitsplat.audit.variety import FEW_VIEWS, RINGS, SECTORS, Variety, cell_of
 from mitsplat.camera import look_at_pose
+from mitsplat.report import variety
+from mitsplat.report.report import write_report
+from mitsplat.report.svg_charts import discs
+from mitsplat.report.variety import FEW_VIEWS, RINGS, SECTORS, Variety, cell_of
 from tests.audit.test_audit import records_of, store
 from tests.cli.test_cli import run
 

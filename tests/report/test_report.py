@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsplat.audit.report import SAMPLES, write_report
-from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.report.report import SAMPLES, write_report
+from mitsplat.report.svg_charts import HeatMap, Histogram, bars, columns
 from tests.audit.test_audit import records_of, store, swap_a_class
 from tests.cli.test_cli import run
 

@@ -15,8 +15,6 @@ import cv2
 import numpy as np
 
 from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
-from mitsplat.audit.svg_charts import HeatMap, Histogram, bars, columns
-from mitsplat.audit.variety import Variety
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import Record, write_text
 from mitsplat.formats.coco import image_file
@@ -24,6 +22,8 @@ from mitsplat.html import inline_image, make_page
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour
 from mitsplat.masks import Silhouette
+from mitsplat.report.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.report.variety import Variety
 
 SAMPLES = 12
 """Images that are shown, evenly spread over the dataset."""

@@ -39,6 +39,8 @@ def _sections(root: Schema, model: Schema, path: str) -> Iterator[tuple[str, Sch
     for name, key in model.get("properties", {}).items():
         inside = _joined(re.sub(r" .*", "", path), name) + ("[]" if _item(key) is not key else "")
         kinds = [_resolved(root, kind) for kind in _item(key).get("oneOf", ())]
+        if kinds and _shown_at(root, _item(key), inside) != inside:
+            continue
         for kind in kinds:
             for where, found in _sections(root, kind, f"{inside} of kind {kind['properties']['kind']['const']}"):
                 if where not in seen:
@@ -47,6 +49,14 @@ def _sections(root: Schema, model: Schema, path: str) -> Iterator[tuple[str, Sch
         one = _resolved(root, _item(key))
         if "properties" in one:
             yield from _sections(root, one, inside)
+
+
+def _shown_at(root: Schema, key: Schema, path: str) -> str:
+    """The first key of the file that holds the same kinds of mappings as another, where they are described."""
+    for name, other in root["properties"].items():
+        if _item(other).get("oneOf") == key["oneOf"]:
+            return name + ("[]" if _item(other) is not other else "")
+    return path
 
 
 def _section(root: Schema, path: str, model: Schema, pictures: dict[str, list[Picture]]) -> str:
@@ -104,6 +114,7 @@ def _type_of(root: Schema, key: Schema, path: str) -> str:
         return " or ".join(_type_of(root, choice, path) for choice in key["anyOf"] if choice.get("type") != "null")
     if "oneOf" in key:
         kinds = [_resolved(root, kind)["properties"]["kind"]["const"] for kind in key["oneOf"]]
+        path = _shown_at(root, key, path)
         return "mapping of kind " + _listed(f"[`{kind}`](#{_anchor(f'{path} of kind {kind}')})" for kind in kinds)
     if "$ref" in key:
         return f"[mapping](#{_anchor(path)})"

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import cv2
 import numpy as np
 
+from mitsplat.arrays import Float64Array
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
 
@@ -20,12 +22,17 @@ class SceneReader:
     """The scene of ``dataset.json``."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
-        self._camera, self._output = content["scene"]["camera"], content["scene"]["output"]
+        scene = content["scene"]
+        self._cameras, self._output = (scene["camera"], *scene.get("cameras", ())), scene["output"]
         self._distractors = set(content.get("distractors", ()))
         self._held_out = _held_out(content["scene"])
 
     def check(self, frame: TrueFrame) -> Violations:
         """Whether the frame's camera can be one of the scene's, and its labels are of what is labelled."""
+        drawn, (number, right) = frame.record.get("viewpoint") or {}, self._seat(frame)
+        sides = ("left", "right") if self._cameras[number].get("stereo") else (None, None)
+        if (drawn.get("camera", 0), drawn.get("side")) != (number, sides[right]):
+            yield f"manifest.jsonl, frame {frame.index}", "it is not of the camera whose turn it is"
         for text in (*self._check_lens(frame), *self._check_place(frame), *self._check_objects(frame)):
             yield f"manifest.jsonl, frame {frame.index}", text
 
@@ -49,29 +56,65 @@ class SceneReader:
             yield f"has {len(frame.instances)} labels, though its layout is an empty one"
 
     def _check_lens(self, frame: TrueFrame) -> Iterator[str]:
-        lens, (width, height) = self._camera["intrinsics"], (self._output["width"], self._output["height"])
+        camera, drawn = self._camera_of(frame), frame.record.get("viewpoint") or {}
+        lens, (width, height) = camera["intrinsics"], (self._output["width"], self._output["height"])
+        low, high = camera.get("zoom", (1.0, 1.0))
+        zoom = drawn.get("zoom", low)
+        if not low <= zoom <= high or (low < high and "zoom" not in drawn):
+            yield f"its zoom must be stated, and in the scene's {low:g} to {high:g} (got {drawn.get('zoom')})"
         if frame.size != (width, height):
             yield f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as the scene says"
-        wide, high = lens["size"] or (width, height)
+        wide, tall = lens["size"] or (width, height)
         if lens["fov_x"] is not None:
             fx = fy = wide / (2 * np.tan(np.radians(lens["fov_x"]) / 2))
         else:
             fx, fy = lens["fx"], lens["fx"] if lens["fy"] is None else lens["fy"]
-        cx, cy = (wide / 2 if lens["cx"] is None else lens["cx"]), (high / 2 if lens["cy"] is None else lens["cy"])
-        scale = np.diag([width / wide, height / high, 1.0])
-        expected = scale @ [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        cx, cy = (wide / 2 if lens["cx"] is None else lens["cx"]), (tall / 2 if lens["cy"] is None else lens["cy"])
+        scale = np.diag([width / wide, height / tall, 1.0])
+        expected = scale @ [[zoom * fx, 0, cx], [0, zoom * fy, cy], [0, 0, 1]]
         if np.abs(frame.intrinsics - expected).max() > 1e-9 * max(fx, fy, width, height):
             yield f"its intrinsics are not the scene's, {expected[0, 0]:.6g}, {expected[1, 1]:.6g} px"
         if list(frame.distortion) != list(lens["distortion"]) or frame.record["camera"]["lens"] != lens["lens"]:
             yield "its lens distortion is not the scene's"
 
+    def _camera_of(self, frame: TrueFrame) -> Mapping[str, Any]:
+        """The camera of the scene that took a frame."""
+        camera: Mapping[str, Any] = self._cameras[self._seat(frame)[0]]
+        return camera
+
+    def _seat(self, frame: TrueFrame) -> tuple[int, bool]:
+        """Position of a frame's camera among the scene's, and whether it is the right one of a pair: taken in turn."""
+        seats = [(n, side) for n, one in enumerate(self._cameras) for side in range(2 if one.get("stereo") else 1)]
+        number, side = seats[frame.record["view"] % len(seats)]
+        return number, side == 1
+
+    def _turn(self, frame: TrueFrame) -> tuple[int, int]:
+        """Which of its camera's views of the layout a frame is, and of how many."""
+        seats = sum(2 if camera.get("stereo") else 1 for camera in self._cameras)
+        turn, seat = divmod(frame.record["view"], seats)
+        return turn, len(range(seat, self._output["views"], seats))
+
+    def _unheld(self, frame: TrueFrame) -> Float64Array:
+        """Pose of a frame's camera without the hand that moved it, and of a pair's left camera for its right one."""
+        pose = np.array(frame.world_from_camera, dtype=np.float64)
+        number, right = self._seat(frame)
+        if right:
+            pose[:3, 3] -= self._cameras[number]["stereo"]["baseline"] * pose[:3, 0]
+        if (motion := (frame.record.get("viewpoint") or {}).get("handheld")) is not None:
+            moved = np.eye(4)
+            moved[:3, :3], _ = cv2.Rodrigues(np.radians(motion[3:]))
+            moved[:3, 3] = motion[:3]
+            pose = pose @ np.linalg.inv(moved)
+        return pose
+
     def _check_place(self, frame: TrueFrame) -> Iterator[str]:
         """Closed forms: circles and spheres about a target that the axis meets, and the ends of paths."""
-        camera, pose = self._camera, frame.world_from_camera
+        camera, pose = self._camera_of(frame), self._unheld(frame)
         eye, axis = pose[:3, 3], pose[:3, 2]
         if camera["kind"] == "path":
-            ends = {0: camera["keys"][0], self._output["views"] - 1: camera["keys"][-1]}
-            if (key := ends.get(frame.record["view"])) is None or self._output["views"] == 1:
+            turn, turns = self._turn(frame)
+            ends = {0: camera["keys"][0], turns - 1: camera["keys"][-1]}
+            if (key := ends.get(turn)) is None or turns == 1:
                 return
             away = float(np.linalg.norm(eye - key["eye"]))
             if away > _SIGMAS * camera["jitter"] + _NEAR:
@@ -81,8 +124,8 @@ class SceneReader:
                 yield "its camera does not look where the scene's path says"
             return
         target, room = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _NEAR
-        if frame.record.get("viewpoint") is not None:  # it looks at what lies there, and says what that is
-            target, room = frame.record["viewpoint"]["target"], _NEAR
+        if (stated := (frame.record.get("viewpoint") or {}).get("target")) is not None:
+            target, room = stated, _NEAR  # it looks at what lies there, and says what that is
         offset = eye - target
         if camera["kind"] == "orbit":
             room = _SIGMAS * camera["jitter"] + _NEAR

@@ -44,6 +44,7 @@ class _Scene(_Stored):
     name: str
     seed: Count
     camera: CameraSpec
+    cameras: tuple[CameraSpec, ...] = ()
     labels: LabelRules
     output: Output
 
@@ -132,10 +133,14 @@ class _Predicted(_Stored):
 
 
 class _Viewpoint(_Stored):
-    """What a camera looks at [m], the object that it is the middle of, and which of the frame's tries it is."""
+    """How a camera was drawn: see :class:`mitsplat.scene.viewpoints.View`, whose units these are."""
 
-    target: Point
-    object: Annotated[int, Field(ge=1, le=65535)] | None
+    camera: Count = 0
+    side: Literal["left", "right"] | None = None
+    zoom: Annotated[float, Field(gt=0)] | None = None
+    handheld: tuple[float, float, float, float, float, float] | None = None
+    target: Point | None = None
+    object: Annotated[int, Field(ge=1, le=65535)] | None = None
     attempt: Count = 0
     predicted: _Predicted | None = None
 
@@ -184,7 +189,7 @@ def read_content(root: Path) -> dict[str, Any]:
         )
     if not (root / "manifest.jsonl").is_file():
         raise InputError(f"{root} must be a dataset of mitsplat (it has no manifest.jsonl)")
-    content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "labels", "output"})
+    content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "cameras", "labels", "output"})
     return content
 
 

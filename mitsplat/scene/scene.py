@@ -345,11 +345,12 @@ def _refuse_outside(folder: Path, name: str) -> None:
 
 def _check_lens(spec: SceneSpec, path: Path) -> None:
     """Refuse intrinsics that no camera of the image's size can have, such as a fisheye's that sees behind itself."""
-    with _blaming(path, "camera", "intrinsics"):
-        try:
-            camera_at(np.eye(4), spec.camera.intrinsics, spec.output)
-        except ValueError as error:
-            raise InputError(str(error)) from error
+    for keys, camera in ((("camera",), spec.camera), *((("cameras", i), one) for i, one in enumerate(spec.cameras))):
+        with _blaming(path, *keys, "intrinsics"):
+            try:
+                camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # which shows most
+            except ValueError as error:
+                raise InputError(str(error)) from error
 
 
 def _check_held_out(spec: SceneSpec, path: Path) -> None:

@@ -121,6 +121,12 @@ class SceneSpec(StrictModel):
     enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
     settle: Settle = Field(Settle(), description="How objects come to rest.")
     camera: CameraSpec = Field(description="Where images are taken from.")
+    cameras: tuple[CameraSpec, ...] = Field(
+        (),
+        exclude_if=lambda cameras: not cameras,
+        description="More cameras: `camera` and these take a layout's views in turn, such as one in a robot's hand "
+        "and one above it; one that is listed twice takes twice as many.",
+    )
     lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
@@ -151,6 +157,11 @@ class SceneSpec(StrictModel):
             )
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: give output.test")
+        turn = sum(1 if camera.stereo is None else 2 for camera in (self.camera, *self.cameras))
+        if any(camera.stereo for camera in (self.camera, *self.cameras)) and self.output.views % turn:
+            raise FieldError(
+                ("output", "views"), f"must be a multiple of {turn}, so that pairs are whole (got {self.output.views})"
+            )
         if self.enclosure is not None and self.enclosure.floor >= self.region.max[2]:
             raise FieldError(
                 ("enclosure", "floor"),

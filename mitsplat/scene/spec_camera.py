@@ -47,10 +47,36 @@ class Intrinsics(StrictModel):
         return self
 
 
+class Stereo(StrictModel):
+    """A second camera beside the first, alike and parallel to it: a rectified pair."""
+
+    baseline: Positive = Field(description="Distance of the right camera from the left one, along its x axis [m].")
+
+
+class Handheld(StrictModel):
+    """Motion of the hand that holds a camera: smooth from view to view of a layout, and another in every layout."""
+
+    position: NonNegativeFloat = Field(0.0, description="Displacement along each axis, 1 sigma [m].")
+    rotation: NonNegativeFloat = Field(0.0, description="Rotation about each axis, 1 sigma [degrees].")
+
+
 class Viewpoint(StrictModel):
     """What every kind of camera has."""
 
     intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor.")
+    zoom: PositiveRange = Field(
+        (1.0, 1.0),
+        exclude_if=lambda zoom: zoom == (1.0, 1.0),
+        description="Factor on the focal lengths, drawn anew for every view.",
+    )
+    handheld: Handheld | None = Field(
+        None, exclude_if=lambda handheld: handheld is None, description="Smooth random motion on top of the pose."
+    )
+    stereo: Stereo | None = Field(
+        None,
+        exclude_if=lambda stereo: stereo is None,
+        description="Takes every view twice, from the left and then from the right; these are two of output.views.",
+    )
 
 
 class PoseKey(StrictModel):
@@ -182,4 +208,20 @@ class CameraHemisphere(Viewpoint):
         return self
 
 
-CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]
+class CameraWalk(Viewpoint):
+    """A video of each layout: a smooth path around the target, through places drawn at random as on a hemisphere.
+
+    Azimuth, sine of the elevation and radius are interpolated by monotone cubics, and so never leave their ranges.
+    """
+
+    kind: Literal["walk"] = Field("walk", description="A smooth random path around a target, for videos.")
+    target: Vec3 = Field(description="Point in the middle of the views [m].")
+    radius: PositiveRange = Field(description="Range of distances from the target [m].")
+    elevation: Annotated[tuple[Elevation, Elevation], AfterValidator(ordered)] = Field(
+        (25.0, 80.0), description="Range above the horizon [degrees]."
+    )
+    azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
+    places: int = Field(4, ge=2, le=1000, description="How many places are drawn, evenly spaced in time.")
+
+
+CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere | CameraWalk, Field(discriminator="kind")]

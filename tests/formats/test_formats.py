@@ -123,6 +123,7 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
         lights=(),
         draws={},
         seed=index,
+        viewpoint={},
     )
     return frame_around(
         plan,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from mitsplat.audit.audit import audit_dataset
@@ -284,3 +285,127 @@ def test_what_is_off_is_not_in_the_specification(scene: Scene) -> None:
     stored = seen_by(scene).spec.camera.model_dump(mode="json")
     assert isinstance(scene.spec.camera, StrictModel)
     assert not stored.keys() & {"look_at", "coverage", "accept", "occlusion", "truncation", "tries"}
+
+
+# Several cameras, pairs, hands and walks
+
+ABOVE = {"kind": "path", "keys": [{"eye": [0, -0.1, 0.9], "target": [0, 0, 0]}], "intrinsics": {"fov_x": 40}}
+
+
+def moving(scene: Scene, camera: dict[str, Any], *others: dict[str, Any], **output: Any) -> Scene:
+    size = {f"output.{key}": value for key, value in output.items()}
+    return load_scene(scene.path, overrides={"camera": camera, "cameras": list(others), **size})
+
+
+def test_cameras_take_views_in_turn(scene: Scene) -> None:
+    keys = [{"eye": [x, -0.8, 0.5], "target": [0, 0, 0]} for x in (-0.3, 0, 0.3)]
+    drawn = moving(scene, HEMISPHERE, ABOVE, ABOVE | {"keys": keys}, views=8)
+    plans = [plan_frame(drawn, index) for index in range(16)]
+    assert [plan.viewpoint["camera"] for plan in plans] == [0, 1, 2, 0, 1, 2, 0, 1] * 2
+    for index in (1, 4, 7, 9):
+        np.testing.assert_allclose(plans[index].camera.centre, (0, -0.1, 0.9), atol=1e-12)
+    np.testing.assert_allclose([plans[2].camera.centre, plans[5].camera.centre], [keys[0]["eye"], keys[2]["eye"]])
+
+
+@pytest.mark.parametrize("camera", [HEMISPHERE | {"look_at": "objects", "occlusion": {"share": 0.4}}, ABOVE])
+def test_pairs_are_rectified(scene: Scene, camera: dict[str, Any]) -> None:
+    """A point has the same row in both images, and a disparity of focal length times baseline over depth."""
+    drawn = moving(scene, camera | {"stereo": {"baseline": 0.06}, "zoom": [0.8, 1.4]}, views=4)
+    layout = layouts(drawn)[0]
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    for index in (0, 2):
+        left, right = plan_frame(drawn, index, layout), plan_frame(drawn, index + 1, layout)
+        assert (left.viewpoint["side"], right.viewpoint["side"]) == ("left", "right")
+        (here, depth), (there, other) = left.camera.project(points), right.camera.project(points)
+        np.testing.assert_allclose(depth, other, atol=1e-12)
+        np.testing.assert_allclose(
+            here - there, np.stack([left.camera.fx * 0.06 / depth, 0 * depth], axis=1), atol=1e-9
+        )
+
+
+def test_half_a_pair_is_refused(scene: Scene) -> None:
+    with pytest.raises(InputError, match=r"output\.views: must be a multiple of 3, so that pairs are whole \(got 8\)"):
+        moving(scene, HEMISPHERE | {"stereo": {"baseline": 0.06}}, ABOVE, views=8)
+
+
+def test_zoom_multiplies_focal_lengths(scene: Scene) -> None:
+    plans = [plan_frame(seen_by(scene, zoom=[0.5, 2.0]), index) for index in range(24)]
+    ratios = np.array([plan.camera.fx for plan in plans]) / plan_frame(seen_by(scene), 0).camera.fx
+    np.testing.assert_allclose(ratios, [plan.viewpoint["zoom"] for plan in plans])
+    assert 0.5 <= ratios.min() < 0.8 < 1.7 < ratios.max() <= 2.0
+
+
+def test_a_fisheye_is_refused_where_zoom_shows_more_than_it_can(scene: Scene) -> None:
+    lens = {"lens": "fisheye", "fx": 24.0, "distortion": [0, 0, 0, 0]}  # corners at 40 px, 96 degrees
+    with pytest.raises(InputError, match=r"camera\.intrinsics: a fisheye must show at most 85 degrees"):
+        seen_by(scene, intrinsics=lens | {"fx": 30.0}, zoom=[0.8, 1.2])
+    seen_by(scene, intrinsics=lens | {"fx": 30.0}, zoom=[1.0, 1.2])
+
+
+def test_a_hand_moves_smoothly_and_as_far_as_it_says(scene: Scene) -> None:
+    drawn = moving(scene, ABOVE | {"handheld": {"position": 0.01, "rotation": 2.0}}, layouts=40, views=16)
+    still = plan_frame(moving(scene, ABOVE), 0).camera.camera_from_world
+    motions = []
+    for index in range(drawn.num_frames):
+        plan = plan_frame(drawn, index)
+        motions.append(plan.viewpoint["handheld"])
+        relative = still @ plan.camera.world_from_camera
+        np.testing.assert_allclose(relative[:3, 3], motions[-1][:3], atol=1e-12)
+        turned = Rotation.from_matrix(relative[:3, :3]).as_rotvec(degrees=True)
+        np.testing.assert_allclose(turned, motions[-1][3:], atol=1e-9)
+    sway = np.reshape(motions, (40, 16, 6)) / ([0.01] * 3 + [2.0] * 3)
+    # 40 layouts of three axes, correlated in time: relative standard error about 1 / sqrt(2 * 120) = 6 %.
+    assert np.std(sway[..., :3]) == pytest.approx(1, rel=0.15)
+    assert np.std(sway[..., 3:]) == pytest.approx(1, rel=0.15)
+    # Of cosines at rates uniform in [0, r], the mean square of a step is 2 (1 - sin(2 pi r) / (2 pi r)) variances.
+    expected = 2 * (1 - np.sinc(2 * 0.15))
+    assert np.mean(np.diff(sway, axis=1) ** 2) == pytest.approx(expected, rel=0.2)
+
+
+def test_a_walk_is_smooth_and_stays_in_its_ranges(scene: Scene) -> None:
+    ranges = {name: HEMISPHERE[name] for name in ("target", "radius", "elevation", "intrinsics")}
+    drawn = moving(scene, {"kind": "walk", "azimuth": [-60, 60], "places": 5, **ranges}, layouts=4, views=100)
+    eyes = np.array([plan_frame(drawn, index).camera.centre for index in range(400)]).reshape(4, 100, 3)
+    radius = np.linalg.norm(eyes, axis=2)
+    assert (radius >= 0.5 - 1e-9).all()
+    assert (radius <= 1.0 + 1e-9).all()
+    elevation, azimuth = (
+        np.degrees(np.arcsin(eyes[..., 2] / radius)),
+        np.degrees(np.arctan2(eyes[..., 1], eyes[..., 0])),
+    )
+    assert (elevation >= 10 - 1e-9).all()
+    assert (elevation <= 70 + 1e-9).all()
+    assert (np.abs(azimuth) <= 60 + 1e-9).all()
+    assert len(np.unique(eyes[:, 0].round(6), axis=0)) == 4  # each layout has its own
+    step = np.diff(eyes, axis=1)
+    # C1: from one step to the next, the velocity changes by a step's share of what it is at most.
+    assert np.linalg.norm(np.diff(step, axis=1), axis=2).max() < 0.2 * np.linalg.norm(step, axis=2).max()
+
+
+def test_rigs_are_audited(scene: Scene, tmp_path: Path) -> None:
+    hand = HEMISPHERE | {
+        "stereo": {"baseline": 0.05},
+        "handheld": {"position": 0.01, "rotation": 3},
+        "zoom": [0.8, 1.2],
+    }
+    walk = {"kind": "walk", **{name: HEMISPHERE[name] for name in ("target", "radius", "elevation", "intrinsics")}}
+    drawn = moving(scene, hand, ABOVE, walk, views=8, layouts=2, formats=["poses", "flow"])
+    out = write_dataset(drawn, tmp_path / "out", render=render_boxes, settle=scatter_boxes).path
+    assert audit_dataset(out).violations == ()
+
+    def wrong(change: dict[str, Any]) -> set[str]:
+        def render(scene: Scene, index: int, *, layout: Layout) -> Any:
+            frame = render_boxes(scene, index, layout=layout)
+            viewpoint = frame.plan.viewpoint | {
+                key: value for key, value in change.items() if key in frame.plan.viewpoint
+            }
+            return replace(frame, plan=replace(frame.plan, viewpoint=viewpoint))
+
+        name = "-".join(change)
+        made = write_dataset(drawn, tmp_path / name, render=render, settle=scatter_boxes, frames=4).path
+        return {text for _, text in audit_dataset(made).violations}
+
+    assert any("whose turn it is" in text for text in wrong({"camera": 1}))
+    assert any("whose turn it is" in text for text in wrong({"side": "left"}))
+    assert any("its intrinsics are not" in text for text in wrong({"zoom": 1.0}))
+    assert any("looks past" in text for text in wrong({"handheld": [0.0] * 6}))

@@ -52,6 +52,7 @@ class Image:
             it met; 0 where it met nothing.
         instance: Id with the largest share of the ray; 0 is the environment, which has what is left of the ray as well.
         centre_alpha: Opacity of the ray through the pixel's centre, whose depth and instance these are.
+        error: Estimate of what the order of blending leaves wrong in ``rgb``, see the module; None if there is none.
     """
 
     rgb: list[Any]
@@ -59,18 +60,21 @@ class Image:
     depth: Any
     instance: Any
     centre_alpha: Any
+    error: Any | None
 
     @classmethod
     def empty(cls, count: int) -> Image:
         """Rays that met nothing."""
         nothing = dr.zeros(mi.Float, count)
-        return cls([nothing] * 3, nothing, nothing, dr.zeros(mi.UInt32, count), nothing)
+        return cls([nothing] * 3, nothing, nothing, dr.zeros(mi.UInt32, count), nothing, nothing)
 
     @classmethod
     def joined(cls, parts: Sequence[Image]) -> Image:
         """The image whose rows are those of the parts, one after the other."""
         rgb = [dr.concat([part.rgb[c] for part in parts]) for c in range(3)]
         rest = [dr.concat([getattr(p, name) for p in parts]) for name in ("alpha", "depth", "instance", "centre_alpha")]
+        known = all(part.error is not None for part in parts)
+        rest.append(dr.concat([part.error for part in parts]) if known else None)
         return cls(rgb, *rest)
 
     def with_tiles(self, part: Image, lists: TileLists, view: View) -> Image:
@@ -84,9 +88,18 @@ class Image:
 
 
 def _select(changed: Any, new: Any, old: Any) -> Any:
+    if new is None or old is None:
+        return None
     if isinstance(new, list):
         return [dr.select(changed, a, b) for a, b in zip(new, old, strict=True)]
     return dr.select(changed, new, old)
+
+
+def largest_and_mean(error: Any) -> tuple[Any, Any]:
+    """Of the pixels' errors, up to 1; the mean by whole numbers, whose sum does not depend on its order."""
+    unit = 1 << 24
+    total = dr.sum(mi.UInt64(dr.minimum(error, 1.0) * unit))
+    return dr.minimum(dr.max(error), 1.0), mi.Float(total) / (unit * dr.width(error))
 
 
 T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
@@ -196,22 +209,25 @@ def march(
         dr.eval(lists.nearest)
     several, estimated = lists.instance is None, quality.order == "window" and lists.pairs > 0
 
-    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], Any]:
+    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
+        """States of the rays at a place in the pixels, and estimates of their errors."""
         state = {"several": labelled and several, "estimated": estimated}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
         found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
-        return ([pixel[:-ESTIMATE] for pixel in found], _too_wrong(found, quality)) if estimated else (found, None)
+        return ([pixel[:-ESTIMATE] for pixel in found], [pixel[ERROR] for pixel in found]) if estimated else (found, [])
 
-    found, wrong = pixels(0.5, 0.5, labelled=True)
+    found, errors = pixels(0.5, 0.5, labelled=True)
     image, unsure = _collect(found, lanes, lists.instance)
+    if quality.order != "tile":
+        image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
     if estimated:
-        dr.eval(image, unsure, wrong)  # in one kernel
+        dr.eval(image, unsure, errors)  # in one kernel
     # One bit is soon read on a CPU, and mostly saves the launch; a GPU would have to be waited for.
     if several and (dr.backend_v(unsure) == dr.JitBackend.CUDA or dr.any(unsure)):
         image.instance = settle_instances(image.instance, unsure, lists, view, quality, z_max)
     if view.samples == 1:
-        return image if wrong is None else _repaired(image, wrong, lists, view, quality, z_max)
+        return _repaired(image, errors, lists, view, quality, z_max) if estimated else image
     n, colours = view.samples, []
     for y, x in np.ndindex(n, n):
         if (2 * x + 1, 2 * y + 1) == (n, n):  # the centre is one of an odd number of samples
@@ -219,10 +235,13 @@ def march(
         else:
             found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
             colours.append([*_picture(found, lanes)])
-            wrong = wrong | also if estimated else None
-        dr.eval(colours[-1], wrong)
+            errors = [dr.maximum(a, b) for a, b in zip(errors, also, strict=True)]
+        dr.eval(colours[-1], errors)
     *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
-    return image if wrong is None else _repaired(image, wrong, lists, view, quality, z_max)
+    if not estimated:
+        return image
+    image.error = lanes.image(mi.Float, errors)
+    return _repaired(image, errors, lists, view, quality, z_max)
 
 
 def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | None = None) -> Image:
@@ -244,13 +263,12 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
     return image
 
 
-def _too_wrong(pixels: list[Pixel], quality: Quality) -> Any:
-    """Whether the estimate of an error exceeds the tolerance in a lane."""
-    return largest([pixel[ERROR] for pixel in pixels]) > dr.opaque(mi.Float, quality.tolerance)
-
-
-def _repaired(image: Image, wrong: Any, lists: TileLists, view: View, quality: Quality, z_max: Any | None) -> Image:
-    """The image with the tiles that hold lanes which are ``wrong`` in the order of each ray."""
+def _repaired(
+    image: Image, errors: list[Any], lists: TileLists, view: View, quality: Quality, z_max: Any | None
+) -> Image:
+    """The image with the tiles in which estimates exceed the tolerance, by lanes, in the order of each ray."""
+    wrong = largest(errors) > dr.opaque(mi.Float, quality.tolerance)
+    dr.eval(wrong)
     per_tile = TILE * TILE
     lane = dr.arange(mi.UInt32, dr.width(wrong) // per_tile) * per_tile
     flags = dr.gather(mi.Bool, wrong, lane)
@@ -289,4 +307,4 @@ def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None) -> tuple[Image
         everything = dr.opaque(mi.Float, only)
         numbers = [dr.select(1.0 - pixel[T] > pixel[T], everything, 0.0) for pixel in pixels]
     depth, instance = lanes.image(mi.Float, depths), lanes.image(mi.UInt32, numbers)
-    return Image(rgb, alpha, depth, instance, alpha), unsure
+    return Image(rgb, alpha, depth, instance, alpha, None), unsure

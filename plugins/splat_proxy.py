@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -19,7 +20,7 @@ from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, light_factor
 from mitsplat.plugins.lit_surface import Seen, lit_surface
-from mitsplat.plugins.march import Image, trace
+from mitsplat.plugins.march import Image, largest_and_mean, trace
 from mitsplat.plugins.mirrored import SplatMirror
 from mitsplat.plugins.occlusion import Caster
 from mitsplat.plugins.parameters import Parameters
@@ -225,22 +226,29 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """All layers as flat row-major device arrays: colours linear, depths along z [m].
 
         Through a thin lens, colours and opacity are means over its aperture; all else is what its centre sees.
+        ``order_error`` holds the largest and the mean error that the order of blending leaves, see :class:`Image`;
+        it is absent where the quality estimates none.
         """
         contents = self._read(scene)
         views = view_of(sensor).apertures(self.quality.lens_rings)
         accuracy = Accuracy(self.shadow_error, self.shadow_samples)
         paths = -(-self.mesh_samples // len(views))
-        layers = self._layers(contents, scene, views[0], accuracy, paths, seed)
+        layers, errors = self._layers(contents, scene, views[0], accuracy, paths, seed), []
+        errors.append(layers.pop("order_error"))
         if len(views) > 1:
             # The mean of n views has sqrt(n) times less noise than each of them.
             coarse = Accuracy(self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views)))
             blurred = {name: layers[name] for name in ("rgb", "alpha", "captured")}
             for number, view in enumerate(views[1:], start=1):
                 seen = self._layers(contents, scene, view, coarse, paths, seed + number)
+                errors.append(seen["order_error"])
                 blurred = {name: value + seen[name] for name, value in blurred.items()}
                 dr.eval(blurred)
             layers |= {name: value / len(views) for name, value in blurred.items()}
             dr.eval(layers)
+        if errors[0] is not None:
+            layers["order_error"] = dr.concat([reduce(dr.maximum, [e[0] for e in errors]), sum(e[1] for e in errors)])
+            layers["order_error"] /= mi.Float([1, len(views)])
         return layers
 
     def _layers(
@@ -296,6 +304,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             "normal": mi.Vector3f(hit.normal),
             "light": light,
             "highlight": highlight,
+            "order_error": None if splat.error is None else largest_and_mean(splat.error),
         }
         dr.eval(layers, shown.key)
         if self.quality.samples == "edges":

@@ -30,4 +30,4 @@ def frame_around(plan: Any, layout: Any, labels: Labels, *, image: Any, ids: Any
         light=np.ones_like(colour),
         highlight=np.zeros_like(colour),
     )
-    return Frame(plan, layout, layers, colour, image, labels, {"march": 0.01})
+    return Frame(plan, layout, layers, colour, image, labels, {"march": 0.01}, {"largest": 0.004, "mean": 2e-5})

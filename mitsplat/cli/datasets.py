@@ -273,12 +273,14 @@ def chart(
             device=chosen,
         )
     best = cheapest(rows, tolerance)
-    table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "SSIM", "mask IoU", "peak [GiB]")
+    table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "estimate", "SSIM", "mask IoU", "peak [GiB]")
     for row in rows:
         name = f"{row.name} *" if row == best else row.name
-        numbers = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.ssim:.4f}", f"{row.mask_iou:.4f}"
-        table.add_row(name, f"{row.seconds:.2f}", *numbers, f"{row.memory:.2f}")
-    Console(width=100).print(table)
+        errors = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.estimate:.4f}"
+        table.add_row(
+            name, f"{row.seconds:.2f}", *errors, f"{row.ssim:.4f}", f"{row.mask_iou:.4f}", f"{row.memory:.2f}"
+        )
+    Console(width=110).print(table)
     typer.echo(f"* the cheapest preset within {tolerance:g}")
     write_csv(rows, out.with_suffix(".csv"))
     draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)

@@ -145,6 +145,11 @@ class _Viewpoint(_Stored):
     predicted: _Predicted | None = None
 
 
+class _OrderError(_Stored):
+    largest: Share
+    mean: Share
+
+
 class _Record(_Stored):
     index: Count
     layout: Count
@@ -159,6 +164,7 @@ class _Record(_Stored):
     objects: list[_Drawn] | None = None
     viewpoint: _Viewpoint | None = None
     empty: bool = False
+    order_error: _OrderError | None = None
 
 
 def read_content(root: Path) -> dict[str, Any]:

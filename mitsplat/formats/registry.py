@@ -91,6 +91,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         record["viewpoint"] = dict(plan.viewpoint)
     if spec.empty:
         record["empty"] = is_empty(spec, plan.layout)
+    if frame.order_error is not None:
+        record["order_error"] = {name: round(value, 6) for name, value in frame.order_error.items()}
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"
     files = FrameFiles(root, frame, catalogue, record, image, ids)
     files.add_bytes(image, encode_image(frame.image, output))

@@ -64,6 +64,8 @@ class Frame(Deferred):
         image: Display-encoded picture, (H, W, 3) uint8.
         labels: Labels of the visible instances.
         seconds: Time of the host per stage [s]; the device may still work at what a stage began in the next ones.
+        order_error: Estimated error of the pixels' display-encoded colours that the order of blending leaves, before
+            light: ``largest`` and ``mean``. None where the quality estimates none.
     """
 
     plan: FramePlan
@@ -73,6 +75,7 @@ class Frame(Deferred):
     image: npt.NDArray[np.uint8]
     labels: Labels
     seconds: Mapping[str, float]
+    order_error: Mapping[str, float] | None = None
 
     @property
     def index(self) -> int:
@@ -232,6 +235,7 @@ class Renderer:
         with _timed(seconds, "composite"):
             image = development.image()
         made = {"plan": plan, "layout": layout, "layers": layers, "image": image, "labels": labels, "seconds": seconds}
+        made["order_error"] = layers.order_error
         return Frame.later({"rgb": partial(host_array, linear, shape)}, **made)
 
     def _settle(self, index: int) -> Layout:

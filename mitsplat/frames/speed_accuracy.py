@@ -81,6 +81,7 @@ class Row:
         ssim: Mean structural similarity (Wang et al. 2004).
         mask_iou: Mean IoU of the instances' pixels; NaN without instances, and where the step tells none.
         memory: Peak memory of the process [GiB].
+        estimate: Largest error that the step's own estimate leaves of the order of blending; NaN where it makes none.
     """
 
     name: str
@@ -91,16 +92,18 @@ class Row:
     ssim: float
     mask_iou: float
     memory: float
+    estimate: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Shots:
-    """Pictures (K, H, W, 3) and instances (K, H, W) of one step, their median time [s] and peak memory [GiB]."""
+    """Pictures (K, H, W, 3) and instances (K, H, W) of one step, their median time [s], peak memory [GiB], estimate."""
 
     pictures: Float32Array
     instances: npt.NDArray[np.uint16] | None
     seconds: float
     memory: float
+    estimate: float
 
 
 def measure_steps(
@@ -220,14 +223,20 @@ def _shoot(
     shots = [shoot(i) for i in (0, *range(frames))][1:]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return _Shots(
-        np.stack([picture for picture, _, _ in shots]),
-        None if quality is None else np.stack([instance for _, instance, _ in shots]),
-        statistics.median(seconds for _, _, seconds in shots),
+        np.stack([shot[0] for shot in shots]),
+        None if quality is None else np.stack([shot[1] for shot in shots]),
+        statistics.median(shot[2] for shot in shots),
         peak / 2 ** (30 if sys.platform == "darwin" else 20),
+        max(shot[3] for shot in shots),
     )
 
 
-Shot = tuple[Float32Array, npt.NDArray[np.uint16], float]
+Shot = tuple[Float32Array, npt.NDArray[np.uint16], float, float]
+"""Picture, instances, time [s], and the largest error that was estimated, or NaN."""
+
+
+def _largest(order_error: Mapping[str, float] | None) -> float:
+    return math.nan if order_error is None else order_error["largest"]
 
 
 def _scene_shooter(
@@ -241,7 +250,8 @@ def _scene_shooter(
     def shoot(i: int) -> Shot:
         frame = render_frame(scene, int(indices[i]), quality=quality)
         seconds = sum(value for stage, value in frame.seconds.items() if stage != "settle")
-        return encode_srgb(np.clip(frame.rgb, 0, 1)).astype(np.float32), frame.instance, seconds
+        picture = encode_srgb(np.clip(frame.rgb, 0, 1)).astype(np.float32)
+        return picture, frame.instance, seconds, _largest(frame.order_error)
 
     return shoot
 
@@ -257,7 +267,7 @@ def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[s
         seconds = time.perf_counter() - start
         colour = layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]
         picture = np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1)
-        return picture.astype(np.float32), layers.instance, seconds
+        return picture.astype(np.float32), layers.instance, seconds, _largest(layers.order_error)
 
     return shoot
 
@@ -272,7 +282,7 @@ def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Call
         start = time.perf_counter()
         picture = render_volprim(scene)
         seconds = time.perf_counter() - start
-        return np.clip(encode_srgb(picture), 0, 1).astype(np.float32), np.empty(0, np.uint16), seconds
+        return np.clip(encode_srgb(picture), 0, 1).astype(np.float32), np.empty(0, np.uint16), seconds, math.nan
 
     return shoot
 
@@ -305,6 +315,7 @@ def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
         float(np.mean(ssim)),
         _mask_iou(shots.instances, truth.instances),
         shots.memory,
+        shots.estimate,
     )
 
 

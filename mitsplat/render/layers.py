@@ -65,8 +65,19 @@ class Layers(Deferred):
     def on_device(cls, channels: Mapping[str, Any], shape: tuple[int, int]) -> Layers:
         """Layers of (H, W) pixels that are flat row-major device arrays, colours of three channels."""
         fetch = {name: _host_ids if name.endswith("instance") else host_array for name in channels}
-        makers = {name: partial(fetch[name], value, shape) for name, value in channels.items()}
-        return cls.later(makers, _channels=channels, _shape=shape)
+        known = dict(channels)
+        order_error = known.pop("order_error", None)
+        makers = {name: partial(fetch[name], value, shape) for name, value in known.items()}
+        return cls.later(makers, _channels=known, _shape=shape, _order_error=order_error)
+
+    @property
+    def order_error(self) -> dict[str, float] | None:
+        """Largest and mean error of the pixels' display-encoded colours that the order of blending leaves, estimated.
+
+        None where the quality estimates none, as ``fast``; and of copies.
+        """
+        found = self.__dict__.get("_order_error")
+        return None if found is None else dict(zip(("largest", "mean"), np.array(found).tolist(), strict=True))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -45,6 +45,7 @@ class _Statistics:
         self.size = size
         self.images, self.classes, self.per_image = Counter[str](), Counter[str](), Counter[int]()
         self.shares = {key: Histogram((0, 1)) for key in _SHARES}
+        self.order_errors: list[tuple[float, float]] = []
         cells = 24, max(2, round(24 * size[1] / size[0]))
         self.places, self.sizes = HeatMap(size, cells), HeatMap(size, cells)
 
@@ -53,6 +54,8 @@ class _Statistics:
         self.images[record["split"]] += 1
         self.per_image[len(labels["instances"])] += 1
         self.classes.update(label["class"] for label in labels["instances"])
+        if error := record.get("order_error"):
+            self.order_errors.append((error["largest"], error["mean"]))
         boxes = np.array([label["box"] for label in labels["instances"]], dtype=np.float64).reshape(-1, 4)
         self.places.add((boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2)
         self.sizes.add(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
@@ -105,6 +108,7 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
         "Instances": str(sum(counted.classes.values())),
         "Not labelled": _counts(audit.dropped),
         "Marked": _counts(audit.marked),
+        "Error of the order of blending, estimated": _order_error(counted),
         "Labels from": content["scene"]["labels"]["source"],
         "Formats": ", ".join(content["scene"]["output"]["formats"]),
         "Seed": str(content["scene"]["seed"]),
@@ -114,6 +118,16 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
     }
     lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
     return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2><table>{lines}</table></section>'
+
+
+def _order_error(counted: _Statistics) -> str:
+    """Of display-encoded colours, over the images that know theirs."""
+    found, images = counted.order_errors, sum(counted.images.values())
+    if not found:
+        return "not estimated by this preset"
+    largest, mean = max(e for e, _ in found), sum(e for _, e in found) / len(found)
+    some = "" if len(found) == images else f", in {len(found)} of {images} images"
+    return f"{mean:.1e} of the range on average, {largest:.4f} at most{some}"
 
 
 def _audit(audit: Audit) -> str:

@@ -28,7 +28,20 @@ RINGS, SECTORS = 3, 8
 """Cells of a hemisphere: rings of equal height, hence of equal area (Archimedes), cut into sectors; 30 degrees wide."""
 
 _NO_DRAWS = frozenset(
-    {"index", "layout", "view", "split", "seed", "files", "camera", "labels", "environment", "rest", "depth_scale"}
+    {
+        "index",
+        "layout",
+        "view",
+        "split",
+        "seed",
+        "files",
+        "camera",
+        "labels",
+        "environment",
+        "rest",
+        "depth_scale",
+        "order_error",
+    }
 )
 """Keys of a frame's record that state no draw, or that are looked at in another way."""
 _NO_VALUES = frozenset({"id", "entry", "asset"})

@@ -154,9 +154,9 @@ def refined(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
 def test_rendering_refines_the_preset(scene: ms.Scene, refined: ms.Scene, settled: dict[str, Any]) -> None:
     layout = layout_of_small_scene(scene, settled)
     whole = replace(PRESETS["balanced"], kernel="mip", samples=2)
-    images = [
-        ms.render_frame(refined, 0, layout=layout, quality=quality).image for quality in (None, "balanced", whole)
-    ]
+    frames = [ms.render_frame(refined, 0, layout=layout, quality=quality) for quality in (None, "balanced", whole)]
+    images = [frame.image for frame in frames]
+    assert frames[0].order_error is not None and frames[0].order_error["largest"] <= whole.tolerance
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_array_equal(images[0], images[2])
     assert not np.array_equal(images[0], ms.render_frame(scene, 0, layout=layout).image)

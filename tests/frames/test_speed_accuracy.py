@@ -28,7 +28,7 @@ def splat_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def row(name: str, seconds: float, rmse: float) -> Row:
     psnr = -20 * math.log10(rmse) if rmse else math.inf
-    return Row(name, seconds, rmse, psnr, largest=rmse, ssim=1.0, mask_iou=1.0, memory=0.5)
+    return Row(name, seconds, rmse, psnr, largest=rmse, ssim=1.0, mask_iou=1.0, memory=0.5, estimate=0.0)
 
 
 ROWS = [row("fast", 1.0, 0.01), row("balanced", 2.0, 0.001), row("exact", 9.0, 0.0), row("fast, no shadow", 0.5, 0.0)]
@@ -66,7 +66,9 @@ def test_chart_command_writes_table_csv_and_picture(splat_file: Path, tmp_path: 
     assert {"fast", "balanced", "exact"} < {line["name"] for line in lines}
     theirs = next(line for line in lines if "volprim" in line["name"])
     assert 0 < float(theirs["rmse"]) < 0.5 and theirs["mask_iou"] == "nan"
-    assert float(next(line for line in lines if line["name"] == "exact")["rmse"]) == 0
+    exact, balanced, fast = (next(li for li in lines if li["name"] == name) for name in ("exact", "balanced", "fast"))
+    assert float(exact["rmse"]) == float(exact["estimate"]) == 0
+    assert 0 <= float(balanced["estimate"]) <= PRESETS["balanced"].tolerance and fast["estimate"] == "nan"
 
 
 def test_chart_shows_every_step(tmp_path: Path) -> None:

@@ -162,3 +162,24 @@ def test_late_by_one_place_is_estimated_exactly() -> None:
         record = {6: colour[0], 7: colour[1], 8: colour[2]}
         pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, True)
     assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
+
+
+def test_the_error_that_is_left_is_told_with_the_picture() -> None:
+    """The largest within the tolerance, since tiles above it are made again; the mean by any order of its sum."""
+    small, large = (render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=t)).order_error for t in (5e-3, 0.3))
+    assert small is not None and large is not None
+    assert 0 < small["mean"] < small["largest"] <= 5e-3 < large["largest"] <= 0.3
+    found = errors(replace(RAY, tolerance=0.3))
+    assert found.mean() / 2 < large["mean"] < 2 * found.mean()
+    assert render_splats(CROWD, WIDE, quality=RAY).order_error == {"largest": 0, "mean": 0}
+    assert render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=math.inf)).order_error is None
+
+
+def test_the_largest_and_the_mean_error_are_those_of_the_pixels() -> None:
+    from mitsplat.plugins.march import largest_and_mean
+
+    ensure_variant()
+    values = np.random.default_rng(1).uniform(0, 0.02, 5000).astype(np.float32)
+    largest, mean = largest_and_mean(mi.Float(values))
+    assert largest[0] == values.max() and mean[0] == pytest.approx(values.mean(), rel=1e-4)
+    assert largest_and_mean(mi.Float([3.0, 0.0]))[0][0] == 1

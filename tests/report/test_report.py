@@ -54,6 +54,7 @@ def page(clean: Path, tmp_path: Path) -> Page:
 def test_the_page_says_what_the_dataset_is(page: Page) -> None:
     for text in ("small", "4 train, 2 val", "64 x 48 px", "No violations in", "Seed", "Device", "hidden", "yolo-pose"):
         assert text in page.text
+    assert "2.0e-05 of the range on average, 0.0040 at most" in page.text  # of frames that all state their error
     assert Path(sys.argv[0]).name in page.text  # the command that made it
     assert len(page.all("img")) == min(SAMPLES, 6)
     captions = (

@@ -263,11 +263,16 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
     return image
 
 
+def _too_wrong(errors: list[Any], quality: Quality) -> Any:
+    """Whether estimates of the errors of a lane's rays exceed the tolerance."""
+    return largest(errors) > dr.opaque(mi.Float, quality.tolerance)
+
+
 def _repaired(
     image: Image, errors: list[Any], lists: TileLists, view: View, quality: Quality, z_max: Any | None
 ) -> Image:
     """The image with the tiles in which estimates exceed the tolerance, by lanes, in the order of each ray."""
-    wrong = largest(errors) > dr.opaque(mi.Float, quality.tolerance)
+    wrong = _too_wrong(errors, quality)
     dr.eval(wrong)
     per_tile = TILE * TILE
     lane = dr.arange(mi.UInt32, dr.width(wrong) // per_tile) * per_tile

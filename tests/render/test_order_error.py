@@ -135,10 +135,10 @@ def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> 
 
     judged = march._too_wrong
 
-    def judged_or_black(pixels: list[Any], quality: Quality) -> Any:
+    def judged_or_black(errors: list[Any], quality: Quality) -> Any:
         """Also the black squares of a chequerboard of 24 x 18 tiles."""
-        tile = dr.arange(mi.UInt32, dr.width(pixels[0][0])) // 16
-        return judged(pixels, quality) | ((tile + tile // 24) % 2 == 0)
+        tile = dr.arange(mi.UInt32, dr.width(errors[0])) // 16
+        return judged(errors, quality) | ((tile + tile // 24) % 2 == 0)
 
     monkeypatch.setattr(march, "_too_wrong", judged_or_black)
     quality = Quality(tolerance=1e-3, alpha_min=1e-4, transmittance_min=1e-5, samples=samples)

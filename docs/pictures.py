@@ -9,7 +9,7 @@ import argparse
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,27 @@ def _render_key(picture: Picture, folder: Path) -> Any:
     return cv2.resize(image, SIZE, interpolation=cv2.INTER_NEAREST if picture.zoom > 1 else cv2.INTER_AREA)
 
 
+def _make_places(folder: Path) -> None:
+    """Images behind and on things, and a second cell: the workcell with red and blue exchanged."""
+    import cv2
+    import numpy as np
+
+    from mitsplat.asset import Asset
+
+    (folder / "photos").mkdir()
+    for name in ("workcell", "bin_picking", "fisheye", "moving_light"):
+        (folder / f"photos/{name}.jpg").symlink_to(FOLDER / f"gallery-{name}.jpg")
+    bricks = np.full((256, 256, 3), (190, 190, 185), dtype=np.uint8)
+    for row in range(4):
+        for left in range(-64 * (row % 2), 256, 128):
+            colour = tuple(map(int, np.array([60, 75, 150]) + 8 * ((left // 64 + row) % 3)))
+            cv2.rectangle(bricks, (left + 3, 64 * row + 3), (left + 124, 64 * row + 60), colour, -1)
+    cv2.imwrite(str(folder / "bricks.png"), bricks)
+    cell = Asset.load(SCENES / "assets/workcell")
+    splats = replace(cell.splats, sh=np.ascontiguousarray(cell.splats.sh[..., ::-1]))
+    replace(cell, splats=splats).save(folder / "red_cell")
+
+
 def _render_scene(name: str) -> Any:
     import mitsplat as ms
 
@@ -156,6 +177,7 @@ def main() -> None:
         (folder / "assets").symlink_to(SCENES / "assets")
         trimesh.creation.torus(0.05, 0.015).apply_translation((0, 0, 0.015)).export(folder / "ring.ply")
         _write_skies(folder / "skies")
+        _make_places(folder)
         failed = []
         for file, (key, make) in work.items():
             if (wanted and key not in wanted) or (options.missing and file.exists()):

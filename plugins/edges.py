@@ -66,10 +66,14 @@ class Edges:
 
     def rays(self) -> Any:
         """World-space rays of the finer view, of unit direction."""
-        x, y = self._places()
-        rays = self.fine.rays_through(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
+        rays = self.fine.rays_through(*self.positions())
         dr.eval(rays)
         return rays
+
+    def positions(self) -> tuple[Any, Any]:
+        """Pixel positions (x, y) of those rays in the finer view [px]."""
+        x, y = self._places()
+        return mi.Float(x) + 0.5, mi.Float(y) + 0.5
 
     def trace(self, clouds: CloudSet, placements: Sequence[Placement], quality: Quality, z_max: Any | None) -> Image:
         """What those rays see of splats; arguments as of :func:`mitsplat.plugins.march.trace`.

@@ -160,11 +160,15 @@ class View:
 
     def rays(self) -> Any:
         """World-space rays through the pixels' centres, row-major, of unit direction."""
-        pixel = dr.arange(mi.UInt32, self.width * self.height)
-        row = pixel // self.width
-        ray = self.rays_through(mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5)
+        ray = self.rays_through(*self.centres())
         dr.eval(ray)
         return ray
+
+    def centres(self) -> tuple[Any, Any]:
+        """Positions (x, y) of the pixels' centres, row-major [px]."""
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        row = pixel // self.width
+        return mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5
 
     def rays_through(self, x: Any, y: Any) -> Any:
         """World-space rays through pixel positions (x, y) [px], of unit direction."""

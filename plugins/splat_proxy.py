@@ -319,7 +319,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if edges is None:
             return {}
         rays = edges.rays()
-        behind, lamps, z_max = self._behind(contents, scene, view, rays)
+        behind, lamps, z_max = self._behind(contents, scene, edges.fine, rays, edges.positions())
         splat = Image.empty(dr.width(rays.d))
         if contents.clouds is not None:
             splat = edges.trace(contents.clouds, contents.placements, self.quality, z_max)
@@ -339,10 +339,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return smooth
 
     def _behind(
-        self, contents: _Contents, scene: Any, view: View, rays: Any
+        self, contents: _Contents, scene: Any, view: View, rays: Any, at: tuple[Any, Any] | None = None
     ) -> tuple[Behind | None, SeenLights | None, Any | None]:
-        """Visible meshes and emitters that rays meet, and the depths [m] of the nearest of them."""
-        behind = contents.meshes.trace(view, rays) if contents.meshes else None
+        """Visible meshes and emitters that rays meet, and the depths [m] of the nearest of them.
+
+        Rays are those through the positions ``at`` of the view [px], or through the centres of all its pixels.
+        """
+        behind = contents.meshes.trace(view, rays, at) if contents.meshes else None
         lamps = None if self.hide_emitters else SeenLights.trace(scene, view, rays)
         z_max = behind.depth if behind else None
         if lamps:

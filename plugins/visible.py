@@ -37,6 +37,9 @@ PER_VERTEX = 16
 ROUNDS = 8
 """Of the hash behind them (Zafar et al. 2010): after four, numbers of neighbouring pixels are still alike."""
 
+FOOTPRINT = 4
+"""Points along each side of a pixel's footprint that the reflectance of patterned meshes is looked at."""
+
 _BENT = ("NormalMap", "BumpMap")
 """Materials that bend the normals of the one that they hold."""
 
@@ -54,6 +57,11 @@ def is_plain(bsdf: Any) -> bool:
 def is_clear(bsdf: Any) -> bool:
     """Whether light passes through a material, so that it casts no shadow on splats and diffuse meshes."""
     return bool(_has(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(bsdf)
+
+
+def has_texture(bsdf: Any) -> bool:
+    """Whether a material changes with texture coordinates; Mitsuba's flag for that is not set for textures."""
+    return any(key.endswith(".to_uv") for key in mi.traverse(bsdf).keys())  # noqa: SIM118 - no mapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +104,12 @@ class VisibleMeshes:
     Attributes:
         scene: A Mitsuba scene of them alone.
         plain: By number of the shape, whether it is plainly diffuse; None if all are.
+        patterned: Whether the reflectance of any of them changes over its surface.
     """
 
     scene: Any
     plain: Any
+    patterned: bool
 
     @classmethod
     def build(cls, shapes: Sequence[Any]) -> VisibleMeshes | None:
@@ -108,12 +118,13 @@ class VisibleMeshes:
             return None
         scene = ray_scene({f"visible_{i}": shape for i, shape in enumerate(shapes)})
         plain = [is_plain(shape.bsdf()) for shape in shapes]
+        patterned = any(map(has_texture, (shape.bsdf() for shape in shapes)))
         if all(plain):
-            return cls(scene, None)
+            return cls(scene, None, patterned)
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
         table = np.zeros(1 + max(numbers), bool)
         table[numbers] = plain
-        return cls(scene, wrapped(mi.Bool, table))
+        return cls(scene, wrapped(mi.Bool, table), patterned)
 
     def is_plain(self, hit: Any) -> Any:
         """Whether what is hit is plainly diffuse; false where nothing is."""
@@ -121,18 +132,39 @@ class VisibleMeshes:
             return hit.is_valid()
         return dr.gather(mi.Bool, self.plain, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
 
-    def trace(self, view: View, rays: Any) -> Behind:
-        """What the camera's rays meet."""
+    def trace(self, view: View, rays: Any, at: tuple[Any, Any] | None = None) -> Behind:
+        """What camera rays meet: those through positions ``at`` [px], or through the centres of all pixels."""
         hit = self.scene.ray_intersect_preliminary(rays, coherent=True)
         si = hit.compute_surface_interaction(rays)
         valid = si.is_valid()
         plain = self.is_plain(hit)
-        reflectance = si.bsdf().eval_diffuse_reflectance(si, valid & plain)
+        reflectance = self._reflectance(view, rays, at, si, valid & plain)
         depth = dr.select(valid, si.t * view.cosine(rays), dr.inf)
         normal, face = (dr.select(dr.dot(n, rays.d) > 0, -n, n) for n in (si.sh_frame.n, si.n))
         behind = Behind(depth, reflectance, valid, plain, normal, face, hit)
         dr.eval(behind)
         return behind
+
+    def _reflectance(self, view: View, rays: Any, at: tuple[Any, Any] | None, si: Any, active: Any) -> Any:
+        """Diffuse albedo (Color3f) where rays meet meshes; of patterns, its mean over the pixel's footprint.
+
+        The footprint is the parallelogram of ray differentials (Igehy 1999), sampled at ``FOOTPRINT`` squared points.
+        """
+        if not self.patterned:
+            return si.bsdf().eval_diffuse_reflectance(si, active)
+        x, y = at or view.centres()
+        wide = mi.RayDifferential3f(rays)
+        wide.o_x, wide.o_y, wide.has_differentials = rays.o, rays.o, True
+        wide.d_x, wide.d_y = view.direction(x + 1, y), view.direction(x, y + 1)
+        si.compute_uv_partials(wide)
+        bsdf, uv, total = si.bsdf(), mi.Point2f(si.uv), mi.Color3f(0)
+        across, along = (dr.select(dr.isfinite(step), step, 0) for step in (si.duv_dx, si.duv_dy))
+        for i in range(FOOTPRINT**2):
+            s, t = ((number + 0.5) / FOOTPRINT - 0.5 for number in divmod(i, FOOTPRINT))
+            si.uv = uv + s * across + t * along
+            total += bsdf.eval_diffuse_reflectance(si, active)
+        si.uv = uv
+        return total / FOOTPRINT**2
 
 
 @dataclass(frozen=True, eq=False)

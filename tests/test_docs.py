@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from mitsplat.checks import check_path
+from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene import SceneSpec, scene_json_schema
-from mitsplat.scene.untrusted_xml import check_xml
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -12,8 +12,8 @@ import pytest
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.frames import mitsuba_xml as xml_scene
+from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene.scene import load_scene
-from mitsplat.scene.untrusted_xml import check_xml
 from mitsplat.splats import Splats
 from tests.cli.test_cli import run
 from tests.conftest import box_asset

@@ -34,6 +34,7 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces
 from mitsplat.physics.settle import settle_layout, settle_layouts, warp_settings
+from mitsplat.scene.contents import draw_objects
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, load_scene
 from mitsplat.splats import Splats
@@ -223,10 +224,10 @@ def measure_rest(count: int) -> None:
         drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)
         times, moved, total = [], 0, 0
         for seed in range(count):
-            assets, _ = drop._draw_objects(0)
+            assets, _ = draw_objects(drop.scene, 0)
             world = drop._world(assets, drop._draw_frictions(0), 1.0)
             world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
-            outcome = run_to_rest(world, max_time=6.0, bounds=drop._bounds)
+            outcome = run_to_rest(world, max_time=6.0, bounds=drop._grounds[0].bounds)
             if outcome.refused:
                 print(f"  seed {seed}: {outcome.refused}")
                 continue
@@ -259,10 +260,17 @@ def measure_worlds(count: int, device: str) -> None:
 
     scene = make_scene(parts(), 2, "warp")
     drop = drop_of(scene, lambda text: None)
-    assets, _ = drop._draw_objects(0)
+    assets, _ = draw_objects(drop.scene, 0)
     starts = [drop.draw_poses(assets, np.random.default_rng(world)) for world in range(count)]
     bodies = [drop._objects[asset].body for asset in assets]
-    time_worlds(bodies, drop._colliders, starts, drop._bounds, timestep=scene.spec.settle.timestep, device=device)
+    time_worlds(
+        bodies,
+        drop._grounds[0].colliders,
+        starts,
+        drop._grounds[0].bounds,
+        timestep=scene.spec.settle.timestep,
+        device=device,
+    )
 
 
 def measure_share(count: int) -> None:

@@ -37,8 +37,8 @@ from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import given_masks
 from mitsplat.capture.photos import Prepared
 from mitsplat.errors import InputError
+from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene.scene import load_scene
-from mitsplat.scene.untrusted_xml import check_xml
 from mitsplat.splats import Splats
 
 MEMORY = 12 << 30

@@ -164,8 +164,9 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         yield Finding("formats", False, str(error), "change output.formats, or what they need")
     faults = list(run_faults(scene))
     yield from faults or doubts(scene)
-    loaded = [asset for asset in (scene.environment, *scene.assets) if asset is not None]
-    assets = {id(asset.splats): asset for asset in loaded}.values()  # several may have one name
+    assets = {
+        id(asset.splats): asset for asset in (*scene.environments, *scene.assets)
+    }.values()  # several may have one name
     for asset in assets:
         name = asset.name
         wrong = [finding for finding in check_asset(asset) if not finding.ok]
@@ -183,7 +184,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         "make the region larger, lower objects[].count, or use settle.arrangement: pile",
     )  # fmt: skip
     support = any(shape.collider and not shape.name.startswith("enclosure ") for shape in spec.shapes)
-    support |= spec.environment_collides and scene.environment is not None
+    support |= spec.environment_collides and bool(scene.environments)
     text = "objects have something to lie on" if support else "nothing collides with objects"
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
     yield _sight(scene, extent)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import trimesh
 
 from mitsplat.content_hash import ContentHash, file_hash
+from mitsplat.scene.scene import image_lists
 from mitsplat.scene.spec_lights import EnvironmentLight
 from mitsplat.splats import Splats
 
@@ -34,8 +35,9 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
         for number, asset in enumerate(pool):
             key = f"objects[{position}]" + (f"[{number}]" if len(pool) > 1 else "")
             found[key] = described.asset(scene.assets[asset])
-    if scene.environment is not None:
-        found["environment"] = described.asset(scene.environment)
+    for number, environment in enumerate(scene.environments):
+        key = "environment" + (f"[{number}]" if len(scene.environments) > 1 else "")
+        found[key] = described.asset(environment)
     for i, mesh in enumerate(scene.shape_meshes):
         found[f"shapes[{i}]"] = described.value(mesh)
     for i, light in enumerate(scene.spec.lights):
@@ -43,6 +45,11 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
             for number, image in enumerate(light.names):
                 key = "image" if light.image is not None else f"pool[{number}]"
                 found[f"lights[{i}].{key}"] = file_hash(scene.images[image])
+    for keys, images in image_lists(scene.spec):
+        digest = ContentHash()
+        for name in images:
+            digest.add(file_hash(scene.images[name]))
+        found[".".join(map(str, keys))] = digest.hexdigest()
     return found
 
 

@@ -301,9 +301,8 @@ def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
     for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
         if shape.collider:
             yield shape.name, mesh
-    around = scene.environment
-    if scene.spec.environment_collides and around is not None and around.mesh is not None:
-        yield around.name, around.mesh
+    if scene.spec.environment_collides:
+        yield from ((around.name, around.mesh) for around in scene.environments if around.mesh is not None)
 
 
 def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:

@@ -150,6 +150,37 @@ class _OrderError(_Stored):
     mean: Share
 
 
+class _DrawnEnvironment(_Stored):
+    number: Count
+    name: str
+
+
+class _Finish(_Stored):
+    kind: str
+    colours: list[Point] = []
+    scale: Annotated[float, Field(gt=0)]
+    rotate: float
+    offset: tuple[float, float]
+    roughness: Share | None = None
+    gain: Annotated[float, Field(gt=0)] | None = None
+    image: str | None = None
+    seed: Count
+
+
+class _Backing(_Stored):
+    image: str
+    crop: Annotated[float, Field(gt=0, le=1)]
+    place: tuple[Share, Share]
+    rotate: float
+    gain: Annotated[float, Field(gt=0)]
+
+
+class _Place(_Stored):
+    environment: _DrawnEnvironment | None = None
+    materials: dict[str, _Finish] = {}
+    background: _Backing | None = None
+
+
 class _Record(_Stored):
     index: Count
     layout: Count
@@ -163,6 +194,7 @@ class _Record(_Stored):
     depth_scale: Annotated[float, Field(gt=0)] | None = None
     objects: list[_Drawn] | None = None
     viewpoint: _Viewpoint | None = None
+    place: _Place | None = None
     empty: bool = False
     order_error: _OrderError | None = None
 

@@ -38,6 +38,7 @@ from mitsplat.files import Record
 from mitsplat.formats import bop, coco, label_studio, maps, voc, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
+from mitsplat.render.places import draw_place
 from mitsplat.scene.contents import is_empty
 from mitsplat.scene.spec import FORMATS, Output, SceneSpec
 
@@ -89,6 +90,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
+    if place := draw_place(spec, frame.index).to_json(spec):
+        record["place"] = place
     if spec.empty:
         record["empty"] = is_empty(spec, plan.layout)
     if frame.order_error is not None:

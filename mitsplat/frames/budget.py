@@ -58,8 +58,9 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     pools = [[scene.assets[i].splats for i in pool] for pool in scene.pools]
     placed = [(max(pool, key=len), count) for pool, count in zip(pools, most, strict=True)]
     middle = np.add(spec.region.min, spec.region.max) / 2
-    static = [] if scene.environment is None else [scene.environment.splats]
-    splats = {id(one): one for one in (*static, *(one for pool in pools for one in pool))}.values()
+    around = [environment.splats for environment in scene.environments]
+    static = [max(around, key=len)] if around else []
+    splats = {id(one): one for one in (*around, *(one for pool in pools for one in pool))}.values()
     stored = sum(getattr(one, f.name).nbytes for one in splats for f in fields(one))
     count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
     samples = replace(resolve_quality(spec.quality), **spec.rendering.model_dump()).grid

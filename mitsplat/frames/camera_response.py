@@ -40,8 +40,8 @@ def light_image(layers: Layers, composite: Composite) -> Float32Array:
     return host_array(light_layers(layers, composite), layers.shape)
 
 
-def light_layers(layers: Layers, composite: Composite) -> Any:
-    """The same on the device: flat and row-major, Color3f."""
+def light_layers(layers: Layers, composite: Composite, behind: Any = BACKGROUND) -> Any:
+    """The same on the device, over what is behind: flat and row-major, Color3f."""
     alpha = layers.device_array("alpha")
     lit = layers.device_array("rgb" if composite.shadow == "traced" else "captured")
     if composite.shadow == "image":
@@ -52,7 +52,7 @@ def light_layers(layers: Layers, composite: Composite) -> Any:
         lit = lit * factor
         if composite.highlight:
             lit += shine * alpha
-    return lit + BACKGROUND * (1 - alpha)
+    return lit + behind * (1 - alpha)
 
 
 def shadow_from_image(shadow_map: Float32Array, parameters: ImageShadow) -> tuple[Float32Array, Float32Array]:

@@ -20,7 +20,8 @@ from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
-from mitsplat.frames.camera_response import develop_layers, light_layers
+from mitsplat.frames.background import background_picture
+from mitsplat.frames.camera_response import BACKGROUND, develop_layers, light_layers
 from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.masks import Silhouette
 from mitsplat.physics.settle import settle_layout
@@ -30,12 +31,15 @@ from mitsplat.render.deferred import Deferred
 from mitsplat.render.emitters import emitter_dict, movable
 from mitsplat.render.layers import (
     Layers,
+    device_array,
     host_array,
     make_integrator,
     make_splats_shape,
     render_layers,
     render_silhouettes,
 )
+from mitsplat.render.places import Backing, Place, draw_place, environment_at
+from mitsplat.render.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
@@ -48,6 +52,9 @@ KEPT_LAYOUTS = 4
 
 NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
 """Splats of a proxy that only receives and casts shadows."""
+
+NOWHERE = Place()
+"""The place of a scene that draws none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +194,8 @@ class Renderer:
         self.quality = quality
         self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
-        self._static = self._static_shapes()
+        self._static: tuple[Place, dict[str, Any]] | None = None
+        self._behind: tuple[Backing, Any] | None = None
         self._placed: tuple[Layout, dict[str, Any]] | None = None
         self._settled: dict[int, Layout] = {}
         self._sky: tuple[str, Any] | None = None
@@ -196,7 +204,7 @@ class Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.integrator, self._static, self._placed, self._sky = None, {}, None, None
+        self.integrator, self._static, self._placed, self._sky, self._behind = None, None, None, None, None
         self._settled.clear()
 
     @one_at_a_time
@@ -223,7 +231,8 @@ class Renderer:
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
             composite, shape = self.scene.spec.composite, layers.shape
-            linear = light_layers(layers, composite)
+            behind = self._background(draw_place(self.scene.spec, index).background, plan.camera)
+            linear = light_layers(layers, composite, behind)
             development = develop_layers(
                 linear, shape, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed
             )
@@ -270,7 +279,8 @@ class Renderer:
                 objects[f"instance_{instance.id}"] = _asset_shape(asset, instance.world_from_object, instance.id)
             self._placed = layout, objects
         emitters = {f"light_{i}": self._made(self._emitter(light)) for i, light in enumerate(lights)}
-        return {"type": "scene", **self._static, **self._placed[1], **emitters}
+        place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
+        return {"type": "scene", **self._surroundings(place), **self._placed[1], **emitters}
 
     def _emitter(self, light: LightSpec) -> dict[str, Any]:
         if isinstance(light, EnvironmentLight) and light.image is not None:
@@ -291,12 +301,35 @@ class Renderer:
         state.update()
         return self._sky[1]
 
-    def _static_shapes(self) -> dict[str, Any]:
+    def _background(self, backing: Backing | None, camera: Camera) -> Any:
+        """What is behind everything, on the device; kept as long as it is the same."""
+        if backing is None:
+            return BACKGROUND
+        if self._behind is None or self._behind[0] != backing:
+            picture = background_picture(backing, self.scene.images[backing.image], camera.width, camera.height)
+            self._behind = backing, device_array(picture)
+        return self._behind[1]
+
+    def _surroundings(self, place: Place) -> dict[str, Any]:
+        """What does not move in a place; the same objects as before if they look the same."""
+        place = replace(place, background=None)
+        if self._static is None or self._static[0] != place:
+            self._static = place, self._static_shapes(place)
+            self.integrator.white = white_irradiance(self.scene, place)
+        return self._static[1]
+
+    def _static_shapes(self, place: Place) -> dict[str, Any]:
         shapes: dict[str, Any] = {}
-        if self.scene.environment is not None:
-            shapes["environment"] = _asset_shape(self.scene.environment, np.eye(4), 0)
+        environment = environment_at(self.scene, place)
+        if environment is not None:
+            shapes["environment"] = _asset_shape(environment, np.eye(4), 0)
         for i, (shape, mesh) in enumerate(zip(self.scene.spec.shapes, self.scene.shape_meshes, strict=True)):
-            if shape.visible:
+            if shape.visible and shape.materials:
+                finish = place.finishes[shape.name]
+                image = texture_image(finish, self.scene.images)
+                bsdf = mi.load_dict(material(finish, None if image is None else bitmap_texture(image)))
+                shapes[f"shape_{i}"] = finished_mesh(mesh, shape, finish, image, bsdf)
+            elif shape.visible:
                 shapes[f"shape_{i}"] = _visible_shape(shape.colour, mesh)
             elif shape.proxy:
                 shapes[f"shape_{i}"] = make_splats_shape(NOTHING, proxy=mesh)
@@ -324,8 +357,8 @@ def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) ->
     return plain_mesh(mesh, props)
 
 
-def light_properties(scene: Scene) -> dict[str, Any]:
-    """Properties of the integrator ``splat_proxy`` by which it lights a scene as its file says."""
+def light_properties(scene: Scene, place: Place = NOWHERE) -> dict[str, Any]:
+    """Properties of the integrator ``splat_proxy`` by which it lights a place of a scene as its file says."""
     composite = scene.spec.composite
     return {
         "shadow": "none" if composite.shadow == "none" else "traced",
@@ -334,20 +367,21 @@ def light_properties(scene: Scene) -> dict[str, Any]:
         "bounce": composite.bounce,
         "highlight": composite.highlight,
         "reference": list(reference_point(scene)),
-        "white": white_irradiance(scene),
+        "white": white_irradiance(scene, place),
         # What no splat covers is the grey of mitsplat.frames.camera_response, which draws no light source.
         "hide_emitters": True,
     }
 
 
-def white_irradiance(scene: Scene) -> float:
-    """Irradiance [W/m^2] of display white in the surroundings, or 0 where it is unknown or of no matter.
+def white_irradiance(scene: Scene, place: Place) -> float:
+    """Irradiance [W/m^2] of display white in a place's surroundings, or 0 where it is unknown or of no matter.
 
     The image-space shadow only looks at light relative to its brightest.
     """
-    if scene.environment is None or scene.spec.composite.shadow == "image":
+    environment = environment_at(scene, place)
+    if environment is None or scene.spec.composite.shadow == "image":
         return 0.0
-    return scene.environment.white or 0.0
+    return environment.white or 0.0
 
 
 def reference_point(scene: Scene) -> tuple[float, float, float]:

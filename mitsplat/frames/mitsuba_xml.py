@@ -20,20 +20,22 @@ from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
+from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.physics.settle import settle_layout
 from mitsplat.plugins.sensors import view_of
 from mitsplat.progress import Note
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import describe_sensor, ensure_variant
+from mitsplat.render.places import Finish, draw_place
+from mitsplat.render.textures import finished_mesh, material, texture_image
 from mitsplat.scene.scene import Scene, layout_of, plan_frame
 from mitsplat.scene.spec_shapes import Shape
-from mitsplat.scene.untrusted_xml import check_xml
 
 
 def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     """Write one frame as a Mitsuba scene, with its splats and meshes in a folder beside it.
 
-    The scene shows what the frame's layers hold; exposure, tone and noise are not part of it.
+    The scene shows what the frame's layers hold; exposure, tone, noise and background images are not part of it.
 
     Raises:
         InputError: If the index is out of range, or the layout cannot be settled.
@@ -46,9 +48,11 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     plan = plan_frame(scene, index, layout)
     files.mkdir(parents=True, exist_ok=True)
     shapes: dict[str, Any] = {}
-    if scene.environment is not None:
-        stem = _write_asset(scene.environment, files / "environment")
-        shapes["environment"] = _describe_asset(scene.environment, stem, np.eye(4), 0)
+    place = draw_place(scene.spec, index)
+    environment = scene.environment_of(layout.index)
+    if environment is not None:
+        stem = _write_asset(environment, files / "environment")
+        shapes["environment"] = _describe_asset(environment, stem, np.eye(4), 0)
     # Named by place: names of assets need be neither distinct nor those of files.
     stems = {i: _write_asset(scene.assets[i], files / f"object_{i}") for i in {one.asset for one in layout.instances}}
     for one in layout.instances:
@@ -56,7 +60,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         shapes[f"instance_{one.id}"] = description
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if shape.visible:
-            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, files / f"shape_{number}.ply")
+            stem = files / f"shape_{number}"
+            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, stem, place.finishes.get(shape.name), scene)
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {
         "type": "scene",
@@ -65,7 +70,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
             "type": "splat_proxy",
             "quality": scene.spec.quality,
             **scene.spec.rendering.model_dump(),
-            **light_properties(scene),
+            **light_properties(scene, place),
         },
         "sensor": describe_sensor(plan.camera),
         **shapes,
@@ -82,7 +87,7 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     Args:
         path: The ``.xml`` file.
         out: Picture to write (``.png``, ``.jpg`` or ``.exr``), or a folder, which gets ``picture.png``.
-        allow_outside: Whether it may name files outside of its folder, see :mod:`mitsplat.scene.untrusted_xml`.
+        allow_outside: Whether it may name files outside of its folder, see :mod:`mitsplat.frames.untrusted_xml`.
 
     Returns:
         Path of the picture.
@@ -212,7 +217,23 @@ def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, inst
     }
 
 
-def _describe_shape(shape: Shape, mesh: trimesh.Trimesh, path: Path) -> dict[str, Any]:
+def _describe_shape(
+    shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: Finish | None, scene: Scene
+) -> dict[str, Any]:
+    """A mesh as ``stem.ply`` and, if it has a pattern, ``stem.png``."""
+    path = stem.with_suffix(".ply")
+    if finish is not None:
+        image, texture = texture_image(finish, scene.images), None
+        if image is not None:
+            mi.Bitmap(image).write(str(stem.with_suffix(".png")))
+            texture = {"type": "bitmap", "filename": f"{path.parent.name}/{stem.name}.png"}
+        finished_mesh(mesh, shape, finish, image).write_ply(str(path))
+        return {
+            "type": "ply",
+            "filename": f"{path.parent.name}/{path.name}",
+            "face_normals": True,
+            "bsdf": material(finish, texture),
+        }
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
     return {
         "type": "ply",

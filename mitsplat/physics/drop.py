@@ -22,7 +22,7 @@ from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
-from mitsplat.scene.contents import draw_objects
+from mitsplat.scene.contents import draw_environment, draw_objects
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
@@ -48,6 +48,21 @@ class _Part:
     body: Body
     surface: Surface
     standoff: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """What does not move; colliders and obstacles are parallel.
+
+    Attributes:
+        contact_finder: For all objects and these colliders.
+        bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+    """
+
+    colliders: tuple[Collider, ...]
+    obstacles: tuple[PlacedSurface, ...]
+    contact_finder: ContactFinder
+    bounds: tuple[Float64Array, Float64Array]
 
 
 @dataclass(frozen=True)
@@ -79,17 +94,13 @@ class Drop:
     def __init__(self, scene: Scene, progress: Note) -> None:
         self.scene = scene
         self._parts: dict[int, _Part] = {}
-        self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float], World] = {}
+        self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float, int], World] = {}
         self._made = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
-        self._colliders: list[Collider] = []
-        self._obstacles: list[PlacedSurface] = []
-        walls = self._add_colliders(progress)
-        self._contact_finder = ContactFinder(all_pieces((part.body for part in self._objects), self._colliders))
-        self._check_given_poses()
-        self._bounds = enclosed_bounds(scene.spec.region, [item.bounds for item in self._obstacles], walls)
-        if scene.spec.settle.arrangement == "pile":
-            self._bounds[1][2] += PILE_HEIGHT
+        surroundings = scene.environments if scene.spec.environment_collides else ()
+        self._grounds = tuple(self._make_ground(around, progress) for around in surroundings or (None,))
+        for ground in self._grounds:
+            self._check_given_poses(ground)
 
     def settle(self, index: int) -> Layout:
         """Draw poses until a layout holds.
@@ -101,21 +112,22 @@ class Drop:
         assets, given = draw_objects(self.scene, index)
         if not assets:
             return Layout(index, (), NOTHING_TO_REST)
-        frictions = self._draw_frictions(index)
+        frictions, number = self._draw_frictions(index), self._ground_of(index)
+        obstacles = self._grounds[number].obstacles
         for attempt in range(spec.settle.attempts):
-            start = self.draw_poses(assets, random_stream(spec.seed, "object poses", index, attempt), given)
-            world = self._world(assets, frictions, capacity)
+            start = self.draw_poses(assets, random_stream(spec.seed, "object poses", index, attempt), given, number)
+            world = self._world(assets, frictions, capacity, number)
             world.reset(start)
-            outcome = self._run(world)
+            outcome = self._run(world, number)
             reason = outcome.refused
             if reason == OVERFLOW:
                 capacity *= 2
             if not reason:
                 resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
-                clearances = all_clearances(resting, self._obstacles, reach=_REACH)
+                clearances = all_clearances(resting, obstacles, reach=_REACH)
                 gaps = _support_gaps(resting, clearances)
-                reason = _fault(clearances, gaps, self._obstacles) or self._disarray(
-                    resting, clearances, start, outcome.poses, given
+                reason = _fault(clearances, gaps, obstacles) or self._disarray(
+                    resting, clearances, obstacles, start, outcome.poses, given
                 )
             if reason:
                 refused.append(reason)
@@ -128,8 +140,8 @@ class Drop:
                 max_speed=outcome.max_speed,
                 max_spin=outcome.max_spin,
                 surface_motion=outcome.surface_motion,
-                collider_penetration=_deepest(pair for pair in clearances if pair.second in self._obstacles),
-                pair_penetration=_deepest(pair for pair in clearances if pair.second not in self._obstacles),
+                collider_penetration=_deepest(pair for pair in clearances if pair.second in obstacles),
+                pair_penetration=_deepest(pair for pair in clearances if pair.second not in obstacles),
                 support_gap=max(gaps.values()),
                 standoff=max(self._objects[asset].standoff for asset in assets),
                 attempts=attempt + 1,
@@ -150,21 +162,27 @@ class Drop:
         certificate = layout.certificate
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
-        world = self._world(assets, self._draw_frictions(layout.index), capacity)
-        world.reset(self.draw_poses(assets, rng, given))
+        number = self._ground_of(layout.index)
+        world = self._world(assets, self._draw_frictions(layout.index), capacity, number)
+        world.reset(self.draw_poses(assets, rng, given, number))
         moments = [world.poses]
 
         def observe(time: float, poses: Float64Array) -> None:
             if len(moments) * interval <= time <= certificate.time_to_rest:
                 moments.append(poses)
 
-        self._run(world, observe=observe)
+        self._run(world, number, observe=observe)
         yield from moments
 
-    def _run(self, world: World, **options: Any) -> Outcome:
+    def _ground_of(self, layout: int) -> int:
+        """Which of the grounds a layout lies on: objects do not notice environments that do not collide."""
+        return draw_environment(self.scene.spec, layout) if len(self._grounds) > 1 else 0
+
+    def _run(self, world: World, ground: int, **options: Any) -> Outcome:
         settle = self.scene.spec.settle
         fastest = _POURED if settle.arrangement == "pile" else np.inf
-        return run_to_rest(world, max_time=settle.max_time, bounds=self._bounds, fastest=fastest, **options)
+        bounds = self._grounds[ground].bounds
+        return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, **options)
 
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
         """Friction coefficient of each asset in a layout."""
@@ -172,27 +190,28 @@ class Drop:
         rng = random_stream(spec.seed, "friction", index)
         return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
 
-    def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float) -> World:
-        """The simulation of these assets; the last one is kept."""
-        if (assets, frictions, capacity) not in self._worlds:
-            settle = self.scene.spec.settle
+    def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float, number: int = 0) -> World:
+        """The simulation of these assets on one of the grounds; the last one is kept."""
+        key = assets, frictions, capacity, number
+        if key not in self._worlds:
+            settle, ground = self.scene.spec.settle, self._grounds[number]
             bodies = [self._objects[asset].body.with_friction(frictions[asset]) for asset in assets]
             self._worlds.clear()
             self._made += 1
             if self._made % _GARBAGE == 0:
                 gc.collect()
-            self._worlds[assets, frictions, capacity] = (
-                MujocoWorld(bodies, self._colliders, timestep=settle.timestep)
+            self._worlds[key] = (
+                MujocoWorld(bodies, ground.colliders, timestep=settle.timestep)
                 if settle.stepper == "mujoco"
                 else WarpWorld(
                     bodies,
-                    self._colliders,
+                    ground.colliders,
                     timestep=settle.timestep,
                     capacity=capacity,
-                    contact_finder=self._contact_finder,
+                    contact_finder=ground.contact_finder,
                 )
             )
-        return self._worlds[assets, frictions, capacity]
+        return self._worlds[key]
 
     def _part(self, asset: Asset, progress: Note) -> _Part:
         """What physics needs of an asset, made once for all entries that share its mesh."""
@@ -215,14 +234,16 @@ class Drop:
             self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, asset.friction), surface, stands_off)
         return self._parts[id(asset.mesh)]
 
-    def _add_colliders(self, progress: Note) -> list[int]:
-        """Fill colliders and obstacles, which are parallel; positions of the invisible ones: the enclosure."""
-        scene, walls = self.scene, []
+    def _make_ground(self, surroundings: Asset | None, progress: Note) -> _Ground:
+        """Shapes that collide, and surroundings if they do."""
+        scene, walls = self.scene, []  # positions of what is invisible: the enclosure
+        colliders: list[Collider] = []
+        obstacles: list[PlacedSurface] = []
         for shape, shape_mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
             if not shape.collider:
                 continue
             if not (shape.visible or shape.proxy):
-                walls.append(len(self._colliders))
+                walls.append(len(colliders))
             mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
             if shape.bin is not None:
                 collider = Collider(shape.friction, pieces=bin_walls(shape.bin))
@@ -230,25 +251,28 @@ class Drop:
                 collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
             else:
                 collider = Collider(shape.friction, box=(shape.box.size, stated_pose(shape.box)))
-            self._colliders.append(collider)
-            self._obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
-        surroundings = scene.environment
-        if scene.spec.environment_collides and surroundings is not None and surroundings.mesh is not None:
+            colliders.append(collider)
+            obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
+        if surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
             pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
-            self._colliders.append(Collider(surroundings.friction, pieces=pieces))
-            self._obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
-        if not self._colliders:
+            colliders.append(Collider(surroundings.friction, pieces=pieces))
+            obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
+        if not colliders:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
-        return walls
+        bounds = enclosed_bounds(scene.spec.region, [item.bounds for item in obstacles], walls)
+        if scene.spec.settle.arrangement == "pile":
+            bounds[1][2] += PILE_HEIGHT
+        finder = ContactFinder(all_pieces((part.body for part in self._objects), colliders))
+        return _Ground(tuple(colliders), tuple(obstacles), finder, bounds)
 
-    def _check_given_poses(self) -> None:
+    def _check_given_poses(self, ground: _Ground) -> None:
         """Refuse poses of the scene file that start in one another or in a collider, which would part them anyhow."""
         keys: dict[PlacedSurface, str] = {}
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
                 keys[self._placed(self.scene.pools[entry][0], stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
-        for pair in all_clearances(list(keys), self._obstacles, reach=_REACH):
+        for pair in all_clearances(list(keys), ground.obstacles, reach=_REACH):
             if -pair.distance > _DEEPEST_GIVEN:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
                 raise InputError(
@@ -257,9 +281,13 @@ class Drop:
                 )
 
     def draw_poses(
-        self, assets: Sequence[int], rng: np.random.Generator, given: Sequence[Float64Array | None] = ()
+        self,
+        assets: Sequence[int],
+        rng: np.random.Generator,
+        given: Sequence[Float64Array | None] = (),
+        ground: int = 0,
     ) -> Float64Array:
-        """Poses (N, 4, 4) to start from, see :func:`mitsplat.physics.placement.draw_poses`.
+        """Poses (N, 4, 4) to start from above one of the grounds, see :func:`mitsplat.physics.placement.draw_poses`.
 
         Raises:
             InputError: If objects find no room.
@@ -269,31 +297,29 @@ class Drop:
             for i, asset in enumerate(assets)
         ]
         region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
-        poses = draw_poses(items, self._obstacles, region, arrangement, rng)
+        obstacles = self._grounds[ground].obstacles
+        poses = draw_poses(items, obstacles, region, arrangement, rng)
         if poses is not None:
             return poses
         size = np.subtract(region.max, region.min)
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
-            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m{self._in_way()}, "
-            f"settle.arrangement {arrangement})"
+            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
+            f"{self._in_way(obstacles)}, settle.arrangement {arrangement})"
         )
 
-    def _in_way(self) -> str:
+    def _in_way(self, obstacles: Sequence[PlacedSurface]) -> str:
         """Of what takes most of the region: how much, and its name; empty if nothing takes a tenth."""
         points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
-        taken = [float((item.signed_distances(points) < 0).mean()) for item in self._obstacles]
+        taken = [float((item.signed_distances(points) < 0).mean()) for item in obstacles]
         worst = int(np.argmax(taken))
-        return (
-            f", {taken[worst]:.0%} of which are inside of {self._obstacles[worst].name!r}"
-            if taken[worst] >= 0.1
-            else ""
-        )
+        return f", {taken[worst]:.0%} of which are inside of {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
 
     def _disarray(
         self,
         resting: Sequence[PlacedSurface],
         clearances: Sequence[Clearance],
+        obstacles: Sequence[PlacedSurface],
         start: Float64Array,
         end: Float64Array,
         given: Sequence[Float64Array | None],
@@ -305,7 +331,7 @@ class Drop:
                 return f"{pair.first.name} rests against the enclosure"
         if arrangement == "scatter":
             for pair in clearances:
-                if pair.second not in self._obstacles and pair.distance < _NEAREST:
+                if pair.second not in obstacles and pair.distance < _NEAREST:
                     return f"{pair.first.name} and {pair.second.name} touch"
         if arrangement in ("stack", "upright"):
             # Angle between the world's vertical, carried along by the object, and the vertical.

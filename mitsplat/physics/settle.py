@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -132,13 +133,17 @@ def _scene_hash(scene: Scene) -> str:
         add(name, version(name))
     for module in MODULES:
         digest.add((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
-    add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, spec.shapes, spec.randomise.friction)
+    solid = [shape.collider for shape in spec.shapes]
+    shapes = [shape.model_copy(update={"materials": ()}) for shape in compress(spec.shapes, solid)]
+    add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
     if spec.empty or spec.hold_out.assets or any(entry.balance for entry in spec.objects):  # which depend on splits
         add(spec.empty, spec.output.validation, spec.output.test, spec.hold_out.assets)
-    for mesh in scene.shape_meshes:
+    for mesh in compress(scene.shape_meshes, solid):
         add_mesh(mesh)
-    surroundings = [scene.environment] if spec.environment_collides and scene.environment is not None else []
+    surroundings = scene.environments if spec.environment_collides else ()
+    if len(surroundings) > 1:
+        add(spec.environment_weights)
     for asset in (*scene.assets, *surroundings):
         add(asset.name, asset.class_name, asset.density, asset.mass, asset.friction)
         for mesh in (asset.mesh, *asset.pieces):

@@ -44,7 +44,7 @@ _NO_DRAWS = frozenset(
     }
 )
 """Keys of a frame's record that state no draw, or that are looked at in another way."""
-_NO_VALUES = frozenset({"id", "entry", "asset"})
+_NO_VALUES = frozenset({"id", "entry", "asset", "seed"})
 _MOST_NUMBERS, _MOST_TEXTS, _MOST_PAIRS = 1 << 16, 1000, 20
 
 

@@ -65,6 +65,15 @@ def is_empty(spec: SceneSpec, layout: int) -> bool:
     return math.floor((rank + 1) * spec.empty + phase) > math.floor(rank * spec.empty + phase)
 
 
+def draw_environment(spec: SceneSpec, layout: int) -> int:
+    """Which of the environments a layout has."""
+    if not isinstance(spec.environment, tuple) or len(spec.environment) == 1:
+        return 0
+    weights = np.array(spec.environment_weights or np.ones(len(spec.environment)))
+    rng = random_stream(spec.seed, "environment", layout)
+    return int(rng.choice(len(weights), p=weights / weights.sum()))
+
+
 @lru_cache
 def _phase(seed: int, split: str) -> float:
     """Where in its turn a split begins with empty layouts, in [0, 1)."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 import trimesh
@@ -23,18 +23,20 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
-from mitsplat.scene.contents import Split, split_of
+from mitsplat.image_lists import WILDCARDS, glob_below, image_names, names_below
+from mitsplat.scene.contents import Split, draw_environment, split_of
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import lights_at, written_out
 from mitsplat.scene.primitives import make_primitives
 from mitsplat.scene.spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
+from mitsplat.scene.spec_materials import ImageMaterial, Material
 from mitsplat.scene.spec_objects import PRIMITIVES, ObjectSpec
 from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.untrusted_images import IMAGES, check_images
 from mitsplat.scene.viewpoints import camera_at, view_of
 from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
+from mitsplat.untrusted_images import IMAGES, check_images
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
 _DRAWN = (
@@ -42,6 +44,9 @@ _DRAWN = (
     *("white_balance", "hue", "saturation", "jpeg"),
 )
 """What is drawn anew for every frame."""
+
+_MOST_IMAGES = 500
+"""Tried in one process, which is given their names as arguments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,20 +57,24 @@ class Scene:
         spec: What the file says, its enclosure written out as shapes, rooms as lights, and patterns of pools as what
             they match.
         path: The scene file.
-        environment: The surroundings, or None.
+        environments: The surroundings, of which each layout has one; empty if there are none.
         assets: Assets of each entry of ``spec.objects`` in turn, in each of its scales, with its class name.
         shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
         class_names: Of what is labelled, sorted; the position in it is the class index.
-        images: Files of the images that lights name, by those names.
+        images: Files of the images that lights, materials and the background name, by those names.
     """
 
     spec: SceneSpec
     path: Path
-    environment: Asset | None
+    environments: tuple[Asset, ...]
     assets: tuple[Asset, ...]
     shape_meshes: tuple[trimesh.Trimesh, ...]
     class_names: tuple[str, ...]
     images: Mapping[str, Path] = field(default_factory=dict)
+
+    def environment_of(self, layout: int) -> Asset | None:
+        """The surroundings of a layout."""
+        return self.environments[draw_environment(self.spec, layout)] if self.environments else None
 
     @property
     def num_frames(self) -> int:
@@ -132,13 +141,13 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     if not allow_outside:
         _confine(spec, path)
     spec = _matched(spec, path, allow_outside=allow_outside)
-    spec = _matched_images(spec, path, allow_outside=allow_outside)
+    spec = _matched_skies(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     _check_held_out(spec, path)
     named = _read_named(spec, path)
     _check_images(spec, path, named)
     with _blaming(path, "environment"):
-        environment = None if named.environment is None else _metric(named.environment)
+        environments = tuple(map(_metric, named.environments))
     assets = _sized_objects(spec, path, named)
     spec, shape_meshes = _walled(spec, named, assets)
     if (lights := written_out(spec)) != spec.lights:
@@ -146,7 +155,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     return Scene(
         spec=spec,
         path=path,
-        environment=environment,
+        environments=environments,
         assets=assets,
         shape_meshes=shape_meshes,
         class_names=_class_names(spec, assets),
@@ -158,19 +167,19 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
 class _Named:
     """What a scene file names, as it is on disk; assets and images by their names in the file."""
 
-    environment: Asset | None
+    environments: tuple[Asset, ...]
     assets: Mapping[str, Asset]
     shape_meshes: tuple[trimesh.Trimesh, ...]
     images: Mapping[str, Path]
 
 
 def _read_named(spec: SceneSpec, path: Path) -> _Named:
-    """Read every asset and mesh that a scene file names, each once; images of lights are Mitsuba's to read."""
+    """Read every asset and mesh that a scene file names, each once; images are Mitsuba's to read."""
     folder = path.parent
-    environment, assets, shape_meshes = None, dict[str, Asset](), []
-    if spec.environment is not None:
-        with _blaming(path, "environment"):
-            environment = Asset.load(folder / spec.environment)
+    environments, assets, shape_meshes = list[Asset](), dict[str, Asset](), []
+    for keys, name in _environments(spec):
+        with _blaming(path, *keys):
+            environments.append(Asset.load(folder / name))
     for keys, name, entry in _object_assets(spec):
         if entry.pool == PRIMITIVES:
             assets |= {} if name in assets else dict(zip(entry.names, make_primitives(spec.seed), strict=True))
@@ -180,8 +189,15 @@ def _read_named(spec: SceneSpec, path: Path) -> _Named:
     for position, shape in enumerate(spec.shapes):
         with _blaming(path, "shapes", position, "mesh"):
             shape_meshes.append(_shape_mesh(shape, folder))
-    images = {name: folder / name for _, name in _light_images(spec)}
-    return _Named(environment, assets, tuple(shape_meshes), images)
+    images = {name: folder / name for _, name in _images(spec)}
+    return _Named(tuple(environments), assets, tuple(shape_meshes), images)
+
+
+def _images(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Key and file of every image that is named."""
+    yield from _light_images(spec)
+    for keys, images in image_lists(spec):
+        yield from ((keys, name) for name in ([images] if isinstance(images, str) else images))
 
 
 def _light_images(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -193,15 +209,17 @@ def _light_images(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str]
 
 
 def _check_images(spec: SceneSpec, path: Path, named: _Named) -> None:
-    """Refuse images of lights that are absent, or that Mitsuba should not be given."""
-    asked = list(_light_images(spec))
+    """Refuse images that are absent, or that Mitsuba should not be given."""
+    asked = list(_images(spec))
     for keys, name in asked:
         with _blaming(path, *keys):
             if not named.images[name].is_file():
                 raise InputError(f"{named.images[name]}: no such file")
-    for (keys, _), reason in zip(asked, check_images([named.images[name] for _, name in asked]), strict=True):
-        if reason is not None:
-            raise InputError(f"{key_place(path, keys)}: {reason}")
+    for start in range(0, len(asked), _MOST_IMAGES):
+        some = asked[start : start + _MOST_IMAGES]
+        for (keys, _), reason in zip(some, check_images([named.images[name] for _, name in some]), strict=True):
+            if reason is not None:
+                raise InputError(f"{key_place(path, keys)}: {reason}")
 
 
 def _sized_objects(spec: SceneSpec, path: Path, named: _Named) -> tuple[Asset, ...]:
@@ -239,17 +257,35 @@ def _object_assets(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str
             yield ("objects", position, *keys), name, entry
 
 
+def _environments(spec: SceneSpec) -> list[tuple[tuple[str | int, ...], str]]:
+    """Key and folder of every environment."""
+    if isinstance(spec.environment, str):
+        return [(("environment",), spec.environment)]
+    return [(("environment", number), name) for number, name in enumerate(spec.environment or ())]
+
+
+def image_lists(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str | tuple[str, ...]]]:
+    """Key and names of the images that materials and the background draw from; a loaded scene has no patterns."""
+    for position, shape in enumerate(spec.shapes):
+        for number, material in enumerate(shape.materials):
+            if isinstance(material, ImageMaterial):
+                yield ("shapes", position, "materials", number, "images"), material.images
+    if spec.background is not None:
+        yield ("background", "images"), spec.background.images
+
+
 def _matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
-    """The specification with patterns of pools replaced by the folders of objects that they match, by name.
+    """The specification with patterns replaced by what they match, by name: folders of assets, and images.
 
     Raises:
         InputError: If there are none or not as many as weights, or one is a link to where none may be named.
     """
+    spec = _matched_images(_matched_environments(spec, path, allow_outside), path, allow_outside)
     objects = list(spec.objects)
     for position, entry in enumerate(objects):
         if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
             with _blaming(path, "objects", position, "pool"):
-                names = _matches(path.parent, entry.pool, allow_outside=allow_outside)
+                names = _matches(path.parent, entry.pool, "object", allow_outside=allow_outside)
             try:
                 entry.check_weights(len(names))
             except FieldError as error:
@@ -258,16 +294,7 @@ def _matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
     return spec.model_copy(update={"objects": tuple(objects)}) if objects != list(spec.objects) else spec
 
 
-def _matches(folder: Path, pattern: str, *, allow_outside: bool) -> tuple[str, ...]:
-    """Asset folders of objects that a pattern matches, relative to a folder."""
-    named = [path for path in _globbed(folder, pattern) if (path / ASSET_FILE).is_file()]
-    objects = [path for path in _inside(folder, named, allow_outside) if read_spec(path).kind == "object"]
-    if not objects:
-        raise InputError(f"must match at least one folder of an object's asset (got {pattern!r}, which matches none)")
-    return _relative(folder, pattern, objects)
-
-
-def _matched_images(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
+def _matched_skies(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
     """The specification with patterns of skies replaced by the images that they match, by name.
 
     Raises:
@@ -277,24 +304,16 @@ def _matched_images(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scen
     for position, light in enumerate(lights):
         if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
             with _blaming(path, "lights", position, "pool"):
-                found = [file for file in _globbed(path.parent, light.pool) if file.suffix.lower() in IMAGES]
+                found = [file for file in glob_below(path.parent, light.pool) if file.suffix.lower() in IMAGES]
                 if not found:
                     raise InputError(f"must match at least one image (got {light.pool!r}, which matches none)")
-                names = _relative(path.parent, light.pool, _inside(path.parent, found, allow_outside))
+                names = names_below(path.parent, light.pool, _inside(path.parent, found, allow_outside))
             try:
                 light.check_weights(len(names))
             except FieldError as error:
                 raise InputError(f"{key_place(path, ('lights', position, *error.key))}: {error}") from error
             lights[position] = light.model_copy(update={"pool": names})
     return spec.model_copy(update={"lights": tuple(lights)}) if lights != list(spec.lights) else spec
-
-
-def _globbed(folder: Path, pattern: str) -> list[Path]:
-    """What a pattern matches, by name."""
-    try:
-        return sorted(Path("/").glob(pattern.lstrip("/")) if Path(pattern).is_absolute() else folder.glob(pattern))
-    except (ValueError, NotImplementedError) as error:
-        raise InputError(f"must be a pattern of files or folders ({error}; got {pattern!r})") from error
 
 
 def _inside(folder: Path, paths: list[Path], allow_outside: bool) -> list[Path]:
@@ -304,10 +323,58 @@ def _inside(folder: Path, paths: list[Path], allow_outside: bool) -> list[Path]:
     return paths
 
 
-def _relative(folder: Path, pattern: str, paths: list[Path]) -> tuple[str, ...]:
-    """Paths as a scene file in a folder would name them."""
-    absolute = Path(pattern).is_absolute()
-    return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in paths)
+def _matched_environments(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
+    pattern = spec.environment
+    if not isinstance(pattern, str):
+        return spec
+    if WILDCARDS & set(pattern) and not (path.parent / pattern / ASSET_FILE).is_file():
+        with _blaming(path, "environment"):
+            names = _matches(path.parent, pattern, "environment", allow_outside=allow_outside)
+        spec = spec.model_copy(update={"environment": names})
+    try:
+        spec.check_environment_weights()
+    except FieldError as error:
+        raise InputError(f"{key_place(path, error.key)}: {error}") from error
+    return spec
+
+
+def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
+    found = {}
+    for keys, images in image_lists(spec):
+        with _blaming(path, *keys):
+            found[keys] = image_names(path.parent, images)
+            _inside(path.parent, [path.parent / name for name in found[keys]], allow_outside)
+    if not found:
+        return spec
+
+    def materials_of(*keys: str | int, among: Sequence[Material]) -> tuple[Material, ...]:
+        lists = (found.get((*keys, number, "images")) for number in range(len(among)))
+        return tuple(
+            material if images is None else material.model_copy(update={"images": images})
+            for material, images in zip(among, lists, strict=True)
+        )
+
+    shapes = tuple(
+        shape.model_copy(update={"materials": materials_of("shapes", number, "materials", among=shape.materials)})
+        for number, shape in enumerate(spec.shapes)
+    )
+    spec = spec.model_copy(update={"shapes": shapes})
+    if spec.background is None:
+        return spec
+    background = spec.background.model_copy(update={"images": found["background", "images"]})
+    return spec.model_copy(update={"background": background})
+
+
+def _matches(
+    folder: Path, pattern: str, kind: Literal["object", "environment"], *, allow_outside: bool
+) -> tuple[str, ...]:
+    """Asset folders of a kind that a pattern matches, relative to a folder."""
+    found = [path for path in glob_below(folder, pattern) if (path / ASSET_FILE).is_file()]
+    named = _inside(folder, found, allow_outside)
+    assets = [path for path in named if read_spec(path).kind == kind]
+    if not assets:
+        raise InputError(f"must match at least one folder of an {kind}'s asset (got {pattern!r}, which matches none)")
+    return names_below(folder, pattern, assets)
 
 
 def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
@@ -315,8 +382,8 @@ def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[
     if spec.enclosure is None:
         return spec, named.shape_meshes
     supports = [mesh for shape, mesh in zip(spec.shapes, named.shape_meshes, strict=True) if shape.collider]
-    if spec.environment_collides and named.environment is not None and named.environment.mesh is not None:
-        supports.append(named.environment.mesh)
+    if spec.environment_collides:
+        supports += [environment.mesh for environment in named.environments if environment.mesh is not None]
     walls = enclosure_walls(spec.enclosure, spec, assets, supports)
     meshes = tuple(_shape_mesh(wall, Path()) for wall in walls)  # boxes, which no file holds
     return spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None}), (*named.shape_meshes, *meshes)
@@ -324,12 +391,12 @@ def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[
 
 def _confine(spec: SceneSpec, path: Path) -> None:
     """Refuse what is named outside of the scene's folder."""
-    named: list[tuple[tuple[str | int, ...], str | None]] = [(("environment",), spec.environment)]
+    named: list[tuple[tuple[str | int, ...], str | None]] = [*_environments(spec)]
     named += [(keys, name) for keys, name, _ in _object_assets(spec)]
     patterns = ((i, entry.pool) for i, entry in enumerate(spec.objects))
     named += [(("objects", i, "pool"), pattern) for i, pattern in patterns if isinstance(pattern, str)]
     named += [(("shapes", position, "mesh"), shape.mesh) for position, shape in enumerate(spec.shapes)]
-    named += _light_images(spec)
+    named += _images(spec)
     skies = ((i, getattr(light, "pool", None)) for i, light in enumerate(spec.lights))
     named += [(("lights", i, "pool"), pattern) for i, pattern in skies if isinstance(pattern, str)]
     for keys, name in named:

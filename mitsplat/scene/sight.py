@@ -200,7 +200,8 @@ class Sight:
         """Distance of a point to the surface that is nearest [m], or ``reach`` if none is as near."""
         scene = self._scene
         shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
-        around = scene.environment.mesh if scene.environment is not None else None
+        here = scene.environment_of(self._layout.index)
+        around = None if here is None else here.mesh
         distances = [_distance(mesh, eye, reach) for mesh in (*shapes, around) if mesh is not None]
         for one in self._layout.instances:
             mesh = _mesh(scene, one.asset)

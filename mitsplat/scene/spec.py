@@ -13,9 +13,10 @@ from mitsplat.quality import PresetName
 from mitsplat.scene.spec_camera import CameraSpec
 from mitsplat.scene.spec_image import Composite, Randomise, Rendering
 from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
+from mitsplat.scene.spec_materials import Background
 from mitsplat.scene.spec_objects import ObjectSpec, Settle
 from mitsplat.scene.spec_shapes import Enclosure, Region, Shape
-from mitsplat.scene.spec_types import StrictModel, Unit
+from mitsplat.scene.spec_types import Positive, StrictModel, Unit
 from mitsplat.yaml_input import FieldError
 
 SCHEMA_VERSION = 1
@@ -105,12 +106,27 @@ class SceneSpec(StrictModel):
     """A scene file. Lengths in metres, angles in degrees, z up; paths are relative to the file."""
 
     name: str = Field(min_length=1, description="Name of the dataset.")
-    environment: str | None = Field(None, description="Asset folder of the surroundings, relative to the scene file.")
+    environment: str | tuple[str, ...] | None = Field(
+        None,
+        description="Asset folder of the surroundings, relative to the scene file; or a list of folders, or a pattern "
+        "such as ``assets/cell_*`` that takes the environments among the folders that it matches, by name, of which "
+        "each layout draws one.",
+    )
+    environment_weights: tuple[Positive, ...] = Field(
+        (),
+        exclude_if=lambda weights: not weights,
+        description="How often each of several environments is drawn, relative to the others; alike if absent.",
+    )
     environment_collides: bool = Field(
         False,
         description="Whether objects also rest on the environment's mesh, whose convex pieces take minutes to make.",
     )
     shapes: tuple[Shape, ...] = Field((), description="Tabletop, walls and other things that do not move.")
+    background: Background | None = Field(
+        None,
+        exclude_if=lambda background: background is None,
+        description="Images behind everything, instead of grey.",
+    )
     objects: tuple[ObjectSpec, ...] = Field((), description="What is dropped and labelled.")
     empty: Unit = Field(
         0.0,
@@ -149,6 +165,10 @@ class SceneSpec(StrictModel):
                 raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
             seen.add(shape.name)
         skies = [i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)]
+        if self.environment == ():
+            raise FieldError("environment", "must name at least one asset (got [])")
+        if not isinstance(self.environment, str):
+            self.check_environment_weights()
         if len(skies) > 1:
             raise FieldError(("lights", skies[1], "kind"), "must not be a second environment light, which rooms have")
         if self.lights and not any(isinstance(light, RoomLight) or light.sure for light in self.lights):
@@ -168,3 +188,10 @@ class SceneSpec(StrictModel):
                 f"must be below the region's top at {self.region.max[2]:g} m (got {self.enclosure.floor:g})",
             )
         return self
+
+    def check_environment_weights(self) -> None:
+        """Refuse weights of another number than there are environments."""
+        count = 1 if isinstance(self.environment, str) else len(self.environment or ())
+        if self.environment_weights and len(self.environment_weights) != count:
+            text = f"must be as many as there are environments, {count} (got {len(self.environment_weights)})"
+            raise FieldError("environment_weights", text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, NonNegativeFloat, model_validator
 
+from mitsplat.scene.spec_materials import Material
 from mitsplat.scene.spec_types import Positive, StrictModel, Unit, Vec3
 from mitsplat.yaml_input import FieldError
 
@@ -39,6 +40,12 @@ class Shape(StrictModel):
         description="Whether light is traced against it though it is not rendered: a table that only splats show.",
     )
     colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
+    materials: tuple[Material, ...] = Field(
+        (),
+        exclude_if=lambda materials: not materials,
+        description="What it is made of instead of ``colour``, if it is visible: one of these, which each layout draws "
+        "anew with all that is a range of it.",
+    )
     friction: NonNegativeFloat = Field(
         0.6, description="Coulomb friction coefficient; what touches has the geometric mean of both sides'."
     )
@@ -49,6 +56,8 @@ class Shape(StrictModel):
             raise FieldError("name", f"shape {self.name!r} must have either a box, a bin or a mesh")
         if not (self.visible or self.collider or self.proxy):
             raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
+        if self.materials and not self.visible:
+            raise FieldError("materials", f"must not be given for shape {self.name!r}, which is not visible")
         return self
 
 

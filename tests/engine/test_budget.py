@@ -60,12 +60,12 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def room(scene):
     """The scene in surroundings of 200,000 Gaussians."""
-    return replace(scene, environment=replace(scene.assets[0], splats=floor(200_000), kind="environment"))
+    return replace(scene, environments=(replace(scene.assets[0], splats=floor(200_000), kind="environment"),))
 
 
 def test_it_covers_the_peak_of_a_process_that_renders(room):
     folder = room.path.parent
-    room.environment.save(folder / "assets/room")
+    room.environments[0].save(folder / "assets/room")
     text = room.path.read_text()
     (folder / "room.yaml").write_text(f"{text}environment: assets/room\n")
     said = subprocess.run([sys.executable, "-c", CHILD, folder / "room.yaml"], capture_output=True, check=True).stdout

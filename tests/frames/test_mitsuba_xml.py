@@ -15,8 +15,8 @@ from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
 from mitsplat.frames.mitsuba_xml import one_sentence, render_xml
+from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.untrusted_xml import check_xml
 from tests.conftest import box_asset
 
 ROOT = Path(__file__).parents[2]

@@ -21,6 +21,7 @@ from scipy.stats import kstest
 
 from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
+from mitsplat.render.places import draw_place
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import load_scene
 from tests.bodies import STEPPERS, lowest, pose_at
@@ -61,7 +62,7 @@ def test_draws_are_uniform_and_apart(scene_data, write_scene):
         bounds = np.stack([item.bounds for item in placed])
         assert (bounds >= np.array(scene_data["region"]["min"]) - 1e-9).all()
         assert (bounds <= np.array(scene_data["region"]["max"]) + 1e-9).all()
-        assert min(pair.distance for pair in all_clearances(placed, drop._obstacles, reach=0.005)) > 0.0009
+        assert min(pair.distance for pair in all_clearances(placed, drop._grounds[0].obstacles, reach=0.005)) > 0.0009
     rotations = np.concatenate(rotations)
     # Haar measure: every column is uniform on the sphere, so its z is uniform (Archimedes); the angle t has
     # density (1 - cos t) / pi.
@@ -303,11 +304,33 @@ def test_an_environment_carries_objects(scene_data, write_scene):
     environment = replace(scene.assets[0], name="cell", mesh=step, pieces=(step,), kind="environment")
     region = scene.spec.region.model_copy(update={"min": (-0.2, -0.2, 0.03)})
     spec = scene.spec.model_copy(update={"region": region, "environment_collides": True})
-    raised = replace(scene, environment=environment, spec=spec)
+    raised = replace(scene, environments=(environment,), spec=spec)
     layout = settle_layout(raised, 0, cached=False)
     for instance in layout.instances:
         mesh = scene.assets[instance.asset].mesh
         assert lowest(mesh, instance.world_from_object) == pytest.approx(0.015, abs=3e-4)
+
+
+def test_objects_lie_on_the_environment_that_their_layout_draws(scene_data, write_scene):
+    """Steps of two heights: what is settled after another is no other than what is settled alone."""
+    scene_data["shapes"] = []
+    scene = load_scene(write_scene({**scene_data, "settle": {"stepper": "mujoco"}}))
+    tops = (0.015, -0.03)
+    cells = []
+    for top in tops:
+        step = trimesh.creation.box((0.6, 0.6, 0.04)).apply_translation((0, 0, top - 0.02))
+        cells.append(replace(scene.assets[0], name=f"cell {top}", mesh=step, pieces=(step,), kind="environment"))
+    spec = scene.spec.model_copy(update={"environment": ("a", "b"), "environment_collides": True})
+    scene = replace(scene, environments=tuple(cells), spec=spec)
+    numbers = [draw_place(spec, 4 * index).environment for index in range(9)]
+    for number in (0, 1, 0):
+        index = numbers.index(number)
+        layout = settle_layout(scene, index, cached=False)
+        for instance in layout.instances:
+            mesh = scene.assets[instance.asset].mesh
+            assert lowest(mesh, instance.world_from_object) == pytest.approx(tops[number], abs=5e-4)
+    alone = settle_layout(replace(scene), index, cached=False)
+    assert alone.to_json() == layout.to_json()
 
 
 def drop_layout(scene_data, write_scene, **changes):

@@ -1,0 +1,56 @@
+"""What is behind everything that a scene has: a part of an image, turned and in the picture's size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import ByteImage, Float32Array
+from mitsplat.colour import decode_srgb
+from mitsplat.render.places import Backing
+from mitsplat.render.textures import read_image
+
+
+def background_picture(backing: Backing, path: Path, width: int, height: int) -> Float32Array:
+    """Linear picture (H, W, 3) of what a backing shows of an image file."""
+    return backing.gain * cut_out(read_image(path), backing, width, height)
+
+
+def cut_out(image: ByteImage, backing: Backing, width: int, height: int) -> Float32Array:
+    """Linear colours (H, W, 3) of the part of an image that a backing says, in another size.
+
+    The part is a turned rectangle of the picture's proportions, all of which is inside of the image. Where it has more
+    pixels than the picture, these are means of theirs.
+    """
+    turn = np.radians(backing.rotate)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    bounds = np.abs([[cosine, sine], [sine, cosine]]) @ (width, height)  # of the turned picture, in its pixels
+    size = np.array(image.shape[1::-1])
+    step = float((size / bounds).min()) * backing.crop  # pixels of the image for one of the picture
+    reach = step * bounds / 2
+    middle = reach + np.array(backing.place) * (size - 2 * reach)
+    low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int)
+    low, high = np.maximum(low, 0), np.minimum(high, size)
+    values = decode_srgb(np.arange(256) / 255).astype(np.float32)
+    part: npt.NDArray[Any] = values[image[low[1] : high[1], low[0] : high[0]]]
+    if step > 1:
+        small = np.maximum(np.rint((high - low) / step).astype(int), 1)
+        part = cv2.resize(part, tuple(map(int, small)), interpolation=cv2.INTER_AREA)
+    scale = np.array(part.shape[1::-1]) / (high - low)
+    # From the centre of a pixel of the picture to that of one of the part; centres of pixels are whole numbers.
+    linear = scale[:, None] * step * np.array([[cosine, -sine], [sine, cosine]])
+    offset = scale * (middle - low) - linear @ (np.array([width, height]) / 2 - 0.5) - 0.5
+    return np.asarray(
+        cv2.warpAffine(
+            part,
+            np.column_stack([linear, offset]),
+            (width, height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        ),
+        dtype=np.float32,
+    )

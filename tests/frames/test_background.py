@@ -1,0 +1,80 @@
+"""Images behind a scene: which part of them is shown, and where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import mitsplat as ms
+from mitsplat.colour import decode_srgb
+from mitsplat.frames.background import cut_out
+from mitsplat.render.places import Backing
+from mitsplat.scene.layout import NOTHING_TO_REST, Layout
+from tests.conftest import WriteScene
+
+
+def backing(**values: Any) -> Backing:
+    return Backing(**{"image": "a", "crop": 1.0, "place": (0.5, 0.5), "rotate": 0.0, "gain": 1.0, **values})
+
+
+def ramp(width: int, height: int) -> np.ndarray:
+    """An image whose encoded red and green say where a pixel's centre is, in shares of width and height."""
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    return np.asarray(np.rint(255 * np.stack([x, y, 0 * x], axis=2)), dtype=np.uint8)
+
+
+def test_an_image_of_the_pictures_size_is_shown_as_it_is() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    np.testing.assert_allclose(cut_out(image, backing(), 40, 30), decode_srgb(image / 255), atol=1e-6)
+
+
+def test_what_is_larger_is_averaged() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    means = decode_srgb(image / 255).reshape(30, 4, 40, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(cut_out(image, backing(), 40, 30), means, atol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [-170.0, -40.0, 0.0, 12.0, 90.0])
+@pytest.mark.parametrize("size", [(400, 300), (250, 600), (60, 50)])
+@pytest.mark.parametrize(("crop", "place"), [(1.0, (0.5, 0.5)), (0.4, (0.0, 1.0)), (0.4, (0.7, 0.2))])
+def test_the_part_that_is_shown(angle: float, size: tuple[int, int], crop: float, place: tuple[float, float]) -> None:
+    """Of a ramp, colours say where they are from: a turned rectangle of the picture's proportions, inside of it."""
+    width, height = 80, 60
+    colours = cut_out(ramp(*size), backing(rotate=angle, crop=crop, place=place), width, height)
+    from mitsplat.colour import encode_srgb
+
+    shown = encode_srgb(colours)[..., :2] * size
+    rounding = np.array(size) / 255 + 0.5
+    assert (shown > -rounding).all() and (shown < size + rounding).all()
+    turn = np.radians(angle)
+    right, down = (np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))
+    bounds = np.abs([right, [right[1], right[0]]]) @ (width, height)
+    step = crop * (size / bounds).min()
+    reach = step * bounds / 2
+    middle = reach + place * (size - 2 * reach)
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    expected = middle + step * (x[..., None] * right + y[..., None] * down)
+    inner = (slice(3, -3), slice(3, -3))  # where nothing beyond the image is blended in
+    assert np.abs(shown - expected)[inner].max() < rounding.max() + 0.01 * max(size)
+
+
+def test_it_is_seen_where_nothing_is_and_changes_no_label(
+    scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
+) -> None:
+    scene_data["shapes"][0]["box"]["size"] = [0.4, 0.4, 0.1]
+    scene_data["objects"] = []
+    layout = Layout(0, (), NOTHING_TO_REST)
+    plain = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
+    cv2.imwrite(str(tmp_path / "red.png"), np.full((30, 40, 3), (0, 0, 200), dtype=np.uint8))
+    scene_data["background"] = {"images": "red.png", "gain": [0.5, 0.5]}
+    frame = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
+    empty = frame.layers.alpha == 0
+    assert 0.1 < empty.mean() < 0.9
+    np.testing.assert_allclose(frame.rgb[empty], np.tile([0.5 * decode_srgb(200 / 255), 0, 0], (empty.sum(), 1)), 1e-5)
+    np.testing.assert_array_equal(frame.image[~empty], plain.image[~empty])
+    for name in ("depth", "instance", "normal", "proxy_depth"):
+        np.testing.assert_array_equal(getattr(frame.layers, name), getattr(plain.layers, name))

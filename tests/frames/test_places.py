@@ -1,0 +1,134 @@
+"""Pictures of places: the same as of a scene that states what was drawn, in any order, as files and as XML."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitsplat as ms
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.colour import encode_srgb
+from mitsplat.dataset.write import write_dataset
+from mitsplat.frames.mitsuba_xml import export_xml
+from mitsplat.render.places import draw_place
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.spec import FORMATS
+from tests.conftest import WriteScene, box_asset
+
+SceneData = dict[str, Any]
+
+SETTLE = {"stepper": "mujoco"}
+
+
+def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
+    """One object, above the table's middle."""
+    pose = np.eye(4)
+    pose[:3, 3] = 0, 0, 0.006
+    return Layout(index, (Instance(1, 0, scene.class_index(0), pose),), NOTHING_TO_REST)
+
+
+@pytest.fixture
+def places(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> SceneData:
+    """Two environments beside a table of many materials, before images."""
+    for name, grey in (("cell_a", 0.3), ("cell_b", -0.5)):
+        wall = box_asset(name, (0.3, 0.3, 0.1))
+        splats = replace(wall.splats, means=wall.splats.means + np.float32([0, 0.35, 0]), sh=wall.splats.sh + grey)
+        replace(wall, splats=splats, kind="environment", mesh=None, pieces=()).save(tmp_path / "assets" / name)
+    rng = np.random.default_rng(0)
+    for number in range(2):
+        image = rng.integers(0, 256, (8, 10, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), cv2.resize(image, (200, 160)))
+    kinds = [{"kind": kind} for kind in ("colour", "noise", "wood", "checker")]
+    scene_data |= {
+        "environment": "assets/cell_*",
+        "background": {"images": "*.png"},
+        "settle": SETTLE,
+        "objects": [{"asset": "assets/nut", "scale": 4}],
+    }
+    table = {"size": [0.4, 0.4, 0.1], "position": [0, 0, -0.05], "rotate": [0, 0, 10]}
+    materials = [*kinds, {"kind": "image", "images": "0.png"}]
+    scene_data["shapes"][0] |= {"box": table, "materials": materials}
+    scene_data["output"] = {"width": 64, "height": 48, "layouts": 6, "views": 2, "validation": 0.5}
+    return scene_data
+
+
+def test_a_drawn_place_looks_as_a_stated_one(places: SceneData, write_scene: WriteScene) -> None:
+    del places["shapes"][0]["materials"]
+    del places["background"]
+    drawn = ms.load_scene(write_scene(places))
+    seen = {}
+    with ms.Renderer(drawn) as renderer:
+        for layout in range(6):
+            frame = renderer.render(2 * layout, layout=lying(drawn, layout))
+            seen[layout] = (draw_place(drawn.spec, frame.index).environment, frame.image)
+    assert {number for number, _ in seen.values()} == {0, 1}
+    for layout, (number, image) in seen.items():
+        places["environment"] = f"assets/cell_{'ab'[number]}"
+        stated = ms.load_scene(write_scene(places))
+        np.testing.assert_array_equal(
+            ms.render_frame(stated, 2 * layout, layout=lying(stated, layout)).image, image, strict=True
+        )
+
+
+def test_one_colour_looks_as_the_key_colour(places: SceneData, write_scene: WriteScene) -> None:
+    del places["environment"], places["background"]
+    places["shapes"][0]["materials"] = [{"kind": "colour"}]
+    scene = ms.load_scene(write_scene(places))
+    frame = ms.render_frame(scene, 0, layout=lying(scene, 0))
+    del places["shapes"][0]["materials"]
+    places["shapes"][0]["colour"] = draw_place(scene.spec, frame.index).finishes["table"].colours[0]
+    stated = ms.load_scene(write_scene(places))
+    np.testing.assert_array_equal(ms.render_frame(stated, 0, layout=lying(stated, 0)).image, frame.image)
+
+
+def test_order_does_not_matter(places: SceneData, write_scene: WriteScene) -> None:
+    scene = ms.load_scene(write_scene(places))
+    frames = [*range(6)]
+    with ms.Renderer(scene) as renderer:
+        forth = [renderer.render(index, layout=lying(scene, index // 2)).image for index in frames]
+    with ms.Renderer(scene) as renderer:
+        back = [renderer.render(index, layout=lying(scene, index // 2)).image for index in frames[::-1]][::-1]
+    assert len({image.tobytes() for image in forth}) == 6
+    np.testing.assert_array_equal(forth, back)
+
+
+def test_a_dataset_of_places(places: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+    """Every draw is in the manifest, which its schema reads, and no label has anything of it."""
+    places["labels"] = {"min_pixels": 1, "min_fragment": 1}
+    places["output"] |= {"layouts": 3, "formats": [name for name in FORMATS if name not in ("colmap", "yolo-pose")]}
+    scene = ms.load_scene(write_scene(places))
+    out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
+    found = audit_dataset(out)
+    assert found.violations == () and found.instances == 6
+    records = [json.loads(line) for line in (out / "manifest.jsonl").read_bytes().splitlines()]
+    for record in records:
+        place = draw_place(scene.spec, record["index"])
+        assert set(record["place"]) == {"environment", "materials", "background"}
+        assert record["place"] == json.loads(json.dumps(place.to_json(scene.spec)))
+    content = json.loads((out / "dataset.json").read_bytes())
+    assert content["scene"]["environment"] == ["assets/cell_a", "assets/cell_b"]
+    assert len(content["inputs"]["background.images"]) == 64
+
+
+@pytest.mark.parametrize("kind", ["colour", "wood"])
+def test_xml_shows_the_same_place(
+    places: SceneData, write_scene: WriteScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    del places["background"]
+    places["shapes"][0]["materials"] = [{"kind": kind}]
+    scene = ms.load_scene(write_scene(places))
+    monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", lying)
+    frame = ms.render_frame(scene, 3, layout=lying(scene, 1))
+    export_xml(scene, 3, tmp_path / "frame.xml")
+    read = mi.load_file(str(tmp_path / "frame.xml"))
+    image = np.array(read.integrator().render(read, read.sensors()[0]))
+    shown = encode_srgb(image[..., :3])
+    expected = encode_srgb(frame.layers.rgb)
+    assert np.abs(shown - expected).mean() < 0.004

@@ -49,7 +49,7 @@ class Quality:
             of a pixel, so that small Gaussians do not sparkle (2-D Mip filter, Yu et al. 2024). ``3dgs`` and ``gsplat``
             dilate and limit opacity as those trainers do.
         tolerance: Error of a display-encoded colour that the order of blending may make. Infinite: Gaussians are
-            blended in the order of their peaks along one ray of every 4 x 4 tile of pixels. 0: along every pixel's own
+            blended in the order of their peaks along one ray of every tile of 8 x 4 pixels. 0: along every pixel's own
             ray. Between: nearly so, with an estimate of the error, and along every ray of the tiles where that exceeds
             the tolerance; a few pixels err by more.
         alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.

@@ -22,7 +22,7 @@ import numpy as np
 from mitsplat.plugins.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.plugins.march import march
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
-from mitsplat.plugins.rays import TILE, View
+from mitsplat.plugins.rays import TILE_WIDTH, View
 from mitsplat.plugins.tiles import TileLists, bin_gaussians, bin_records
 from mitsplat.plugins.walk import Lanes, largest
 from mitsplat.quality import KERNELS, Quality
@@ -30,8 +30,8 @@ from mitsplat.recorded import Table, recorded
 
 LN_2 = 0.6931471805599453
 
-PAIRS_AT_ONCE = 1 << 21
-"""Pairs of a Gaussian and a tile whose gradients are held at once, 256 bytes each."""
+PAIRS_AT_ONCE = 1 << 20
+"""Pairs of a Gaussian and a tile whose gradients are held at once, 512 bytes each."""
 
 
 def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[list[Any], Any]:
@@ -355,7 +355,7 @@ def _parts(lists: TileLists) -> Iterator[tuple[TileLists, Any]]:
                 tiles=tile,
             )
             dr.eval(part.slots, part.first, part.start, part.stop, tile)
-            yield part, dr.arange(mi.UInt32, (last - first) * TILE) + dr.opaque(mi.UInt32, first * TILE)
+            yield part, dr.arange(mi.UInt32, (last - first) * TILE_WIDTH) + dr.opaque(mi.UInt32, first * TILE_WIDTH)
         first = last
 
 
@@ -370,8 +370,8 @@ def _gradient(
     """The gradient that comes from the tiles of some lists; they may say that there are more pairs than there are."""
     lanes = Lanes(lists, view)
     us, vs = slopes
-    column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE
-    shares = dr.zeros(mi.Float, RECORD * TILE * lists.pairs)
+    column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE_WIDTH
+    shares = dr.zeros(mi.Float, RECORD * TILE_WIDTH * lists.pairs)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end, near = dr.opaque(mi.Float, quality.transmittance_min), view.near_plane
 
@@ -415,7 +415,7 @@ def _gradient(
             sums = [total + part for total, part in zip(sums, parts, strict=True)]
             new_light.append(t - weight)
             new_rest.append(r)
-        dr.scatter(shares, mi.ArrayXf(sums), dr.gather(mi.UInt32, lists.slots, i) * TILE + column)
+        dr.scatter(shares, mi.ArrayXf(sums), dr.gather(mi.UInt32, lists.slots, i) * TILE_WIDTH + column)
         return i + 1, new_light, new_rest
 
     def alive(i: Any, light: list[Any], rest: list[Any]) -> Any:
@@ -445,7 +445,7 @@ def _sum_shares(shares: Any, lists: TileLists) -> Any:
     run = dr.arange(mi.UInt32, lanes) - dr.gather(mi.UInt32, begin, owner)
     start = dr.gather(mi.UInt32, first, owner) + run * _RUN
     stop = dr.minimum(start + _RUN, dr.gather(mi.UInt32, lists.first, owner + 1))
-    partial = _sum_rows(shares, start * TILE, stop * TILE)
+    partial = _sum_rows(shares, start * TILE_WIDTH, stop * TILE_WIDTH)
     return _sum_rows(partial, begin, begin + runs)
 
 

@@ -23,15 +23,15 @@ import numpy as np
 from mitsplat.plugins.chosen import ChosenTiles
 from mitsplat.plugins.march import Image, march_apart
 from mitsplat.plugins.project import CloudSet, Placement
-from mitsplat.plugins.rays import TILE, View
+from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
 from mitsplat.plugins.tiles import CrowdedError, bin_gaussians
 from mitsplat.quality import Quality
 
 ZOOM = 2
-"""Rays along each axis of a pixel, a divisor of TILE."""
+"""Rays along each axis of a pixel, a divisor of a tile's width and height."""
 
-BLOCK = TILE // ZOOM
-"""Edge of a block of pixels that are looked at again together [px]: one tile of the finer view."""
+BLOCK_WIDTH, BLOCK_HEIGHT = TILE_WIDTH // ZOOM, TILE_HEIGHT // ZOOM
+"""Size of a block of pixels that are looked at again together [px]: one tile of the finer view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,9 @@ class Edges:
         fine = view.finer(ZOOM)
         block = dr.arange(mi.UInt32, fine.tiles_x * fine.tiles_y)
         row = block // fine.tiles_x
-        x, y = mi.Int32(block - row * fine.tiles_x) * BLOCK, mi.Int32(row) * BLOCK
+        x, y = mi.Int32(block - row * fine.tiles_x) * BLOCK_WIDTH, mi.Int32(row) * BLOCK_HEIGHT
         own, differs = dr.gather(mi.UInt32, key, _pixel(x, y, view)), mi.Bool(False)
-        for dx, dy in np.ndindex(BLOCK + 2, BLOCK + 2):
+        for dx, dy in np.ndindex(BLOCK_WIDTH + 2, BLOCK_HEIGHT + 2):
             differs |= dr.gather(mi.UInt32, key, _pixel(x + (dx - 1), y + (dy - 1), view)) != own
         dr.eval(differs)
         chosen = ChosenTiles.of(differs, fine)
@@ -101,16 +101,17 @@ class Edges:
 
     def averaged(self, values: Any, fine: Any) -> Any:
         """The pixels ``values`` of the picture (Float or Color3f), in the chosen blocks the means over the rays."""
-        lane = dr.arange(mi.UInt32, self.chosen.count * BLOCK * BLOCK)
-        tile, within = lane // (BLOCK * BLOCK), lane % (BLOCK * BLOCK)
-        bx, by = within % BLOCK, within // BLOCK
+        size = BLOCK_WIDTH * BLOCK_HEIGHT
+        lane = dr.arange(mi.UInt32, self.chosen.count * size)
+        tile, within = lane // size, lane % size
+        bx, by = within % BLOCK_WIDTH, within // BLOCK_WIDTH
         total = type(fine)(0)
         for dx, dy in np.ndindex(ZOOM, ZOOM):
-            place = tile * (TILE * TILE) + (by * ZOOM + dy) * TILE + bx * ZOOM + dx
+            place = tile * TILE_PIXELS + (by * ZOOM + dy) * TILE_WIDTH + bx * ZOOM + dx
             total += dr.gather(type(fine), fine, place)
         number = dr.gather(mi.UInt32, self.chosen.number, tile)
         row = number // self.fine.tiles_x
-        x, y = (number - row * self.fine.tiles_x) * BLOCK + bx, row * BLOCK + by
+        x, y = (number - row * self.fine.tiles_x) * BLOCK_WIDTH + bx, row * BLOCK_HEIGHT + by
         inside = (x < self.view.width) & (y < self.view.height)
         result = dr.copy(values)
         dr.scatter(result, total / (ZOOM * ZOOM), y * self.view.width + x, inside, mode=dr.ReduceMode.Permute)
@@ -118,10 +119,11 @@ class Edges:
 
     def _places(self) -> tuple[Any, Any]:
         """Column and row of the finer view's pixels."""
-        lane = dr.arange(mi.UInt32, self.chosen.count * TILE * TILE)
-        number = dr.gather(mi.UInt32, self.chosen.number, lane // (TILE * TILE))
+        lane = dr.arange(mi.UInt32, self.chosen.count * TILE_PIXELS)
+        number = dr.gather(mi.UInt32, self.chosen.number, lane // TILE_PIXELS)
         row = number // self.fine.tiles_x
-        return (number - row * self.fine.tiles_x) * TILE + lane % TILE, row * TILE + lane // TILE % TILE
+        x = (number - row * self.fine.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
+        return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
 
 
 def _pixel(x: Any, y: Any, view: View) -> Any:
@@ -144,8 +146,8 @@ def _trace(
             raise
     parts, start = [], 0
     for half in chosen.halves(view):
-        pixels = dr.arange(mi.UInt32, half.count * TILE * TILE) + start
+        pixels = dr.arange(mi.UInt32, half.count * TILE_PIXELS) + start
         part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
         parts.append(_trace(clouds, placements, view, half, quality, part_z))
-        start += half.count * TILE * TILE
+        start += half.count * TILE_PIXELS
     return Image.joined(parts)

@@ -34,7 +34,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.plugins.project import CloudSet, Placement
-from mitsplat.plugins.rays import TILE, View
+from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, View
 from mitsplat.plugins.shares import add_to_tally, new_tally, settle_instances, winner_of_tally
 from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, in_ray_order
 from mitsplat.plugins.walk import Lanes, Pixel, Rays, largest, walk
@@ -171,7 +171,7 @@ def trace(
     except CrowdedError:
         if view.tiles_y == 1:
             raise
-    middle = view.tiles_y // 2 * TILE
+    middle = view.tiles_y // 2 * TILE_HEIGHT
     parts = []
     for start, stop in ((0, middle), (middle, view.height)):
         pixels = dr.arange(mi.UInt32, (stop - start) * view.width) + start * view.width
@@ -200,7 +200,7 @@ def march(
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
         slopes: Those of the rays, where they are known already; for one sample per pixel.
     """
-    lanes = Lanes(lists, view, TILE if quality.order == "tile" else 1)
+    lanes = Lanes(lists, view, TILE_HEIGHT if quality.order == "tile" else 1)
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
         for p, m in zip(lanes.pixel, lanes.inside, strict=True)
@@ -245,11 +245,11 @@ def march(
 
 
 def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | None = None) -> Image:
-    """The pixels of some tiles, 16 of each, tile after tile, by one ray through the centre of each.
+    """The pixels of some tiles, tile after tile, by one ray through the centre of each.
 
     Arguments are those of :func:`march`, but nothing is repaired: the order is per tile or per ray.
     """
-    lanes = Lanes(lists, view, TILE if quality.order == "tile" else 1, apart=True)
+    lanes = Lanes(lists, view, TILE_HEIGHT if quality.order == "tile" else 1, apart=True)
     places = zip(lanes.pixel, lanes.inside, strict=True)
     far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
     if quality.order == "ray":
@@ -274,10 +274,9 @@ def _repaired(
     """The image with the tiles in which estimates exceed the tolerance, by lanes, in the order of each ray."""
     wrong = _too_wrong(errors, quality)
     dr.eval(wrong)
-    per_tile = TILE * TILE
-    lane = dr.arange(mi.UInt32, dr.width(wrong) // per_tile) * per_tile
+    lane = dr.arange(mi.UInt32, dr.width(wrong) // TILE_PIXELS) * TILE_PIXELS
     flags = dr.gather(mi.Bool, wrong, lane)
-    for k in range(1, per_tile):
+    for k in range(1, TILE_PIXELS):
         flags |= dr.gather(mi.Bool, wrong, lane + k)
     chosen = dr.compress(flags)
     if dr.width(chosen) == 0:

@@ -13,9 +13,11 @@ import numpy as np
 
 from mitsplat.camera import FISHEYE_MAX, Camera, Lens, fisheye_radius, fisheye_rate
 
-TILE = 4
-"""Edge of a tile [px]. Smaller tiles make more pairs to sort; larger ones idle more lanes, blend further from the order
-of each ray, and bound depths less tightly."""
+TILE_WIDTH, TILE_HEIGHT = 8, 4
+"""Size of a tile [px]. Smaller tiles make more pairs to sort; larger ones idle more lanes, blend further from the order
+of each ray, and bound depths less tightly. A packet of eight lanes carries all of a tile and fetches a record once."""
+
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +102,12 @@ class View:
     @property
     def tiles_x(self) -> int:
         """Number of tiles along x."""
-        return -(-self.width // TILE)
+        return -(-self.width // TILE_WIDTH)
 
     @property
     def tiles_y(self) -> int:
         """Number of tiles along y."""
-        return -(-self.height // TILE)
+        return -(-self.height // TILE_HEIGHT)
 
     def sampled(self, samples: int) -> View:
         """The same view with ``samples`` x ``samples`` rays per pixel."""
@@ -290,23 +292,23 @@ class View:
                 x, y = pu * o["fx"] + o["cx"], pv * o["fy"] + o["cy"]
                 lo_x, hi_x = dr.minimum(lo_x, x), dr.maximum(hi_x, x)
                 lo_y, hi_y = dr.minimum(lo_y, y), dr.maximum(hi_y, y)
-        margin = TILE / 2 + 0.05 * dr.maximum(hi_x - lo_x, hi_y - lo_y)
+        margin = TILE_WIDTH / 2 + 0.05 * dr.maximum(hi_x - lo_x, hi_y - lo_y)
         x0, x1, y0, y1 = self._clip_tiles(lo_x, hi_x, lo_y, hi_y, margin)
         return x0, dr.select(empty, x0, x1), y0, y1
 
     def tile_columns(self, u0: Any, u1: Any) -> tuple[Any, Any]:
         """Half-open range of columns of tiles that a range of slopes meets in an undistorted view."""
         o = self._opaque
-        return self._tile_range(u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], self.tiles_x)
+        return self._tile_range(u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], TILE_WIDTH, self.tiles_x)
 
     def _clip_tiles(self, x0: Any, x1: Any, y0: Any, y1: Any, margin: Any) -> tuple[Any, Any, Any, Any]:
-        columns = self._tile_range(x0 - margin, x1 + margin, self.tiles_x)
-        return *columns, *self._tile_range(y0 - margin, y1 + margin, self.tiles_y)
+        columns = self._tile_range(x0 - margin, x1 + margin, TILE_WIDTH, self.tiles_x)
+        return *columns, *self._tile_range(y0 - margin, y1 + margin, TILE_HEIGHT, self.tiles_y)
 
-    def _tile_range(self, low: Any, high: Any, tiles: int) -> tuple[Any, Any]:
+    def _tile_range(self, low: Any, high: Any, size: int, tiles: int) -> tuple[Any, Any]:
         # A pixel is sampled at its centre: what ends before the first centre or starts after the last one is out.
         half = 0.5 if self.samples == 1 else 0.0
-        first, last = dr.floor((low + half) / TILE), dr.floor((high - half) / TILE) + 1.0
+        first, last = dr.floor((low + half) / size), dr.floor((high - half) / size) + 1.0
         return mi.UInt32(dr.clip(first, 0.0, float(tiles))), mi.UInt32(dr.clip(last, 0.0, float(tiles)))
 
     def tile_slopes(self, tile: Any) -> tuple[Any, Any, Any, Any]:
@@ -317,12 +319,12 @@ class View:
         o = self._opaque
         half = 0.5 if self.samples == 1 else 0.0
         row = tile // self.tiles_x
-        x, y = mi.Float((tile - row * self.tiles_x) * TILE), mi.Float(row * TILE)
+        x, y = mi.Float((tile - row * self.tiles_x) * TILE_WIDTH), mi.Float(row * TILE_HEIGHT)
         return (
             (x + half - o["cx"]) / o["fx"],
-            (x + (TILE - half) - o["cx"]) / o["fx"],
+            (x + (TILE_WIDTH - half) - o["cx"]) / o["fx"],
             (y + half - o["cy"]) / o["fy"],
-            (y + (TILE - half) - o["cy"]) / o["fy"],
+            (y + (TILE_HEIGHT - half) - o["cy"]) / o["fy"],
         )
 
     @cached_property
@@ -330,14 +332,15 @@ class View:
         """Slope boxes of all tiles of a distorted view, 4 floats each, from the slopes around each tile's edge."""
         tiles = self.tiles_x * self.tiles_y
         tile = dr.arange(mi.UInt32, tiles)
-        x, y = mi.Float(tile % self.tiles_x * TILE), mi.Float(tile // self.tiles_x * TILE)
+        x, y = mi.Float(tile % self.tiles_x * TILE_WIDTH), mi.Float(tile // self.tiles_x * TILE_HEIGHT)
         lo_u = lo_v = mi.Float(dr.inf)
         hi_u = hi_v = mi.Float(-dr.inf)
-        for i in range(TILE + 1):
-            for dx, dy in ((i, 0), (i, TILE), (0, i), (TILE, i)):
-                u, v = self.slopes(x + dx, y + dy)
-                lo_u, hi_u = dr.minimum(lo_u, u), dr.maximum(hi_u, u)
-                lo_v, hi_v = dr.minimum(lo_v, v), dr.maximum(hi_v, v)
+        edge = {(i, dy) for i in range(TILE_WIDTH + 1) for dy in (0, TILE_HEIGHT)}
+        edge |= {(dx, i) for dx in (0, TILE_WIDTH) for i in range(TILE_HEIGHT + 1)}
+        for dx, dy in sorted(edge):
+            u, v = self.slopes(x + dx, y + dy)
+            lo_u, hi_u = dr.minimum(lo_u, u), dr.maximum(hi_u, u)
+            lo_v, hi_v = dr.minimum(lo_v, v), dr.maximum(hi_v, v)
         table = dr.empty(mi.Float, 4 * tiles)
         dr.scatter(table, mi.Array4f(lo_u, hi_u, lo_v, hi_v), tile)
         dr.eval(table)

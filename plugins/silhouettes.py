@@ -24,7 +24,7 @@ from mitsplat.masks import Silhouette
 from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.project import CloudSet, Placement
-from mitsplat.plugins.rays import TILE, View
+from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH, View
 from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, prefix_ranges
 from mitsplat.plugins.walk import largest, respond_along
 from mitsplat.quality import Quality
@@ -33,7 +33,7 @@ MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Widths of the canvas around the image that are tried, in images. One image on each side is BOP's; where lens
 distortion cannot be inverted that far out, the widest is taken where it can."""
 
-_ROWS_OF_COLUMN = (np.arange(1 << TILE)[:, None] >> np.arange(TILE) & 1).astype(bool)
+_ROWS_OF_COLUMN = (np.arange(1 << TILE_HEIGHT)[:, None] >> np.arange(TILE_HEIGHT) & 1).astype(bool)
 """Which pixels of a column of a tile, from the top, the bits of a number cover."""
 
 _INVERTED = 0.01
@@ -68,7 +68,7 @@ def _cover(
         if canvas.tiles_y == 1:
             raise
         middle = canvas.tiles_y // 2
-        upper, lower = canvas.rows(0, middle * TILE), canvas.rows(middle * TILE, canvas.height)
+        upper, lower = canvas.rows(0, middle * TILE_HEIGHT), canvas.rows(middle * TILE_HEIGHT, canvas.height)
         (above, *rest), (below, *more) = (_cover(clouds, objects, part, quality, ids) for part in (upper, lower))
         tile = np.concatenate([above, below + middle * canvas.tiles_x])
         slot, bits = (np.concatenate(parts) for parts in zip(rest, more, strict=True))
@@ -178,14 +178,14 @@ def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any] 
 
 def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance: Any) -> Any:
     """For every pair and each column of its tile, the pixels that the instance covers, as bits from the top."""
-    lane = dr.arange(mi.UInt32, dr.width(tile) * TILE)
-    pair, column = lane // TILE, lane % TILE
+    lane = dr.arange(mi.UInt32, dr.width(tile) * TILE_WIDTH)
+    pair, column = lane // TILE_WIDTH, lane % TILE_WIDTH
     tile, instance = dr.gather(mi.UInt32, tile, pair), dr.gather(mi.Float, instance, pair)
     row = tile // view.tiles_x
-    x = mi.Float((tile - row * view.tiles_x) * TILE + column)
-    y = mi.Float(row * TILE)
+    x = mi.Float((tile - row * view.tiles_x) * TILE_WIDTH + column)
+    y = mi.Float(row * TILE_HEIGHT)
     centre = dr.opaque(mi.Float, 0.5)  # as in the instance image, whatever the number of samples
-    slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE)]
+    slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
     start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
@@ -205,7 +205,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance
     def undecided(i: Any, through: list[Any]) -> Any:
         return (i < stop) & (largest(through) >= 0.5)
 
-    ones = [mi.Float(1.0) for _ in range(TILE)]
+    ones = [mi.Float(1.0) for _ in range(TILE_HEIGHT)]
     _, through = dr.while_loop((mi.UInt32(start), ones), undecided, body, label="silhouettes")
     bits = mi.UInt32(0)
     for k, t in enumerate(through):
@@ -218,7 +218,7 @@ def _assemble(
     tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: View, left: int, top: int
 ) -> dict[int, Silhouette]:
     """Masks of whole instances from those of their tiles."""
-    columns = bits.astype(np.uint8).reshape(len(tile), TILE)
+    columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)
     chosen = np.flatnonzero(columns.any(axis=1))
     chosen = chosen[np.argsort(slot[chosen], kind="stable")]
     tile, columns = tile[chosen], columns[chosen]
@@ -231,12 +231,12 @@ def _assemble(
             continue
         y, x = rows[start:stop], cols[start:stop]
         y0, x0 = int(y.min()), int(x.min())
-        grid = np.zeros((int(y.max()) - y0 + 1, TILE, int(x.max()) - x0 + 1, TILE), dtype=bool)
+        grid = np.zeros((int(y.max()) - y0 + 1, TILE_HEIGHT, int(x.max()) - x0 + 1, TILE_WIDTH), dtype=bool)
         grid[y - y0, :, x - x0] = blocks[start:stop]
-        mask = grid.reshape(grid.shape[0] * TILE, grid.shape[2] * TILE)
-        mask = mask[: canvas.height - y0 * TILE, : canvas.width - x0 * TILE]
+        mask = grid.reshape(grid.shape[0] * TILE_HEIGHT, grid.shape[2] * TILE_WIDTH)
+        mask = mask[: canvas.height - y0 * TILE_HEIGHT, : canvas.width - x0 * TILE_WIDTH]
         if mask.any():
-            found[instance] = Silhouette.cropped(mask, x0 * TILE - left, y0 * TILE - top)
+            found[instance] = Silhouette.cropped(mask, x0 * TILE_WIDTH - left, y0 * TILE_HEIGHT - top)
     return found
 
 

@@ -3,9 +3,9 @@
 1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
 2. *Project* what is left to view records (one kernel), see :mod:`mitsplat.plugins.project`.
 3. *Pair* each with the tiles that its cut-off ellipse really meets: the ellipse cuts a span out of every row of tiles.
-4. *Sort* the pairs by tile and by depth there. For the order per tile that is the peak's depth along the tile's ray
-   nearest to the Gaussian's centre; for the order per ray it is a lower bound over all rays of the tile, which says
-   when a ray has seen all that can come first.
+4. *Sort* the pairs by tile and by depth there. For the order per tile that is the peak's depth along the ray
+   around which the tile sees most of the Gaussian; for the order per ray it is a lower bound over all rays of the tile,
+   which says when a ray has seen all that can come first.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from mitsplat.errors import MissingResourceError
 from mitsplat.plugins.chosen import ChosenTiles
 from mitsplat.plugins.device import concatenated
-from mitsplat.plugins.gaussian import RECORD, conic_touches_rectangle, ellipse_span
+from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD, conic_touches_rectangle, ellipse_span
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import View
 from mitsplat.quality import Quality
@@ -302,10 +302,7 @@ def _pair(
     def one_tile(k: Any) -> tuple[Any]:
         tile, pair = first_tile + k, pair_of + k
         slopes = view.tile_slopes(tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile))
-        if quality.order == "ray":
-            depth = _least_depth(record, ellipsoid, slopes)
-        else:
-            depth = _depth_near_centre(record, slopes)
+        depth = _least_depth(record, ellipsoid, slopes) if quality.order == "ray" else _depth_where_seen(record, slopes)
         for target, value in ((number, owner), (tile_of, tile), (level_of, _level(depth, view))):
             dr.scatter(target, value, pair, mode=dr.ReduceMode.Permute)
         return (k + 1,)
@@ -415,10 +412,24 @@ def _depth_of_level(level: Any, view: View) -> Any:
     return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
 
-def _depth_near_centre(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
-    """Depth of a Gaussian's peak along that ray of a tile which passes its centre most closely."""
+def _depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
+    """Depth of a Gaussian's peak along the ray of a tile around which the tile sees most of it.
+
+    With M the inverse covariance of the footprint and V that of a tile's pixels, taken for a Gaussian around its middle
+    m, their product has its mean at (I + V M)^-1 m from the footprint's centre: near the centre of what is small
+    against the tile, in the middle of the tile for what is large.
+    """
     lo_u, hi_u, lo_v, hi_v = slopes
-    du, dv = dr.clip(record[0], lo_u, hi_u) - record[0], dr.clip(record[1], lo_v, hi_v) - record[1]
+    u0, v0, a, b2, c = (record[k] for k in range(5))
+    middle_u, middle_v = 0.5 * (lo_u + hi_u) - u0, 0.5 * (lo_v + hi_v) - v0
+    variance_u, variance_v = (dr.square(w) / (12 * LOG2_E_HALF) for w in (hi_u - lo_u, hi_v - lo_v))
+    # What is smaller than the tile by more than this is seen at its centre, and would overflow.
+    p11, p22 = 1 + dr.minimum(variance_u * a, 1e15), 1 + dr.minimum(variance_v * c, 1e15)
+    b = dr.clip(0.5 * b2, -1e15 / variance_u, 1e15 / variance_u)
+    inverse = dr.rcp(dr.maximum(p11 * p22 - variance_u * b * (variance_v * b), 1))
+    du = inverse * (p22 * middle_u - variance_u * b * middle_v)
+    dv = inverse * (p11 * middle_v - variance_v * b * middle_u)
+    du, dv = dr.clip(du, lo_u - u0, hi_u - u0), dr.clip(dv, lo_v - v0, hi_v - v0)
     top, bottom = _depth_fraction(record, du, dv)
     return dr.select(record[2] < 0, 0, record[9] * dr.maximum(top, 0) / bottom)
 

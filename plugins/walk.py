@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.gaussian import RECORD
-from mitsplat.plugins.rays import TILE, View
+from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
 from mitsplat.plugins.tiles import TileLists
 from mitsplat.quality import KERNELS, Order, Quality
 
@@ -46,24 +46,25 @@ class Lanes:
         start, stop: Range of the tile's list.
     """
 
-    def __init__(self, lists: TileLists, view: View, rows: int = TILE, *, apart: bool = False) -> None:
-        """Lanes of ``rows`` pixels each, a divisor of the tile's.
+    def __init__(self, lists: TileLists, view: View, rows: int = TILE_HEIGHT, *, apart: bool = False) -> None:
+        """Lanes of ``rows`` pixels each, a divisor of a tile's height.
 
         Tiles that are taken ``apart`` from their view have pixels of their own, tile after tile and row by row.
         """
         count = view.tiles_x * view.tiles_y if lists.tiles is None else dr.width(lists.tiles)
-        per_tile = TILE * TILE // rows
+        per_tile = TILE_PIXELS // rows
         lane = dr.arange(mi.UInt32, count * per_tile)
         own = lane // per_tile
         tile = own if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, own)
         tile_y = tile // view.tiles_x
         self.view, self.rows = view, rows
-        self.x = (tile - tile_y * view.tiles_x) * TILE + lane % TILE
-        self.y = tile_y * TILE + lane % per_tile // TILE * rows
-        self.count = count * TILE * TILE if apart else view.width * view.height
+        self.x = (tile - tile_y * view.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
+        self.y = tile_y * TILE_HEIGHT + lane % per_tile // TILE_WIDTH * rows
+        self.count = count * TILE_PIXELS if apart else view.width * view.height
         if apart:
-            first = own * (TILE * TILE) + lane % per_tile // TILE * (rows * TILE) + lane % TILE
-            self.pixel = [first + k * TILE for k in range(rows)]
+            row = lane % per_tile // TILE_WIDTH * rows
+            first = own * TILE_PIXELS + row * TILE_WIDTH + lane % TILE_WIDTH
+            self.pixel = [first + k * TILE_WIDTH for k in range(rows)]
         else:
             self.pixel = [(self.y + k) * view.width + self.x for k in range(rows)]
         self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(rows)]

@@ -135,8 +135,10 @@ def print_estimate(name: str, picture: Picture) -> None:
 
 
 def tiles_of(pixels: npt.NDArray[np.bool_], width: int) -> npt.NDArray[np.bool_]:
-    """Which tiles of 4 x 4 hold one of some pixels of an image whose edges tiles divide."""
-    return pixels.reshape(-1, 4, width // 4, 4).any(axis=(1, 3))
+    """Which tiles hold one of some pixels of an image whose edges tiles divide."""
+    from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
+
+    return pixels.reshape(-1, TILE_HEIGHT, width // TILE_WIDTH, TILE_WIDTH).any(axis=(1, 3))
 
 
 def rms(difference: npt.NDArray[np.float32]) -> float:
@@ -167,7 +169,7 @@ def main() -> None:
     """Parse the command line and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=CAPTURES)
-    parser.add_argument("--size", default="1280x720", help="of the pictures, a multiple of 4 px")
+    parser.add_argument("--size", default="1280x720", help="of the pictures, a multiple of 8 px")
     parser.add_argument("--names", nargs="*", default=[], help="captures, or workcell; all by default")
     options = parser.parse_args()
     ensure_variant()

@@ -109,14 +109,14 @@ def print_growth() -> None:
 
 def print_peak() -> None:
     """Evaluations per second of a march that no ray leaves early, against the peak of fused multiply-adds."""
-    from mitsplat.plugins.rays import TILE
+    from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
 
     splats = synthetic(200_000)
     endless = replace(PRESETS["fast"], transmittance_min=0.0)
     _, seconds, pairs = stages(
         replace(splats, opacities=splats.opacities * 0.02), CAMERA, replace(endless, alpha_min=1e-5)
     )
-    rate, peak = pairs * TILE * TILE / seconds, fma_peak()
+    rate, peak = pairs * TILE_WIDTH * TILE_HEIGHT / seconds, fma_peak()
     figure(rate / 1e9, "G/s", "evaluations")
     figure(peak / 1e9, "G/s", "multiply adds")
     figure(rate * FMA_PER_EVALUATION / peak, "", "share of peak")

@@ -14,6 +14,7 @@ import numpy as np
 
 from mitsplat.camera import Camera
 from mitsplat.engine.resources import WorkerMemory
+from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
 from mitsplat.plugins.tiles import PAIRS_MAX
 from mitsplat.quality import resolve_quality
 from mitsplat.scene.scene import Scene, plan_frame
@@ -41,6 +42,7 @@ PER_SEEN = 2.25
 """For every pixel and instance: which of them are seen alone, in tiles up to an image beyond each border [bytes]."""
 
 _VIEWS = 5
+_TILE = np.array([TILE_WIDTH, TILE_HEIGHT])
 _SAMPLE = 50_000
 """Gaussians of an asset that are looked at, of which the others are taken to be alike."""
 _REACH = 3.33
@@ -83,15 +85,15 @@ def worker_memory(scene: Scene) -> WorkerMemory:
 
 
 def _pairs(splats: Splats, camera: Camera, samples: int, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:
-    """About how many tiles of 4 x 4 rays Gaussians cover together, no fewer, of an asset that stands at a place [m]."""
+    """About how many tiles of 8 x 4 rays Gaussians cover together, no fewer, of an asset that stands at a place [m]."""
     step = 1 + len(splats) // _SAMPLE
     means = splats.means[::step] + np.asarray(tuple(at), dtype=np.float32)
     pixel, depth = camera.project(means)
     seen = depth > camera.near
     slope = samples * max(camera.fx, camera.fy) / np.maximum(depth[seen], 1e-6)
     axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:]  # of the widest outline that it can show
-    tiles = np.prod(2 * _REACH * axes * slope[:, None] / 4 + 1, axis=1)
-    across = samples * np.array([camera.width, camera.height]) / 4
+    tiles = np.prod(2 * _REACH * axes * slope[:, None] / _TILE + 1, axis=1)
+    across = samples * np.array([camera.width, camera.height]) / _TILE
     reach = _REACH * axes[:, 1] * slope / samples
     x, y = pixel[seen].T
     inside = (x > -reach) & (x < camera.width + reach) & (y > -reach) & (y < camera.height + reach)

@@ -88,7 +88,7 @@ def test_each_point_of_a_lens_sees_smooth_borders() -> None:
 
 
 def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -> None:
-    from mitsplat.plugins.edges import BLOCK, Edges
+    from mitsplat.plugins.edges import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
     from mitsplat.plugins.sensors import view_of
     from mitsplat.render.layers import make_sensor
 
@@ -102,7 +102,7 @@ def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -
     rows, columns = np.nonzero(np.any(beside, axis=0))
     edges = Edges.find(mi.UInt32(keys.ravel()), view)
     assert edges is not None
-    blocks = np.unique(rows // BLOCK * edges.fine.tiles_x + columns // BLOCK)
+    blocks = np.unique(rows // BLOCK_HEIGHT * edges.fine.tiles_x + columns // BLOCK_WIDTH)
     assert np.array_equal(np.array(edges.chosen.number), blocks)
 
 

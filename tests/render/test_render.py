@@ -413,7 +413,7 @@ def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples:
     quality = replace(PRESETS["exact"], samples=samples)
     camera = replace(CAMERA, height=27)
     whole = render_splats(splats, camera, quality=quality)
-    monkeypatch.setattr(tiles, "PAIRS_MAX", 3000)
+    monkeypatch.setattr(tiles, "PAIRS_MAX", 1500)
     parts = render_splats(splats, camera, quality=quality)
     assert joined
     for name in ("rgb", "alpha", "depth"):

@@ -63,7 +63,7 @@ def test_a_smaller_tolerance_walks_more_tiles_again(monkeypatch: pytest.MonkeyPa
 
     for tolerance in (0.05, 0.01, 1e-3, 1e-9):
         render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=tolerance))
-    assert 0 < again[0] < again[1] < again[2] < again[3] <= 24 * 18
+    assert 0 < again[0] < again[1] < again[2] < again[3] <= 12 * 18
     again.clear()
     for tolerance in (0.0, math.inf):
         render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=tolerance))
@@ -136,9 +136,9 @@ def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> 
     judged = march._too_wrong
 
     def judged_or_black(errors: list[Any], quality: Quality) -> Any:
-        """Also the black squares of a chequerboard of 24 x 18 tiles."""
-        tile = dr.arange(mi.UInt32, dr.width(errors[0])) // 16
-        return judged(errors, quality) | ((tile + tile // 24) % 2 == 0)
+        """Also the black squares of a chequerboard of 12 x 18 tiles."""
+        tile = dr.arange(mi.UInt32, dr.width(errors[0])) // 32
+        return judged(errors, quality) | ((tile + tile // 12) % 2 == 0)
 
     monkeypatch.setattr(march, "_too_wrong", judged_or_black)
     quality = Quality(tolerance=1e-3, alpha_min=1e-4, transmittance_min=1e-5, samples=samples)
@@ -148,7 +148,7 @@ def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> 
     exact = display(render_splats(sheets(lambda x: 0.8 * x), WIDE, quality=replace(quality, tolerance=0.0)))
     steps = np.abs(np.diff(ramp - exact, axis=1)).max(axis=(0, 2))
     assert np.ptp(ramp) > 0.3
-    assert steps[3::4].max() < 2e-3  # from the last column of a tile to the first of the next
+    assert steps[7::8].max() < 2e-3  # from the last column of a tile to the first of the next
 
 
 def test_late_by_one_place_is_estimated_exactly() -> None:

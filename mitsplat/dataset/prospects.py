@@ -22,9 +22,10 @@ from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
-from mitsplat.scene.sight import solid_around
+from mitsplat.scene.spec import BACKDROP
 from mitsplat.scene.spec_lights import LocalLight
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds, stated_pose
+from mitsplat.sight import solid_around
 
 MOST_OBJECTS = 65535
 """Instance ids have 16 bits."""
@@ -227,6 +228,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
         f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
         "move camera, its keys or its ranges: such images have no labels",
     )
+    yield from _backdrop_doubts(scene, plans)
     for number, light in enumerate(spec.lights):
         if isinstance(light, LocalLight) and not light.moved and (name := _light_inside(scene, light)):
             text = f"lights[{number}] is inside of shape {name!r}"
@@ -245,6 +247,30 @@ def doubts(scene: Scene) -> Iterator[Finding]:
             if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
                 text = f"{asset.name!r} does not fit into {shape.name!r}"
                 yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
+
+
+def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
+    """Views and lights from behind a backdrop's walls."""
+    walls = [shape.box for shape in scene.spec.shapes if shape.box and shape.name.startswith(f"{BACKDROP}wall ")]
+    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
+
+    def behind(point: Iterable[float]) -> bool:
+        """Whether a wall's middle plane parts a point from the middle of the region."""
+        for box in walls:
+            axis = int(np.argmin(box.size))
+            turn = stated_pose(box)[:3, :3].T
+            here, there = (turn @ np.subtract(tuple(place), box.position) for place in (point, middle))
+            if here[axis] * there[axis] < 0:
+                return True
+        return False
+
+    if hidden := sum(behind(plan.camera.centre) for plan in plans):
+        text = f"of {len(plans)} views {hidden} are from behind a wall of the backdrop, which hides everything"
+        yield Finding("backdrop", False, text, "make backdrop.size larger, or leave that side out of backdrop.sides")
+    lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
+    if hidden := sum(behind(light.position) for light in lights):
+        text = f"{hidden} of {len(lights)} lights are behind a wall of the backdrop"
+        yield Finding("backdrop", False, text, "move lights into the room, or leave that side out of backdrop.sides")
 
 
 def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:

@@ -324,8 +324,7 @@ class Renderer:
         if environment is not None:
             shapes["environment"] = _asset_shape(environment, np.eye(4), 0)
         for i, (shape, mesh) in enumerate(zip(self.scene.spec.shapes, self.scene.shape_meshes, strict=True)):
-            if shape.visible and shape.materials:
-                finish = place.finishes[shape.name]
+            if shape.visible and (finish := place.finish_of(shape.name)) is not None:
                 image = texture_image(finish, self.scene.images)
                 bsdf = mi.load_dict(material(finish, None if image is None else bitmap_texture(image)))
                 shapes[f"shape_{i}"] = finished_mesh(mesh, shape, finish, image, bsdf)

@@ -61,7 +61,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if shape.visible:
             stem = files / f"shape_{number}"
-            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, stem, place.finishes.get(shape.name), scene)
+            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, stem, place.finish_of(shape.name), scene)
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {
         "type": "scene",

@@ -16,6 +16,7 @@ from mitsplat.scene.contents import draw_environment
 from mitsplat.scene.spec import SceneSpec
 from mitsplat.scene.spec_materials import Background, BrushedMetalMaterial, ColourMaterial, ImageMaterial, Material
 from mitsplat.scene.streams import random_stream
+from mitsplat.scene.walls import finish_name
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset
@@ -84,13 +85,17 @@ class Place:
 
     Attributes:
         environment: Position among the scene's environments; 0 without any.
-        finishes: Materials of visible shapes by their names, of those that draw one.
+        finishes: Materials of visible shapes that draw one by their names, and of all walls of a backdrop.
         background: What is behind everything, if it is an image.
     """
 
     environment: int = 0
     finishes: Mapping[str, Finish] = field(default_factory=dict)
     background: Backing | None = None
+
+    def finish_of(self, shape: str) -> Finish | None:
+        """Material of a shape by its name, if it draws one."""
+        return self.finishes.get(finish_name(shape))
 
     def to_json(self, spec: SceneSpec) -> dict[str, Any]:
         """What the scene file leaves open, as JSON values; empty if that is nothing."""
@@ -107,11 +112,8 @@ class Place:
 def draw_place(spec: SceneSpec, index: int) -> Place:
     """The place of frame ``index``."""
     layout = index // spec.output.views
-    finishes = {
-        shape.name: draw_finish(shape.materials, spec.seed, shape.name, layout)
-        for shape in spec.shapes
-        if shape.materials
-    }
+    materials = {finish_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
+    finishes = {name: draw_finish(among, spec.seed, name, layout) for name, among in materials.items()}
     background = None
     if spec.background is not None:
         background = draw_backing(spec.background, spec.seed, index if spec.background.per == "frame" else layout)

@@ -35,7 +35,7 @@ from mitsplat.scene.spec_objects import PRIMITIVES, ObjectSpec
 from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.viewpoints import camera_at, view_of
-from mitsplat.scene.walls import bin_walls, enclosure_walls, stated_pose
+from mitsplat.scene.walls import backdrop_shapes, bin_walls, enclosure_walls, stated_pose
 from mitsplat.untrusted_images import IMAGES, check_images
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
@@ -144,6 +144,8 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     spec = _matched_skies(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     _check_held_out(spec, path)
+    if spec.backdrop is not None:
+        spec = spec.model_copy(update={"shapes": (*spec.shapes, *backdrop_shapes(spec.backdrop)), "backdrop": None})
     named = _read_named(spec, path)
     _check_images(spec, path, named)
     with _blaming(path, "environment"):
@@ -270,6 +272,11 @@ def image_lists(spec: SceneSpec) -> Iterator[tuple[tuple[str | int, ...], str | 
         for number, material in enumerate(shape.materials):
             if isinstance(material, ImageMaterial):
                 yield ("shapes", position, "materials", number, "images"), material.images
+    if spec.backdrop is not None:
+        for key in ("floor", "walls"):
+            for number, material in enumerate(getattr(spec.backdrop, key)):
+                if isinstance(material, ImageMaterial):
+                    yield ("backdrop", key, number, "images"), material.images
     if spec.background is not None:
         yield ("background", "images"), spec.background.images
 
@@ -359,6 +366,9 @@ def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSp
         for number, shape in enumerate(spec.shapes)
     )
     spec = spec.model_copy(update={"shapes": shapes})
+    if spec.backdrop is not None:
+        both = {key: materials_of("backdrop", key, among=getattr(spec.backdrop, key)) for key in ("floor", "walls")}
+        spec = spec.model_copy(update={"backdrop": spec.backdrop.model_copy(update=both)})
     if spec.background is None:
         return spec
     background = spec.background.model_copy(update={"images": found["background", "images"]})

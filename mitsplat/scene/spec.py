@@ -15,9 +15,12 @@ from mitsplat.scene.spec_image import Composite, Randomise, Rendering
 from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec_materials import Background
 from mitsplat.scene.spec_objects import ObjectSpec, Settle
-from mitsplat.scene.spec_shapes import Enclosure, Region, Shape
+from mitsplat.scene.spec_shapes import Backdrop, Enclosure, Region, Shape
 from mitsplat.scene.spec_types import Positive, StrictModel, Unit
 from mitsplat.yaml_input import FieldError
+
+BACKDROP = "backdrop "
+"""How the names of the shapes begin that a backdrop is written out as."""
 
 SCHEMA_VERSION = 1
 """Goes up when a scene file that was right is refused or means something else. Scene files, which people write, state
@@ -122,6 +125,11 @@ class SceneSpec(StrictModel):
         description="Whether objects also rest on the environment's mesh, whose convex pieces take minutes to make.",
     )
     shapes: tuple[Shape, ...] = Field((), description="Tabletop, walls and other things that do not move.")
+    backdrop: Backdrop | None = Field(
+        None,
+        exclude_if=lambda backdrop: backdrop is None,
+        description="A room around an environment that is only a table, or around shapes.",
+    )
     background: Background | None = Field(
         None,
         exclude_if=lambda background: background is None,
@@ -164,6 +172,9 @@ class SceneSpec(StrictModel):
             if shape.name in seen:
                 raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
             seen.add(shape.name)
+            if self.backdrop is not None and shape.name.startswith(BACKDROP):
+                text = f"must not begin with {BACKDROP!r} beside a backdrop (got {shape.name!r})"
+                raise FieldError(("shapes", position, "name"), text)
         skies = [i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)]
         if self.environment == ():
             raise FieldError("environment", "must name at least one asset (got [])")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, NonNegativeFloat, model_validator
 
-from mitsplat.scene.spec_materials import Material
+from mitsplat.scene.spec_materials import ColourMaterial, Material, NoiseMaterial
 from mitsplat.scene.spec_types import Positive, StrictModel, Unit, Vec3
 from mitsplat.yaml_input import FieldError
 
@@ -58,6 +60,34 @@ class Shape(StrictModel):
             raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
         if self.materials and not self.visible:
             raise FieldError("materials", f"must not be given for shape {self.name!r}, which is not visible")
+        return self
+
+
+class Backdrop(StrictModel):
+    """Floor and walls around everything, which lights fall on as on visible shapes. What is behind them is hidden."""
+
+    size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of the room inside [m].")
+    position: Vec3 = Field((0, 0, 0), description="Middle of its floor [m].")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+    sides: tuple[Literal["-x", "+x", "-y", "+y"], ...] = Field(
+        ("-x", "+x", "-y", "+y"), description="Sides that have a wall, before the rotation."
+    )
+    ceiling: bool = Field(False, description="Whether it has a ceiling, of the walls' material.")
+    collider: bool = Field(False, description="Whether objects rest on its floor.")
+    floor: tuple[Material, ...] = Field(
+        (NoiseMaterial(saturation=(0, 0.3), scale=(0.1, 0.5)),),
+        description="Materials, one of which each layout draws for the floor.",
+    )
+    walls: tuple[Material, ...] = Field(
+        (ColourMaterial(saturation=(0, 0.3), value=(0.4, 0.9)),),
+        description="Materials, one of which each layout draws for all walls.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Backdrop:
+        for key in ("floor", "walls"):
+            if not getattr(self, key):
+                raise FieldError(key, "must have at least one material (got [])")
         return self
 
 

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
-from mitsplat.scene.sight import Prospect, Sight
 from mitsplat.scene.spec import Output
 from mitsplat.scene.spec_camera import CameraHemisphere, CameraOrbit, CameraSpec, CameraWalk, Handheld, Intrinsics
 from mitsplat.scene.streams import random_stream
+from mitsplat.sight import Prospect, Sight
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout

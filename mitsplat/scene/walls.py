@@ -10,9 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.scene.spec import SceneSpec
+from mitsplat.scene.spec import BACKDROP, SceneSpec
 from mitsplat.scene.spec_objects import ObjectPose
-from mitsplat.scene.spec_shapes import Bin, Box, Enclosure, Region, Shape
+from mitsplat.scene.spec_shapes import Backdrop, Bin, Box, Enclosure, Region, Shape
+from mitsplat.scene.spec_types import Vec3
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 ENCLOSURE = "enclosure "
 """How the names of the shapes begin that an enclosure is written out as."""
+
+BACKDROP_THICKNESS = 0.1
+"""Of a backdrop's floor and walls [m]."""
 
 PILE_HEIGHT = 1.0
 """How far above the drop region the objects of a pile may start [m]."""
@@ -55,6 +59,41 @@ def enclosure_walls(
         box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
         walls.append(Shape(name=f"{ENCLOSURE}{name}", box=box))
     return walls
+
+
+def backdrop_shapes(room: Backdrop) -> list[Shape]:
+    """A backdrop as visible boxes: floor, walls that stand on it, and ceiling, each outside of the room."""
+    width, depth, height = room.size
+    turn = Rotation.from_euler("z", room.rotate_z, degrees=True).as_matrix()
+    edge = BACKDROP_THICKNESS
+    wide = width + 2 * edge, depth + 2 * edge
+    parts: list[tuple[str, Vec3, Vec3]] = [("floor", (*wide, edge), (0.0, 0.0, -edge / 2))]
+    for side in room.sides:
+        axis, sign = "xy".index(side[1]), -1.0 if side[0] == "-" else 1.0
+        size, middle = [width, wide[1], height], [0.0, 0.0, height / 2]
+        if axis == 1:  # these stand between those along y, so that no faces coincide
+            size = [width, edge, height]
+        else:
+            size[0] = edge
+        middle[axis] = sign * (room.size[axis] + edge) / 2
+        parts.append((f"wall {side}", (size[0], size[1], size[2]), (middle[0], middle[1], middle[2])))
+    if room.ceiling:
+        parts.append(("wall above", (*wide, edge), (0.0, 0.0, height + edge / 2)))
+    return [
+        Shape(
+            name=f"{BACKDROP}{name}",
+            box=Box(size=size, position=tuple((turn @ middle + room.position).tolist()), rotate=(0, 0, room.rotate_z)),
+            visible=True,
+            collider=room.collider and name == "floor",
+            materials=room.floor if name == "floor" else room.walls,
+        )
+        for name, size, middle in parts
+    ]
+
+
+def finish_name(shape: str) -> str:
+    """What a shape shares its material with: all walls of a backdrop have one."""
+    return f"{BACKDROP}walls" if shape.startswith(f"{BACKDROP}wall ") else shape
 
 
 def stated_pose(place: Box | ObjectPose) -> Float64Array:

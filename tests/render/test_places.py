@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mitsplat.dataset.prospects import doubts
 from mitsplat.errors import InputError
 from mitsplat.render.places import Finish, draw_place, environment_at
 from mitsplat.scene.scene import load_scene
@@ -153,6 +154,12 @@ def test_each_frame_or_layout_draws_a_background(scene_data: SceneData, write_sc
         ({"background": {"images": "bad.png"}}, "bad.png: not a readable image ("),
         ({"background": {"images": "/etc/*.png"}}, "background.images: must be inside the scene's folder"),
         ({"background": {"images": "assets", "crop": [0, 1]}}, "background.crop[0]: must be > 0 (got 0)"),
+        ({"backdrop": {"size": [1, 1, 0]}}, "backdrop.size[2]: must be > 0 (got 0)"),
+        ({"backdrop": {"size": [1, 1, 1], "walls": []}}, "backdrop.walls: must have at least one material (got [])"),
+        (
+            {"backdrop": {"size": [1, 1, 1], "floor": [{"kind": "image", "images": "gone.png"}]}},
+            "backdrop.floor[0].images: must name at least one image (got 'gone.png', where",
+        ),
         ({"materials": [{"kind": "glass"}]}, "shapes[0].materials[0].kind: must be "),
         ({"materials": [{"kind": "noise", "scale": [0, 1]}]}, "shapes[0].materials[0].scale[0]: must be > 0 (got 0)"),
         ({"materials": [{"kind": "wood", "roughness": [0, 1]}]}, "shapes[0].materials[0].roughness: "),
@@ -184,3 +191,31 @@ def test_the_first_unreadable_image_of_many_is_named(
     scene_data |= {"background": {"images": "photos"}}
     with pytest.raises(InputError, match=r"background\.images: .*photos/3\.png: not a readable image"):
         load_scene(write_scene(scene_data))
+
+
+def test_a_backdrop_is_a_room_around_its_inside(scene_data: SceneData, write_scene: WriteScene) -> None:
+    """Walls leave the inside free, overlap nowhere, and share one material; without sides there is only the floor."""
+    room = {"size": [3, 2, 2.5], "position": [0.2, 0, -0.7], "rotate_z": 30, "ceiling": True, "collider": True}
+    scene_data |= {"backdrop": room, "enclosure": {}}
+    scene = load_scene(write_scene(scene_data))
+    made = {s.name: m for s, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if s.name[:8] == "backdrop"}
+    names = ["floor", "wall -x", "wall +x", "wall -y", "wall +y", "wall above"]
+    assert list(made) == [f"backdrop {name}" for name in names]
+    outer = 3.2 * 2.2 * 2.7
+    assert sum(mesh.volume for mesh in made.values()) == pytest.approx(outer - 3 * 2 * 2.5)
+    turn = np.array([[np.cos(np.pi / 6), np.sin(np.pi / 6)], [-np.sin(np.pi / 6), np.cos(np.pi / 6)]])
+    corners = np.concatenate([mesh.vertices for mesh in made.values()]) - room["position"]
+    own = np.column_stack([corners[:, :2] @ turn.T, corners[:, 2]])
+    np.testing.assert_allclose([own.min(axis=0), own.max(axis=0)], [(-1.6, -1.1, -0.1), (1.6, 1.1, 2.6)], atol=1e-9)
+    inside = (np.abs(own[:, :2]) < (1.499, 0.999)).all(axis=1) & (own[:, 2] > 0.001) & (own[:, 2] < 2.499)
+    assert not inside.any()
+    assert [s.name for s in scene.spec.shapes if s.collider and s.visible] == ["table", "backdrop floor"]
+    assert set(draw_place(scene.spec, 0).finishes) == {"backdrop floor", "backdrop walls"}
+    assert draw_place(scene.spec, 0).finish_of("backdrop wall +y") == draw_place(scene.spec, 0).finish_of(
+        "backdrop wall -x"
+    )
+    assert [finding.text for finding in doubts(scene) if not finding.ok] == []
+    scene_data["backdrop"] = {"size": [0.7, 0.7, 0.9], "position": [0, 0, -0.2], "sides": ["+x", "-y"]}
+    found = [finding.text for finding in doubts(load_scene(write_scene(scene_data))) if not finding.ok]
+    assert "of 12 views 6 are from behind a wall of the backdrop, which hides everything" in found
+    assert "1 of 1 lights are behind a wall of the backdrop" in found

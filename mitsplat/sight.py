@@ -18,11 +18,11 @@ import trimesh
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.camera import Camera
 from mitsplat.mesh_points import points_inside
-from mitsplat.scene.spec_camera import Acceptance, Occlusion, Truncation
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
     from mitsplat.scene.scene import Scene
+    from mitsplat.scene.spec_camera import Acceptance, Occlusion, Truncation
 
 _POINTS = 40_000
 """Of all objects of a layout together, at most."""

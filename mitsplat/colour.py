@@ -27,6 +27,22 @@ def decode_srgb(encoded: npt.ArrayLike) -> Float64Array:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
+def hue_matrix(degrees: float) -> Float64Array:
+    """Rotation of linear sRGB about the grey axis, shape (3, 3)."""
+    angle = np.radians(degrees)
+    axis = np.full((3, 3), 1 / 3)
+    k = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
+    matrix: Float64Array = np.cos(angle) * np.eye(3) + (1 - np.cos(angle)) * axis + np.sin(angle) * k
+    return matrix
+
+
+def saturation_matrix(factor: float) -> Float64Array:
+    """Matrix on linear sRGB that scales the distance from the grey of the same luminance, shape (3, 3)."""
+    grey = np.broadcast_to(LUMINANCE.astype(np.float64), (3, 3))
+    matrix: Float64Array = factor * np.eye(3) + (1 - factor) * grey
+    return matrix
+
+
 @lru_cache(maxsize=256)
 def black_body_colour(kelvin: float) -> tuple[float, float, float]:
     """Linear sRGB of a black body (Kang et al. 2002), of luminance 1; a negative component counts as 0."""

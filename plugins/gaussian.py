@@ -128,6 +128,12 @@ def srgb_to_linear(value: Any) -> Any:
     )
 
 
+def linear_to_srgb(value: Any) -> Any:
+    """The inverse of :func:`srgb_to_linear`; what is below 0 counts as 0."""
+    value = dr.maximum(value, 0)
+    return dr.select(value <= 0.0031308, 12.92 * value, 1.055 * dr.power(dr.maximum(value, 1e-9), 1 / 2.4) - 0.055)
+
+
 def rotation_axes(q: Any) -> Axes:
     """Columns of the rotation matrix of a quaternion xyzw: the Gaussian's axes in its frame."""
     x, y, z, w = q

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.plugins.appearance import ROW, changed, rows_of
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.gaussian import evaluate_sh, rotation_axes
 from mitsplat.plugins.occlusion import SETS, Caster, Solids
@@ -54,12 +55,14 @@ class SplatMirror:
         clouds: Their colours.
         gaussians: Placement and number in its cloud of each triangle's Gaussian, two per triangle.
         table: ``_ROW`` floats per placement.
+        appearances: Floats per placement, see :mod:`mitsplat.plugins.appearance`; None if there are none.
     """
 
     solids: Solids
     clouds: CloudSet
     gaussians: Any
     table: Any
+    appearances: Any | None = None
 
     @classmethod
     def build(
@@ -81,7 +84,12 @@ class SplatMirror:
             row[9], row[10] = anew, footprint
         caster, gaussian = solids.owners
         owners = np.stack([caster, firsts[caster] + gaussian], axis=1)
-        return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows))
+        appearances = None
+        if any(p.appearance is not None for p in placements):
+            appearances = wrapped(
+                mi.Float, np.pad(rows_of([p.appearance for p in placements]), ((0, 0), (0, _ROW - ROW)))
+            )
+        return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
     def look(self, ray: Any, key: Any, active: Any) -> Glimpse:
         """What rays see, each by the set of solids that its ``key`` decides."""
@@ -96,6 +104,10 @@ class SplatMirror:
         packet = dr.gather(mi.ArrayXf, self.clouds.sh, owner.y, found, shape=(stride, dr.width(owner)))
         colour = evaluate_sh(own, lambda k: [packet[3 * k + i] for i in range(3)], self.clouds.sh_count)
         geometry = dr.gather(mi.ArrayXf, self.clouds.geometry, owner.y, found, shape=(8, dr.width(owner)))
+        if self.appearances is not None:
+            looks = dr.gather(mi.ArrayXf, self.appearances, owner.x, found, shape=(_ROW, dr.width(owner)))
+            centre = mi.Vector3f(*[geometry[i] for i in range(3)])
+            colour = changed(colour, [looks[i] for i in range(ROW)], centre)
         sigma = dr.gather(mi.Vector4f, self.clouds.scales, owner.y, found)
         axes = rotation_axes([geometry[4 + i] for i in range(4)])
         thin_x, thin_y = (sigma.x < sigma.y) & (sigma.x < sigma.z), sigma.y < sigma.z

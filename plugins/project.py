@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.plugins.appearance import ROW, Appearance, changed, rows_of
 from mitsplat.plugins.chosen import ChosenTiles
 from mitsplat.plugins.device import concatenated, wrapped
 from mitsplat.plugins.gaussian import (
@@ -28,7 +29,10 @@ from mitsplat.quality import KERNELS, Quality
 
 PLACEMENT = 32
 """Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
-cloud's frame as a sum of two floats (3 + 3), padding. Two floats keep the difference exact far from the origin."""
+cloud's frame as a sum of two floats (3 + 3), appearance (13). Two floats keep the difference exact far from the
+origin."""
+
+_APPEARANCE = PLACEMENT - ROW
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +43,13 @@ class Placement:
         cloud: Index of the cloud.
         world_from_cloud: Rotation, translation and uniform scale, shape (4, 4).
         instance: Instance id; 0 is the environment.
+        appearance: What its colours are changed by, if anything.
     """
 
     cloud: int
     world_from_cloud: np.ndarray
     instance: int
+    appearance: Appearance | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,14 +143,18 @@ def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Vie
         rows[:, 10] = [p.instance for p in placements]
         rows[:, 12:15] = coarse
         rows[:, 16:19] = centre - coarse
+        rows[:, _APPEARANCE:] = rows_of([p.appearance for p in placements])
     return wrapped(mi.Float, rows), *clouds.numbers([p.cloud for p in placements])
 
 
 class Projector:
-    """Gaussians of placements as the projection kernels read them."""
+    """Gaussians of placements as the projection kernels read them; ``changed`` is whether any has an appearance."""
 
-    def __init__(self, clouds: CloudSet, table: Any, view: View, quality: Quality, at_camera: bool) -> None:
+    def __init__(
+        self, clouds: CloudSet, table: Any, view: View, quality: Quality, at_camera: bool, changed: bool = False
+    ) -> None:
         self.clouds, self.table, self.view, self.quality, self.at_camera = clouds, table, view, quality, at_camera
+        self.changed = changed
         self.cut = dr.opaque(mi.Float, quality.alpha_min)
 
     def _load(self, owner: Any, local: Any) -> dict[str, Any]:
@@ -160,7 +170,12 @@ class Projector:
             "down": mi.Vector3f(row[3], row[4], row[5]),
             "forward": mi.Vector3f(row[6], row[7], row[8]),
             "scale": row[9],
-        } | {"opacity": packet[3], "instance": row[10]}
+        } | {
+            "opacity": packet[3],
+            "instance": row[10],
+            "row": row,
+            "point": mi.Vector3f(*[packet[i] for i in range(3)]),
+        }
 
     def _bounds(self, g: dict[str, Any]) -> tuple[Any, ...]:
         """Response, opacity, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth.
@@ -259,6 +274,8 @@ class Projector:
         """View records of Gaussians that do not reach the camera's plane."""
         scaled = LOG2_E_HALF
         colour = self._colour(g["mean"], local)
+        if self.changed:
+            colour = changed(colour, [g["row"][_APPEARANCE + i] for i in range(ROW)], g["point"])
         return [
             response.u0,
             response.v0,

@@ -457,7 +457,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         visible = [s for s in shapes if not hasattr(s, "world_from_splats")]
         distinct = list({id(c.splats): c.splats for c in carriers}.values())
         number = {id(splats): i for i, splats in enumerate(distinct)}
-        placements = tuple(Placement(number[id(c.splats)], c.world_from_splats, c.instance) for c in carriers)
+        placements = tuple(
+            Placement(number[id(c.splats)], c.world_from_splats, c.instance, c.appearance) for c in carriers
+        )
         occluders = [
             Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats) for c in carriers if c.proxy is not None
         ]

@@ -11,6 +11,7 @@ import trimesh
 
 from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
+from mitsplat.plugins.appearance import Appearance
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.splats import Splats
 
@@ -65,6 +66,18 @@ class SplatsShape(mi.Mesh):
      * - specular
        - |float|
        - Specular reflectance at normal incidence of the highlight, in [0, 1]. (Default: 0)
+
+     * - colours
+       - |string|
+       - Nine numbers, row by row: a matrix on linear colours. (Default: none)
+
+     * - wear
+       - |float|
+       - Share of light that dirt takes where it is thickest, in [0, 1]. (Default: 0)
+
+     * - wear_seed
+       - |int|
+       - Which dirt, from 0 to 8388607. (Default: 0)
 
     The shape only carries its data: rays never meet it, and other integrators see nothing. Shapes of one file share one
     copy.
@@ -124,6 +137,26 @@ class SplatsShape(mi.Mesh):
         self.specular = given.number("specular", float(asset.specular) if asset and self.instance else 0.0)
         if not 0 <= self.specular <= 1:
             raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
+
+        self.appearance = self._read_appearance(given)
+
+    def _read_appearance(self, given: Parameters) -> Appearance | None:
+        """What its colours are changed by, if the scene says anything of that."""
+        text, wear = given.text("colours", ""), given.number("wear", 0.0)
+        seed = given.whole("wear_seed", 0, 0, 2**23 - 1)
+        if not 0 <= wear <= 1:
+            given.refuse("wear", "be in [0, 1]", wear)
+        if not (text or wear):
+            return None
+        try:
+            matrix = [float(word) for word in text.split()] if text else list(np.eye(3).ravel())
+        except ValueError:
+            matrix = []
+        if len(matrix) != 9 or not np.isfinite(matrix).all():
+            given.refuse("colours", "be nine numbers", text)
+        points = self.splats.means if self.proxy is None else self.proxy.vertices
+        size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+        return Appearance(tuple(matrix), wear, seed, size or 1.0)
 
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""

@@ -105,7 +105,8 @@ def bin_gaussians(
     table, owner, local = placement_table(clouds, placements, view)
     if dr.width(local) == 0:
         return _empty(tiles)
-    source = Projector(clouds, table, view, quality, at_camera)
+    changed = any(placement.appearance is not None for placement in placements)
+    source = Projector(clouds, table, view, quality, at_camera, changed)
 
     visible, near = source.cull(owner, local, chosen)
     index = dr.compress(visible)

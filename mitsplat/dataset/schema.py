@@ -117,6 +117,19 @@ class _Drawn(_Stored):
     label: bool
 
 
+class _Appearance(_Stored):
+    id: Annotated[int, Field(ge=1, le=65535)]
+    entry: Count
+    hue: float
+    saturation: float
+    value: float
+    gain: Point
+    roughness: Annotated[float, Field(gt=0, le=1)]
+    specular: Share
+    wear: Share
+    wear_seed: Count
+
+
 class _Light(_Stored):
     position: Point | None = None
     size: tuple[float, float] | None = None
@@ -193,6 +206,7 @@ class _Record(_Stored):
     environment: _Environment | None = None
     depth_scale: Annotated[float, Field(gt=0)] | None = None
     objects: list[_Drawn] | None = None
+    appearance: list[_Appearance] | None = None
     viewpoint: _Viewpoint | None = None
     place: _Place | None = None
     empty: bool = False

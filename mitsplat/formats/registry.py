@@ -92,6 +92,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
         record["viewpoint"] = dict(plan.viewpoint)
     if place := draw_place(spec, frame.index).to_json(spec):
         record["place"] = place
+    if any(entry.appearance for entry in spec.objects):
+        record["appearance"] = [one.to_json() for one in frame.appearances.values()]
     if spec.empty:
         record["empty"] = is_empty(spec, plan.layout)
     if frame.order_error is not None:

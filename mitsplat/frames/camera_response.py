@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
-from mitsplat.colour import LUMINANCE, colour_science
+from mitsplat.colour import LUMINANCE, colour_science, hue_matrix, saturation_matrix
 from mitsplat.plugins.device import wrapped
 from mitsplat.render.layers import Layers, device_array, host_array
 from mitsplat.scene.spec_image import Composite, ImageShadow, Sensor
@@ -231,13 +231,9 @@ def colour_matrix(*, white_balance: float = 6504.0, hue: float = 0.0, saturation
     if white_balance != 6504.0:
         matrix = _adaptation(float(white_balance))
     if hue:
-        angle = np.radians(hue)
-        axis = np.full((3, 3), 1 / 3)
-        k = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
-        matrix = (np.cos(angle) * np.eye(3) + (1 - np.cos(angle)) * axis + np.sin(angle) * k) @ matrix
+        matrix = hue_matrix(hue) @ matrix
     if saturation != 1.0:
-        grey = np.broadcast_to(LUMINANCE.astype(np.float64), (3, 3))
-        matrix = (saturation * np.eye(3) + (1 - saturation) * grey) @ matrix
+        matrix = saturation_matrix(saturation) @ matrix
     return np.asarray(matrix, dtype=np.float64)
 
 

@@ -40,6 +40,7 @@ from mitsplat.render.layers import (
 )
 from mitsplat.render.places import Backing, Place, draw_place, environment_at
 from mitsplat.render.textures import bitmap_texture, finished_mesh, material, texture_image
+from mitsplat.scene.appearance import Appearance, draw_appearances
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
@@ -73,6 +74,7 @@ class Frame(Deferred):
         seconds: Time of the host per stage [s]; the device may still work at what a stage began in the next ones.
         order_error: Estimated error of the pixels' display-encoded colours that the order of blending leaves, before
             light: ``largest`` and ``mean``. None where the quality estimates none.
+        appearances: What was drawn of the appearance of objects, by instance id.
     """
 
     plan: FramePlan
@@ -83,6 +85,7 @@ class Frame(Deferred):
     labels: Labels
     seconds: Mapping[str, float]
     order_error: Mapping[str, float] | None = None
+    appearances: Mapping[int, Appearance] = field(default_factory=dict)
 
     @property
     def index(self) -> int:
@@ -245,6 +248,7 @@ class Renderer:
             image = development.image()
         made = {"plan": plan, "layout": layout, "layers": layers, "image": image, "labels": labels, "seconds": seconds}
         made["order_error"] = layers.order_error
+        made["appearances"] = draw_appearances(self.scene, layout)
         return Frame.later({"rgb": partial(host_array, linear, shape)}, **made)
 
     def _settle(self, index: int) -> Layout:
@@ -273,10 +277,12 @@ class Renderer:
     def describe(self, layout: Layout, lights: tuple[LightSpec, ...]) -> dict[str, Any]:
         """Mitsuba's dictionary of a layout under some lights. Shapes stay the same objects while the layout does."""
         if self._placed is None or self._placed[0] is not layout:
-            objects = {}
+            objects, appearances = {}, draw_appearances(self.scene, layout)
             for instance in layout.instances:
                 asset = self.scene.assets[instance.asset]
-                objects[f"instance_{instance.id}"] = _asset_shape(asset, instance.world_from_object, instance.id)
+                objects[f"instance_{instance.id}"] = _asset_shape(
+                    asset, instance.world_from_object, instance.id, appearances.get(instance.id)
+                )
             self._placed = layout, objects
         emitters = {f"light_{i}": self._made(self._emitter(light)) for i, light in enumerate(lights)}
         place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
@@ -335,15 +341,17 @@ class Renderer:
         return shapes
 
 
-def _asset_shape(asset: Asset, world_from_asset: Float64Array, instance: int) -> Any:
+def _asset_shape(
+    asset: Asset, world_from_asset: Float64Array, instance: int, appearance: Appearance | None = None
+) -> Any:
+    own = {"roughness": float(asset.roughness), "specular": float(asset.specular) if instance else 0.0}
     return make_splats_shape(
         asset.splats,
         world_from_asset,
         asset.mesh,
         instance=instance,
         capture_light=asset.capture_light,
-        roughness=float(asset.roughness),
-        specular=float(asset.specular) if instance else 0.0,
+        **(own | (appearance.properties() if appearance else {})),
     )
 
 

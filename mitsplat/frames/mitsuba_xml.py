@@ -28,6 +28,7 @@ from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import describe_sensor, ensure_variant
 from mitsplat.render.places import Finish, draw_place
 from mitsplat.render.textures import finished_mesh, material, texture_image
+from mitsplat.scene.appearance import draw_appearances
 from mitsplat.scene.scene import Scene, layout_of, plan_frame
 from mitsplat.scene.spec_shapes import Shape
 
@@ -55,9 +56,11 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         shapes["environment"] = _describe_asset(environment, stem, np.eye(4), 0)
     # Named by place: names of assets need be neither distinct nor those of files.
     stems = {i: _write_asset(scene.assets[i], files / f"object_{i}") for i in {one.asset for one in layout.instances}}
+    appearances = draw_appearances(scene, layout)
     for one in layout.instances:
         description = _describe_asset(scene.assets[one.asset], stems[one.asset], one.world_from_object, one.id)
-        shapes[f"instance_{one.id}"] = description
+        drawn = appearances[one.id].properties() if one.id in appearances else {}
+        shapes[f"instance_{one.id}"] = description | drawn
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if shape.visible:
             stem = files / f"shape_{number}"

@@ -2,13 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from mitsplat.scene.spec_types import CountRange, Positive, Scale, StrictModel, Vec3, check_weights
+from mitsplat.scene.spec_types import (
+    CountRange,
+    Positive,
+    Scale,
+    StrictModel,
+    Unit,
+    Vec3,
+    check_weights,
+    ordered,
+)
 from mitsplat.yaml_input import FieldError
+
+UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
+_Hue = Annotated[float, Field(ge=-180, le=180)]
+HueRange = Annotated[tuple[_Hue, _Hue], AfterValidator(ordered)]
+_Saturation = Annotated[float, Field(ge=0, le=2)]
+SaturationRange = Annotated[tuple[_Saturation, _Saturation], AfterValidator(ordered)]
+_Value = Annotated[float, Field(ge=0.1, le=4)]
+ValueRange = Annotated[tuple[_Value, _Value], AfterValidator(ordered)]
+_Gain = Annotated[float, Field(ge=0.5, le=2)]
+GainRange = Annotated[tuple[_Gain, _Gain], AfterValidator(ordered)]
+_Roughness = Annotated[float, Field(ge=0.02, le=1)]
+RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(ordered)]
 
 Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
 
@@ -27,6 +48,35 @@ NUM_PRIMITIVES = 15
 
 SIZES = 5
 """How many sizes a range of scales has, evenly spaced in ratio: each is a rigid model of its own in every format."""
+
+
+class AppearanceRanges(StrictModel):
+    """Ranges from which each object's appearance is drawn, once for a layout, uniformly and each for itself.
+
+    Colours change as reflectances do: in linear light, from all directions alike. Nothing becomes brighter than white
+    that was not captured so. What is absent stays as it was captured.
+    """
+
+    hue: HueRange = Field((0.0, 0.0), description="Rotation of colours about the grey axis [degrees].")
+    saturation: SaturationRange = Field(
+        (1.0, 1.0), description="Factor on the distance from the grey of the same luminance."
+    )
+    value: ValueRange = Field((1.0, 1.0), description="Factor on the reflectance.")
+    gain: GainRange = Field(
+        (1.0, 1.0),
+        description="Factors on red, green and blue, each drawn for itself: another capture's white balance.",
+    )
+    roughness: RoughnessRange | None = Field(
+        None, description="GGX roughness of the highlight, instead of the asset's own."
+    )
+    specular: UnitRange | None = Field(
+        None, description="Specular reflectance at normal incidence, instead of the asset's own."
+    )
+    wear: UnitRange = Field(
+        (0.0, 0.0),
+        description="Share of its light that dirt takes where it is thickest, about a third of the surface, in patches "
+        "that lie elsewhere on every object.",
+    )
 
 
 class ObjectSpec(StrictModel):
@@ -67,6 +117,14 @@ class ObjectSpec(StrictModel):
     class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
     poses: tuple[ObjectPose, ...] = Field(
         (), description="Where each starts, instead of count; from there it settles like the others."
+    )
+
+    # Not shown, because layouts are known by what entries show, and none depends on how objects look.
+    appearance: AppearanceRanges | None = Field(
+        None,
+        repr=False,
+        exclude_if=lambda appearance: appearance is None,
+        description="How much one object looks other than the next.",
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Frames of scenes whose lights are drawn: a renderer that has made others makes the same bytes."""
+"""Frames of scenes whose lights and appearances are drawn: what is stated of them, and what decides them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 
 import mitsplat as ms
 from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from tests.conftest import WriteScene
 from tests.drawn import scatter_boxes
 
@@ -53,3 +54,44 @@ def test_the_manifest_states_lights_as_they_were(scene: ms.Scene, tmp_path: Path
     assert [area["position"] for area in areas] == [list(light.position) for light in frame.plan.lights[:-1]]
     assert set(sky) == {"kind", "radiance", "colour", "image", "rotate_z"} and sky["image"].startswith("skies/")
     assert all("draw" not in area for area in areas)
+
+
+APPEARANCE = {"hue": [-30, 30], "value": [0.4, 0.9], "gain": [0.8, 1.2], "roughness": [0.2, 0.8], "wear": [0.2, 1]}
+
+
+def test_appearances_change_colours_and_nothing_else(scene_data: Any, write_scene: WriteScene, tmp_path: Path) -> None:
+    def frames(**keys: Any) -> list[ms.Frame]:
+        scene_data["camera"] |= {"radius": 0.15, "height": 0.15}
+        scene_data["objects"] = [{"asset": "assets/nut", "count": 3, **keys}, {"asset": "assets/bolt"}]
+        scene = ms.load_scene(write_scene(scene_data))
+        poses = np.tile(np.eye(4), (4, 1, 1))
+        poses[:, :3, 3] = (-0.05, 0, 0.005), (0, 0.05, 0.005), (0.05, 0, 0.005), (0, -0.05, 0.025)
+        instances = [Instance(i + 1, int(i == 3), int(i < 3), pose) for i, pose in enumerate(poses)]
+        layout = Layout(0, tuple(instances), NOTHING_TO_REST)
+        with ms.Renderer(scene, quality="fast") as renderer:
+            return [renderer.render(index, layout=layout) for index in range(2)]
+
+    plain, varied, again = frames(), frames(appearance=APPEARANCE), frames(appearance=APPEARANCE)
+    scene = ms.load_scene(tmp_path / "scene.yaml")
+    for one, other, third in zip(plain, varied, again, strict=True):
+        np.testing.assert_array_equal(one.instance, other.instance)
+        np.testing.assert_array_equal(one.depth, other.depth)
+        assert one.labels.to_json() == other.labels.to_json()
+        np.testing.assert_array_equal(other.image, third.image)
+        change = np.abs(one.layers.captured - other.layers.captured).max(axis=-1)
+        nuts = np.isin(one.instance, [i.id for i in one.layout.instances if i.asset == 0])
+        assert nuts.sum() > 30 and np.mean(change[nuts] > 0.01) > 0.95
+        # Gaussians reach a few pixels beyond what is an instance's; the table and the bolt stay as they were.
+        assert change[~cv2.dilate(nuts.astype(np.uint8), np.ones((13, 13))).astype(bool)].max() == 0
+    record = write_frame(varied[0], tmp_path / "out", scene.spec, Catalogue.of(scene))
+    drawn = {one["id"]: one for one in record["appearance"]}
+    assert set(drawn) == {i.id for i in varied[0].layout.instances if i.asset == 0}
+    assert all(0.2 <= one["wear"] <= 1 and 0.2 <= one["roughness"] <= 0.8 for one in drawn.values())
+    assert "appearance" not in write_frame(
+        plain[0],
+        tmp_path / "plain",
+        scene.spec.model_copy(
+            update={"objects": tuple(entry.model_copy(update={"appearance": None}) for entry in scene.spec.objects)}
+        ),
+        Catalogue.of(scene),
+    )

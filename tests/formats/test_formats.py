@@ -159,6 +159,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
         output=SimpleNamespace(formats=FORMATS, image="png", jpeg_quality=95),
         labels=SimpleNamespace(source="splats"),
         empty=0.0,
+        objects=(),
     )
     catalogue = Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES)
     frames = [frame_of(Drawn(covered), index) for index, covered in enumerate(LAYOUTS.values())]

@@ -11,6 +11,7 @@ import pytest
 
 import mitsplat as ms
 from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from tests.conftest import WriteScene
 from tests.drawn import scatter_boxes
@@ -59,17 +60,24 @@ def test_the_manifest_states_lights_as_they_were(scene: ms.Scene, tmp_path: Path
 APPEARANCE = {"hue": [-30, 30], "value": [0.4, 0.9], "gain": [0.8, 1.2], "roughness": [0.2, 0.8], "wear": [0.2, 1]}
 
 
+def _apart() -> Layout:
+    """Three nuts and a bolt around the middle."""
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = (-0.05, 0, 0.005), (0, 0.05, 0.005), (0.05, 0, 0.005), (0, -0.05, 0.025)
+    instances = [Instance(i + 1, int(i == 3), int(i < 3), pose) for i, pose in enumerate(poses)]
+    return Layout(0, tuple(instances), NOTHING_TO_REST)
+
+
+APART = _apart()
+
+
 def test_appearances_change_colours_and_nothing_else(scene_data: Any, write_scene: WriteScene, tmp_path: Path) -> None:
     def frames(**keys: Any) -> list[ms.Frame]:
         scene_data["camera"] |= {"radius": 0.15, "height": 0.15}
         scene_data["objects"] = [{"asset": "assets/nut", "count": 3, **keys}, {"asset": "assets/bolt"}]
         scene = ms.load_scene(write_scene(scene_data))
-        poses = np.tile(np.eye(4), (4, 1, 1))
-        poses[:, :3, 3] = (-0.05, 0, 0.005), (0, 0.05, 0.005), (0.05, 0, 0.005), (0, -0.05, 0.025)
-        instances = [Instance(i + 1, int(i == 3), int(i < 3), pose) for i, pose in enumerate(poses)]
-        layout = Layout(0, tuple(instances), NOTHING_TO_REST)
         with ms.Renderer(scene, quality="fast") as renderer:
-            return [renderer.render(index, layout=layout) for index in range(2)]
+            return [renderer.render(index, layout=APART) for index in range(2)]
 
     plain, varied, again = frames(), frames(appearance=APPEARANCE), frames(appearance=APPEARANCE)
     scene = ms.load_scene(tmp_path / "scene.yaml")
@@ -95,3 +103,20 @@ def test_appearances_change_colours_and_nothing_else(scene_data: Any, write_scen
         ),
         Catalogue.of(scene),
     )
+
+
+def test_xml_shows_appearances(
+    scene_data: Any, write_scene: WriteScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", lambda scene, index: APART)
+    scene_data["camera"] |= {"radius": 0.15, "height": 0.15}
+    scene_data["objects"] = [
+        {"asset": "assets/nut", "count": 3, "appearance": {"value": [0.2, 0.2], "wear": [0.5, 0.5]}},
+        {"asset": "assets/bolt"},
+    ]
+    scene = ms.load_scene(write_scene(scene_data))
+    export_xml(scene, 0, tmp_path / "one.xml")
+    ours = cv2.imread(str(render_xml(tmp_path / "one.xml", tmp_path / "out.png")))[..., ::-1].astype(float)
+    frame = ms.render_frame(scene, 0, layout=APART)
+    covered = (frame.layers.alpha > 0.99) & np.isin(frame.instance, [1, 2, 3])
+    assert covered.any() and np.abs(ours - frame.image)[covered].mean() < 1.0

@@ -156,10 +156,13 @@ MESHES = [trimesh.creation.box(extents=(0.02, 0.03, 0.05)), trimesh.creation.ico
 def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     root = tmp_path_factory.mktemp("formats")
     spec = SimpleNamespace(
-        output=SimpleNamespace(formats=FORMATS, image="png", jpeg_quality=95),
+        output=SimpleNamespace(formats=FORMATS, image="png", jpeg_quality=95, views=2),
         labels=SimpleNamespace(source="splats"),
         empty=0.0,
+        environment=None,
+        shapes=(),
         objects=(),
+        background=None,
     )
     catalogue = Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES)
     frames = [frame_of(Drawn(covered), index) for index, covered in enumerate(LAYOUTS.values())]

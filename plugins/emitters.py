@@ -11,10 +11,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.highlight import Lobe
 
 SURVEY_LATTICE = (233, 144)
-OPEN_LATTICE = (89, 55)
+OPEN_LATTICE = (34, 21)
 SKY_LATTICE = (377, 233)
+LOBE_LATTICE = (21, 13)
 REFERENCE_LATTICE = (4181, 2584)
 """Points and generator of Fibonacci lattices: consecutive Fibonacci numbers give the best two-dimensional ones
 (Niederreiter 1992, section 5.3)."""
@@ -130,34 +132,47 @@ class Emitters:
         outside.wi = -direction
         return mi.Color3f(emitter.eval(outside, active))
 
-    def open_irradiance(self, si: Any, active: Any) -> Any:
-        """Irradiance (Color3f) without any occluder, from the same directions for all."""
-        total = mi.Color3f(0)
+    def open_light(self, si: Any, lobe: Lobe, active: Any) -> tuple[Any, Any]:
+        """Irradiance, and radiance that is mirrored (Color3f), without occluders, from the same directions for all."""
+        total, shine = mi.Color3f(0), mi.Color3f(0)
         if self.local_choice is not None:
             choice = self.local_choice
-            total += self._integrate(si, active, OPEN_LATTICE, lambda u: self._local_light(si, choice, u, active))
+
+            def local(point: Any) -> tuple[Any, Any]:
+                index, x, chance = choice.sample(point.x)
+                emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
+                light, direction = _facing(si, emitter, mi.Point2f(x, point.y), active)
+                return light / chance, light * (lobe.reflectance(direction) / chance)
+
+            total, shine = self._integrate(si, active, OPEN_LATTICE, local)
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
-            if self.even_sky:
-                total += dr.pi * self.sky_colour
-            else:
-                total += self._integrate(si, active, SKY_LATTICE, lambda u: _facing(si, emitter, u, active))
-        return total
 
-    def _local_light(self, si: Any, choice: _Choice, point: Any, active: Any) -> Any:
-        index, x, chance = choice.sample(point.x)
-        emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
-        return _facing(si, emitter, mi.Point2f(x, point.y), active) / chance
+            def sky(point: Any) -> tuple[Any, Any]:
+                light = mi.Color3f(0) if self.even_sky else _facing(si, emitter, point, active)[0]
+                return light, mi.Color3f(0)
+
+            def mirrored(point: Any) -> tuple[Any, Any]:
+                direction, weight = lobe.sample(point)
+                radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
+                return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
+
+            total += dr.pi * self.sky_colour if self.even_sky else self._integrate(si, active, SKY_LATTICE, sky)[0]
+            shine += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
+        return total, shine
 
     @staticmethod
-    def _integrate(si: Any, active: Any, lattice: tuple[int, int], light: Any) -> Any:
+    def _integrate(si: Any, active: Any, lattice: tuple[int, int], light: Any) -> tuple[Any, Any]:
         rounds = dr.opaque(mi.UInt32, lattice[0])
 
-        def body(i: Any, total: Any) -> tuple[Any, Any]:
-            return i + 1, total + light(lattice_point(i, lattice))
+        def body(i: Any, total: Any, shine: Any) -> tuple[Any, Any, Any]:
+            arriving, mirrored = light(lattice_point(i, lattice))
+            return i + 1, total + arriving, shine + mirrored
 
-        state = dr.zeros(mi.UInt32, dr.width(si.p)), mi.Color3f(0)
-        return dr.while_loop(state, lambda i, _: active & (i < rounds), body, label="open light")[1] / lattice[0]
+        nothing = dr.zeros(mi.Color3f, dr.width(si.p))
+        state = dr.zeros(mi.UInt32, dr.width(si.p)), nothing, mi.Color3f(nothing)
+        _, *sums = dr.while_loop(state, lambda i, *_: active & (i < rounds), body, label="open light")
+        return sums[0] / lattice[0], sums[1] / lattice[0]
 
 
 class _Choice:
@@ -189,10 +204,11 @@ def _is_sky(emitter: Any) -> bool:
     return bool(infinite and not mi.has_flag(flags, mi.EmitterFlags.DeltaDirection))
 
 
-def _facing(si: Any, emitter: Any, point: Any, active: Any) -> Any:
-    """Estimate of irradiance from one emitter."""
+def _facing(si: Any, emitter: Any, point: Any, active: Any) -> tuple[Any, Any]:
+    """Estimate of irradiance from one emitter, and where it comes from."""
     sample, radiance = emitter.sample_direction(si, point, active)
-    return dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, sample.d), 0), 0)
+    direction = mi.Vector3f(sample.d)
+    return dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0), direction
 
 
 def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:

@@ -28,25 +28,20 @@ import mitsuba as mi
 from mitsplat.plugins.bounce import RadianceGrid, bounced_light
 from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import Beam, Emitters, receiver
+from mitsplat.plugins.highlight import Lobe, mirrored_tent
 from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter
+from mitsplat.plugins.light_tiles import BLOCK, Tiles, block_order, parity
+from mitsplat.plugins.lit_surface import Surface
 from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import stable_order
-
-BLOCK = 8
-"""Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
-that follows averages a stratified set."""
 
 R2 = (3242174889, 2447445414)
 """Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
 effectiveness of quasirandom sequences")."""
 
-FAINT = 0.25
+FAINT = 0.5
 """Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced."""
-
-CAPTURED_SPECULAR = 0.08
-"""Reflectance up to which the light tent's mirror image counts as part of a captured colour, to be replaced by that of
-the scene's lights. Metals reflect more, and keep the rest as it was captured: it stands for what else they mirror."""
 
 FIRST_RAYS = 4
 """Rays per point after which its error is first estimated."""
@@ -56,39 +51,6 @@ LEVEL_BITS = 4
 
 WORD = 32
 """Rays whose fate is kept as bits of one number."""
-
-
-@dataclass(eq=False)
-class Surface:
-    """Visible points.
-
-    Attributes:
-        position, normal: Point [m] and unit normal towards the camera.
-        face: Unit normal of the proxy's triangle.
-        lift: Displacement [m] from the triangle to the smooth surface that it stands for.
-        to_camera: Unit vector towards the camera.
-        offset: How far shadow rays start off the surface [m].
-        instance: Instance id (Float).
-        trait: Row of the shape's traits (Float); light is not averaged across its borders.
-        relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
-        roughness, specular: GGX roughness and reflectance at normal incidence.
-        known: Whether the proxy of what is seen says so; else position and normal are a guess.
-        valid: Whether there is a point at all.
-    """
-
-    position: Any
-    normal: Any
-    face: Any
-    lift: Any
-    to_camera: Any
-    offset: Any
-    instance: Any
-    trait: Any
-    relit: Any
-    roughness: Any
-    specular: Any
-    known: Any
-    valid: Any
 
 
 @dataclass(frozen=True)
@@ -135,20 +97,15 @@ def light_factor(
     """
     emitters = Emitters(scene, point)
     everything = surface(dr.arange(mi.UInt32, view.width * view.height))
-    needed = everything.valid & (everything.relit | (everything.specular > 0))
+    needed, light = everything.valid, mi.Color3f(1)
     if accuracy.error > 0:
-        rays = min(FIRST_RAYS, accuracy.most)
-        enough = dr.opaque(mi.Float, FAINT * accuracy.error * (3 * BLOCK) ** 2)
-        pixel, inside = _block_order(view)
-        met = _Tracer(emitters, proxies, surface(pixel), pixel, view, seed).search(inside)
-        found = dr.zeros(mi.Float, view.width * view.height)
-        dr.scatter(found, met, pixel, inside)
-        needed = everything.valid & _spread(dr.select(needed, enough, found), enough, view)
-    else:
-        rays = accuracy.most
-        needed = everything.valid
-    dr.eval(needed)
-    light, highlight = mi.Color3f(1), mi.Color3f(0)
+        pixel, inside = block_order(view)
+        tiles = _Tracer(emitters, proxies, surface(pixel), pixel, view, seed).search(inside)
+        anew = everything.relit | (everything.specular > 0)
+        needed = everything.valid & (anew | tiles.differs(FAINT * accuracy.error))
+        light = dr.select(everything.valid, tiles.light(), 1)
+    dr.eval(needed, light)
+    highlight = mi.Color3f(0)
     index = dr.compress(needed)
     if not dr.width(index):
         return light, highlight
@@ -157,7 +114,9 @@ def light_factor(
     light_filter = LightFilter(here, view, index)
     tracer = _Tracer(emitters, proxies, here, index, view, seed)
     places = _blockwise(light_filter.place, view)
-    estimate = tracer.trace(places, Estimate.nothing(dr.width(index)), dr.opaque(mi.UInt32, rays), rays)
+    rays = min(FIRST_RAYS, accuracy.most) if accuracy.error > 0 else accuracy.most
+    estimate = Estimate.nothing(dr.width(index))
+    estimate = tracer.trace(places, estimate, dr.opaque(mi.UInt32, rays), rays)
     if rays < accuracy.most:
         wanted = light_filter.rays_for(estimate, accuracy.error)
         more = dr.gather(mi.Float, wanted, places) > dr.opaque(mi.Float, rays)
@@ -168,26 +127,29 @@ def light_factor(
             order = stable_order(level, LEVEL_BITS)
             places, extra = (dr.gather(mi.UInt32, values, order) for values in (places, extra))
             estimate = tracer.trace(places, estimate, extra, accuracy.most - rays, first=rays)
-    lit, base, shine = light_filter.smooth(estimate)
+    lit, base, shine, glare = light_filter.smooth(estimate)
     share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
-    shine *= dr.pi / reference
-    anew = dr.compress(here.relit)
-    if dr.width(anew):
-        own = gathered(here, anew)
-        open_light = emitters.open_irradiance(receiver(own.position, own.normal), own.valid) / reference
-        dr.eval(own, open_light, share, shine)
-        relit = dr.gather(mi.Color3f, share, anew) * open_light
-        dr.scatter(shine, dr.gather(mi.Color3f, shine, anew) - relit * _mirrored(own), anew)
+    light = mi.Color3f(*[v + dr.zeros(mi.Float, dr.width(needed)) for v in light])
+    dr.eval(light, share, shine, glare)
+    dr.scatter(light, share, index)
+    special = dr.compress(here.relit | (here.specular > 0))
+    if dr.width(special):
+        own, pixels = gathered(here, special), dr.gather(mi.UInt32, index, special)
+        part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
+        dr.eval(own, part, shine, glare)
+        open_light, mirrored = emitters.open_light(receiver(own.position, own.normal), Lobe.of(own), own.valid)
+        # Where no ray came from where the lobe is, as much of it arrives as of all light.
+        mirrored *= dr.select(glare > 0, shine / glare, dr.mean(part)) * (dr.pi / reference)
+        relit = part * open_light / reference
+        mirrored -= dr.select(own.relit, relit * mirrored_tent(own), 0)
+        dr.eval(relit, mirrored)
         if grid is not None and proxies.static is not None:
             # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
             # known.
-            pixels = dr.gather(mi.UInt32, index, anew)
             relit += _Tracer(emitters, proxies, own, pixels, view, seed).bounce(grid)
-        dr.scatter(share, relit, anew)
-    light = mi.Color3f(dr.full(mi.Float, 1, dr.width(needed)))
-    highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
-    dr.scatter(light, share, index)
-    dr.scatter(highlight, shine, index)
+        dr.scatter(light, relit, pixels, own.relit)
+        highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
+        dr.scatter(highlight, mirrored, pixels)
     return light, highlight
 
 
@@ -203,37 +165,9 @@ def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
     return level, extra
 
 
-def _spread(found: Any, enough: Any, view: View) -> Any:
-    """Whether enough was found in a pixel's tile of BLOCK x BLOCK pixels and those beside it."""
-    tiles_x, tiles_y = -(-view.width // BLOCK) + 2, -(-view.height // BLOCK) + 2
-    pixel = dr.arange(mi.UInt32, view.width * view.height)
-    tile = (pixel // view.width // BLOCK + 1) * tiles_x + pixel % view.width // BLOCK + 1
-    hits = dr.zeros(mi.Float, tiles_x * tiles_y)
-    dr.scatter_reduce(dr.ReduceOp.Add, hits, found, tile, found > 0)
-    beside = [dy * tiles_x + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    return sum((dr.gather(mi.Float, hits, mi.UInt32(mi.Int32(tile) + step)) for step in beside), mi.Float(0)) >= enough
-
-
-def _block_order(view: View) -> tuple[Any, Any]:
-    """Pixels in an order for tracing, and whether they lie in the image.
-
-    Those that share their place in a block take the same point of the low-discrepancy sequence, hence similar rays, and
-    are traced side by side (Keller and Heidrich 2001, "Interleaved Sampling"); but only within squares of BLOCK x BLOCK
-    blocks, so that what is known of their pixels stays in the processor's cache.
-    """
-    square = BLOCK * BLOCK
-    squares_x, squares_y = -(-view.width // square), -(-view.height // square)
-    i = dr.arange(mi.UInt32, squares_x * squares_y * square**2)
-    block, within, number = i % square, i // square % square, i // square**2
-    x = number % squares_x * square + block % BLOCK * BLOCK + within % BLOCK
-    y = number // squares_x * square + block // BLOCK * BLOCK + within // BLOCK
-    inside = (x < view.width) & (y < view.height)
-    return dr.select(inside, y * view.width + x, 0), inside
-
-
 def _blockwise(place: Any, view: View) -> Any:
-    """What an image ``place`` holds, less where it is NOWHERE, in the order of :func:`_block_order`."""
-    pixel, inside = _block_order(view)
+    """What an image ``place`` holds, less where it is NOWHERE, in the order of :func:`block_order`."""
+    pixel, inside = block_order(view)
     ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), NOWHERE)
     return dr.gather(mi.UInt32, ordered, dr.compress(ordered != NOWHERE))
 
@@ -254,20 +188,29 @@ class _Tracer:
     view: View
     seed: int
 
-    def search(self, active: Any) -> Any:
-        """1 where one ray from a point towards the light is stopped by a dynamic object, else 0."""
-        surface = self.surface
-        beam = self.emitters.sample(
-            receiver(surface.position, surface.normal), _sequence(self._start(self.pixel)), active & surface.valid
-        )
-        active = active & surface.valid & (dr.sum(beam.irradiance) > 0)
+    def search(self, inside: Any) -> Tiles:
+        """What dynamic objects take of one ray of every point, all pixels in :func:`block_order`, by tiles.
+
+        Each of 2 x 2 blocks has points of its own, else what is too small for those of one block is missed in all.
+        """
+        surface, proxies, width = self.surface, self.proxies, self.view.width
+        kind = parity(self.pixel % width // BLOCK, self.pixel // width // BLOCK)
+        number = self._start(self.pixel) + kind * (BLOCK * BLOCK)
+        active = inside & surface.valid
+        beam = self.emitters.sample(receiver(surface.position, surface.normal), _sequence(number), active)
         ray = _shadow_ray(_origin(surface), beam, surface.offset)
-        stopped = mi.Bool(False)
-        for stopper in self.proxies.casting:
-            if self.proxies.apart:
-                dr.eval(stopped)
-            stopped = stopped | stopper.stop(ray, surface.instance, self.pixel, active & ~stopped)
-        return dr.select(stopped, mi.Float(1), 0)
+        captured = ~(surface.relit | (surface.specular > 0))
+        static_light = free = active & captured & (dr.sum(beam.irradiance) > 0)
+        for stopper in proxies.stoppers:
+            free = free & ~stopper.stop(ray, surface.instance, self.pixel * R2[0] + number, free)
+            if proxies.apart:
+                dr.eval(free)
+            if stopper is proxies.static:
+                static_light = free
+        arriving = dr.select(static_light, beam.irradiance, 0)
+        lost = dr.select(free, 0, arriving)
+        dr.eval(arriving, lost)
+        return Tiles.of(arriving, lost, self.view)
 
     def trace(self, places: Any, before: Estimate, rays: Any, most: int, *, first: int = 0) -> Estimate:
         """What ``rays`` more rays, ``most`` at the most, add to an estimate at ``places``, which have had ``first``."""
@@ -282,8 +225,7 @@ class _Tracer:
         start = self._start(pixel) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
         si = receiver(surface.position, surface.normal)
         origin = _origin(surface)
-        alpha2 = dr.square(dr.square(surface.roughness))
-        cos_camera = dr.maximum(dr.dot(surface.normal, surface.to_camera), 1e-3)
+        lobe = Lobe.of(surface)
         static, stoppers = self.proxies.static, self.proxies.stoppers
         known: list[Any] = []
 
@@ -311,7 +253,7 @@ class _Tracer:
                 dr.eval(word)
                 known.append(word)
 
-        def body(i: Any, lit: Any, base: Any, shine: Any, squares: Any) -> tuple[Any, Any, Any, Any, Any]:
+        def body(i: Any, lit: Any, base: Any, shine: Any, glare: Any, squares: Any) -> tuple[Any, ...]:
             beam, active, number, stopped = send(i)
             static_light = free = active
             for each, stopper in enumerate(stoppers):
@@ -322,11 +264,13 @@ class _Tracer:
             compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), unshadowed)
             lit += light
             base += compared
-            shine += light * _ggx(surface, beam.direction, cos_camera, alpha2)
+            reflectance = lobe.reflectance(beam.direction)
+            shine += dr.sum(light) * reflectance
+            glare += dr.select(active, dr.sum(beam.irradiance) * reflectance, 0)
             squares += dr.square(dr.sum(compared))
-            return i + 1, lit, base, shine, squares
+            return i + 1, lit, base, shine, glare, squares
 
-        sums = [dr.gather(type(v), v, places) for v in (before.lit, before.base, before.shine, before.squares)]
+        sums = [dr.gather(type(v), v, places) for v in before.sums]
         state = dr.zeros(mi.UInt32, dr.width(places)), *sums
         _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
         return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
@@ -364,35 +308,6 @@ def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
 def _sequence(i: Any) -> Any:
     """Point ``i`` of the low-discrepancy sequence, to 24 bits however large ``i`` is."""
     return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in R2])
-
-
-def _ggx(surface: Surface, to_light: Any, cos_camera: Any, alpha2: Any) -> Any:
-    """GGX microfacet reflection with height-correlated masking (Walter 2007; Heitz 2014) and Schlick's Fresnel term."""
-    cos_light = dr.dot(surface.normal, to_light)
-    half = dr.normalize(to_light + surface.to_camera)
-    cos_half = dr.dot(surface.normal, half)
-    spread = dr.fma(cos_half * cos_half, alpha2 - 1, 1)
-    distribution = alpha2 / (dr.pi * dr.square(spread))
-    masking = cos_light * dr.sqrt(dr.fma(cos_camera * cos_camera, 1 - alpha2, alpha2)) + cos_camera * dr.sqrt(
-        dr.fma(cos_light * cos_light, 1 - alpha2, alpha2)
-    )
-    grazing = dr.power(dr.clip(1 - dr.dot(half, to_light), 0, 1), 5)
-    fresnel = dr.select(surface.specular > 0, dr.fma(1 - surface.specular, grazing, surface.specular), 0)
-    return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
-
-
-def _mirrored(surface: Surface) -> Any:
-    """Part of the captured colour that is light of the tent, mirrored: the lobe's reflectance under even light.
-
-    Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60 degrees: colours
-    of few SH bands do not show it, so that to take it away would blacken silhouettes.
-    """
-    cosine = dr.maximum(dr.dot(surface.normal, surface.to_camera), 0.5)
-    rough = surface.roughness
-    x, y, z, w = 1 - rough, dr.fma(-0.0275, rough, 0.0425), dr.fma(-0.572, rough, 1.04), dr.fma(0.022, rough, -0.04)
-    bend = dr.fma(dr.minimum(x * x, dr.exp2(-9.28 * cosine)), x, y)
-    specular = dr.minimum(surface.specular, CAPTURED_SPECULAR)
-    return dr.select(specular > 0, dr.maximum(specular * dr.fma(-1.04, bend, z) + dr.fma(1.04, bend, w), 0), 0)
 
 
 def _bayer(x: Any, y: Any) -> Any:

@@ -38,7 +38,7 @@ class Estimate:
 
     Attributes:
         lit, base: Light that arrives and light to compare with (Color3f).
-        shine: Highlight (Color3f).
+        shine, glare: Light that is mirrored towards the camera, sum of its channels, and the same of all that is sent.
         squares: Sum of the squares of what is added to ``base``.
         rays: Number of rays.
     """
@@ -46,21 +46,27 @@ class Estimate:
     lit: Any
     base: Any
     shine: Any
+    glare: Any
     squares: Any
     rays: Any
 
     @classmethod
     def nothing(cls, count: int) -> Estimate:
         """No rays yet at ``count`` points."""
-        lit, base, shine = (dr.zeros(mi.Color3f, count) for _ in range(3))
-        return cls(lit, base, shine, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
+        colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 2), (mi.Float, 4)))
+        return cls(*colours, *numbers)
+
+    @property
+    def sums(self) -> tuple[Any, ...]:
+        """All but the number of rays."""
+        return self.lit, self.base, self.shine, self.glare, self.squares
 
     def updated(self, places: Any, *values: Any) -> Estimate:
         """The estimate with new values at some points."""
         dr.eval(values)  # else what they were made from would be copied before it is written to
-        for old, new in zip((self.lit, self.base, self.shine, self.squares, self.rays), values, strict=True):
+        for old, new in zip((*self.sums, self.rays), values, strict=True):
             dr.scatter(old, new, places)
-        dr.eval(self.lit, self.base, self.shine, self.squares, self.rays)
+        dr.eval(self.sums, self.rays)
         return self
 
 
@@ -90,12 +96,12 @@ class LightFilter:
         _, variance = self._share(estimate)
         return estimate.rays * variance / (GAIN * error * error)
 
-    def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any]:
-        """Light that arrives, light to compare with, and highlight (Color3f) per ray, at the pixels of ``index``."""
+    def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any, Any]:
+        """The first four sums of the estimate per ray, averaged over neighbours, at the pixels of ``index``."""
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
-        values = [c * weight for colour in (estimate.lit, estimate.base, estimate.shine) for c in colour]
+        values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.shine, estimate.glare)]
         values = self.average(values, estimate.rays, RADIUS, self._share(estimate))
-        return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mi.Color3f(*values[6:])
+        return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7]
 
     def _share(self, estimate: Estimate) -> tuple[Any, Any]:
         """Share of light that arrives, over 3 x 3 pixels, and its variance."""

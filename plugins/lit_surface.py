@@ -9,13 +9,45 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.device import gathered
-from mitsplat.plugins.light import Surface
 from mitsplat.plugins.proxies import Hit
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.traits import Traits
 
 AGREEMENT = 0.02
 """Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
+
+
+@dataclass(eq=False)
+class Surface:
+    """Visible points.
+
+    Attributes:
+        position, normal: Point [m] and unit normal towards the camera.
+        face: Unit normal of the proxy's triangle.
+        lift: Displacement [m] from the triangle to the smooth surface that it stands for.
+        to_camera: Unit vector towards the camera.
+        offset: How far shadow rays start off the surface [m].
+        instance: Instance id (Float).
+        trait: Row of the shape's traits (Float); light is not averaged across its borders.
+        relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
+        roughness, specular: GGX roughness and reflectance at normal incidence.
+        known: Whether the proxy of what is seen says so; else position and normal are a guess.
+        valid: Whether there is a point at all.
+    """
+
+    position: Any
+    normal: Any
+    face: Any
+    lift: Any
+    to_camera: Any
+    offset: Any
+    instance: Any
+    trait: Any
+    relit: Any
+    roughness: Any
+    specular: Any
+    known: Any
+    valid: Any
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,9 @@ colours of the surroundings are exposed: an object taken in a light tent keeps i
 less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.plugins.bounce`. The highlight is what
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
-Rays are spent where they are needed. One a pixel, towards the dynamic objects alone, finds the places whose light may
-differ; those get ``FIRST_RAYS``, and as many more as the wanted standard error of the filtered ratio asks for.
+Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take next to no light,
+see :mod:`mitsplat.plugins.light_tiles`. All else gets ``FIRST_RAYS``, and as many more as the wanted standard error of
+the filtered ratio asks for.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ R2 = (3242174889, 2447445414)
 effectiveness of quasirandom sequences")."""
 
 FAINT = 0.5
-"""Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced."""
+"""Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced by more than one ray."""
 
 FIRST_RAYS = 4
 """Rays per point after which its error is first estimated."""

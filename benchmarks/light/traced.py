@@ -4,7 +4,9 @@
 
 The truth is the ratio of ``--truth`` rays per pixel without a filter. Errors are the standard deviation of the light
 factor (mean of RGB) from it, where it matters: at objects that are lit anew, and where a shadow takes 1 % or more of
-the light. Processor seconds of all threads are medians over frames, less those of the same frames without light.
+the light. The PSNR [dB] is that of pictures as each frame's camera develops them, noise and all, to those of the truth:
+what highlights miss counts as well. Processor seconds of all threads are medians over frames, less those of the same
+frames without light.
 """
 
 from __future__ import annotations
@@ -21,10 +23,12 @@ import numpy as np
 
 import mitsplat as ms
 from benchmarks.record import figure, recording
+from mitsplat.arrays import Float32Array
+from mitsplat.frames.camera_response import develop, light_image
 from mitsplat.frames.frame import Renderer, light_properties, plan_frame
 from mitsplat.quality import resolve_quality
 from mitsplat.render.layers import Layers, ensure_variant, make_integrator, render_layers
-from mitsplat.scene.scene import layout_of
+from mitsplat.scene.scene import FramePlan, layout_of
 
 ensure_variant()
 import drjit as dr  # noqa: E402
@@ -35,10 +39,10 @@ from mitsplat.plugins.light_filter import Estimate, LightFilter  # noqa: E402
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def means(_: LightFilter, estimate: Estimate) -> tuple[Any, Any, Any]:
+def means(_: LightFilter, estimate: Estimate) -> tuple[Any, Any, Any, Any]:
     """What a filter of one pixel would give."""
     count = dr.rcp(dr.maximum(estimate.rays, 1))
-    return estimate.lit * count, estimate.base * count, estimate.shine * count
+    return estimate.lit * count, estimate.base * count, estimate.shine * count, estimate.glare * count
 
 
 @contextmanager
@@ -60,14 +64,23 @@ class Pictures:
         self.renderer = Renderer(self.scene, quality=quality)
         layout = ms.settle_layout(self.scene, layout_of(self.scene, 0))
         print(f"{len(layout.instances)} objects, {len(self.scene.spec.lights)} lights, {frames} frames")
-        self.frames = []
+        self.frames: list[tuple[Any, Any]] = []
+        self.plans: list[FramePlan] = []
         for index in range(frames):
             plan = plan_frame(self.scene, index)
             self.frames.append((mi.load_dict(self.renderer.describe(layout, plan.lights)), plan.camera))
+            self.plans.append(plan)
 
     def integrator(self, **properties: Any) -> Any:
         """The scene's own, with some properties changed."""
         return make_integrator(quality=resolve_quality("fast"), **{**light_properties(self.scene), **properties})
+
+    def developed(self, number: int, layers: Layers) -> Float32Array:
+        """The picture of a frame, 0 to 255."""
+        plan, composite = self.plans[number], self.scene.spec.composite
+        linear = light_image(layers, composite)
+        image = develop(linear, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed)
+        return image.astype(np.float32)
 
     def render(self, integrator: Any, seed: int) -> tuple[list[Layers], list[float]]:
         """Layers and processor seconds of each frame, after one that compiles."""
@@ -102,18 +115,23 @@ def measure(args: argparse.Namespace) -> None:
         with filtered(by_neighbours):
             found, seconds = pictures.render(pictures.integrator(**properties), 1)
         cost = float(np.median(np.subtract(seconds, without)))
-        errors: dict[str, list[float]] = {"objects": [], "shadows": []}
-        for layers, truth in zip(found, exact, strict=True):
+        errors: dict[str, list[float]] = {"objects": [], "shadows": [], "picture": []}
+        for number, (layers, truth) in enumerate(zip(found, exact, strict=True)):
+            apart = pictures.developed(number, layers) - pictures.developed(number, truth)
+            errors["picture"].append(np.mean(apart**2))
             off = layers.light.mean(axis=-1) - truth.light.mean(axis=-1)
             objects = truth.instance > 0
             shadow = ~objects & (truth.light.mean(axis=-1) < 0.99)
             errors["objects"].append(np.mean(off[objects] ** 2))
             errors["shadows"].append(np.mean(off[shadow] ** 2))
         rms = {where: float(np.sqrt(np.mean(values))) for where, values in errors.items()}
+        psnr = 20 * np.log10(255 / rms.pop("picture"))
         figure(cost, "s", name, "cpu")
+        figure(psnr, "dB", name, "picture")
         for where, error in rms.items():
             figure(error, "", name, where)
-        print(f"{name:32} {cost:6.2f} CPU s   shadows {rms['shadows']:.4f}   objects {rms['objects']:.4f}", flush=True)
+        errors_said = "   ".join(f"{where} {error:.4f}" for where, error in rms.items())
+        print(f"{name:32} {cost:6.2f} CPU s   {errors_said}   picture {psnr:.1f} dB", flush=True)
 
     for rays in (1, 4, 16, 64):
         row(f"{rays} rays everywhere", False, shadow_error=0, shadow_samples=rays)

@@ -142,6 +142,8 @@ def small_scene(folder: Path, assets: Sequence[Asset], objects: list[dict[str, A
         "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4},
         "output": {"width": 64, "height": 48, **output},
     }
+    if "depth-sensor" in output.get("formats", ()):
+        data["depth_sensor"] = {"kind": "tof"}
     YAML(typ="safe", pure=True).dump(data, folder / "scene.yaml")
     return load_scene(folder / "scene.yaml")
 

@@ -68,6 +68,7 @@ def measure(options: argparse.Namespace) -> None:
         "output.layouts": -(-options.frames // VIEWS),
         "output.views": VIEWS,
         "output.image": "png",
+        "depth_sensor": {"kind": "stereo"},
         "output.formats": [name for name in FORMATS if name not in SKIPPED],
     }
     scene = ms.load_scene(ROOT / "scenes/workcell.yaml", overrides=overrides)

@@ -79,7 +79,10 @@ def measure(options: argparse.Namespace) -> None:
     width, height = map(int, options.size.split("x"))
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)
-    scene = ms.load_scene(ROOT / "scenes/workcell.yaml", overrides={"output.width": width, "output.height": height})
+    scene = ms.load_scene(
+        ROOT / "scenes/workcell.yaml",
+        overrides={"output.width": width, "output.height": height, "depth_sensor": {"kind": "stereo"}},
+    )
     layout = grid(scene)
     frames = [ms.render_frame(scene, i, layout=layout) for i in range(options.frames + 1)][1:]
     truths = [truth_of(frame) for frame in frames]

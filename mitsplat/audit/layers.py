@@ -20,6 +20,8 @@ _FLOW_ROUNDED = 0.02
 """Difference that single precision and lens models make in optical flow [px]."""
 _KNOWN_FLOW = 1e9
 """Components above this mean that there is no flow."""
+_MOST_MEASURED = 0.25
+"""Middle error of measured depth, relative to the true one, which no sensor of use has."""
 _FEW = 6
 """Instances of an asset of which nothing is concluded."""
 _MOST_TRUNCATED = 0.2
@@ -57,6 +59,7 @@ class LayersReader:
                 depth, step = stored * unit, unit
             elif wrong := np.count_nonzero(np.abs(stored * unit - np.minimum(depth, 65535 * unit)) > 1.01 * unit):
                 yield file, f"{wrong} pixels have another depth than in {layers if step == 0 else 'depth/'}"
+        yield from _check_sensed(frame, depth)
         normals = f"normals/{frame.split}/{frame.index:06d}.png"
         if normals in frame.record["files"]:
             yield from ((normals, text) for text in _check_normals(frame, normals, channels))
@@ -178,6 +181,21 @@ def _depth_files(frame: TrueFrame) -> list[str]:
     name = f"{frame.index:06d}.png"
     files = [f"depth/{frame.split}/{name}", f"{frame.bop_folder}/depth/{name}"]
     return [file for file in files if file in frame.record["files"] and (frame.root / file).is_file()]
+
+
+def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
+    """Whether measured depth is of the frame's size, and its middle error small where the true depth is known."""
+    file = f"depth-sensor/{frame.split}/{frame.index:06d}.png"
+    if file not in frame.record["files"] or not (frame.root / file).is_file():
+        return
+    stored = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+    if stored is None:
+        yield file, "cannot be read as a 16-bit grey image of the frame's size"
+    elif depth is not None and (both := (stored > 0) & (depth > 0)).any():
+        measured = stored[both] * frame.record["depth_sensor_scale"] / 1000
+        error = float(np.median(np.abs(measured - depth[both]) / depth[both]))
+        if error > _MOST_MEASURED:
+            yield file, f"depths are off by {error:.0%} of the true ones in the middle"
 
 
 def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] | None:

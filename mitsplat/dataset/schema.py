@@ -205,6 +205,7 @@ class _Record(_Stored):
     labels: _Labels
     environment: _Environment | None = None
     depth_scale: Annotated[float, Field(gt=0)] | None = None
+    depth_sensor_scale: Annotated[float, Field(gt=0)] | None = None
     objects: list[_Drawn] | None = None
     appearance: list[_Appearance] | None = None
     viewpoint: _Viewpoint | None = None
@@ -318,6 +319,8 @@ def _check_record(record: Record, content: dict[str, Any]) -> None:
         raise ValueError("environment must be a segment or absent (got null)")
     if record.get("depth_scale") is None and {"bop", "depth"} & set(content["scene"]["output"]["formats"]):
         raise ValueError("depth_scale must be stated")
+    if record.get("depth_sensor_scale") is None and "depth-sensor" in content["scene"]["output"]["formats"]:
+        raise ValueError("depth_sensor_scale must be stated")
     for label in record["labels"]["instances"]:
         name = f"instance {label['id']}"
         for key, among in (("class_index", content["classes"]), ("asset", content["assets"])):

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from mitsplat.frames.frame import Frame
     from mitsplat.scene.scene import Scene
+    from mitsplat.scene.spec_image import DepthSensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,7 @@ class Catalogue:
         distractors: Positions of the assets that are in no label.
         drawn: Of a scene that draws its objects, what the manifest states of an instance of each asset; else empty.
         splits: Names of the dataset's splits.
+        depth_sensor: What measures the depth of the format ``depth-sensor``.
     """
 
     class_names: Sequence[str]
@@ -43,6 +45,7 @@ class Catalogue:
     distractors: Sequence[int] = ()
     drawn: Sequence[Mapping[str, Any]] = ()
     splits: Sequence[str] = SPLITS[:2]
+    depth_sensor: DepthSensor | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> Catalogue:
@@ -77,7 +80,16 @@ class Catalogue:
         distractors = [position for position, kind in enumerate(kinds) if kind is None]
         assets = [asset.name for asset in scene.assets]
         splits = splits_of(scene.spec.output.model_dump())
-        return cls(scene.class_names, keypoint_names, assets, meshes, distractors, _drawn(scene), splits)
+        return cls(
+            scene.class_names,
+            keypoint_names,
+            assets,
+            meshes,
+            distractors,
+            _drawn(scene),
+            splits,
+            scene.spec.depth_sensor,
+        )
 
     @property
     def num_keypoints(self) -> int:

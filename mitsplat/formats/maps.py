@@ -17,6 +17,7 @@ import OpenEXR
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
 from mitsplat.files import storage_error
+from mitsplat.frames.depth_sensor import sensed_depth
 from mitsplat.labels.labels import Labels
 from mitsplat.masks import Box
 
@@ -45,6 +46,14 @@ def write_semantic(files: FrameFiles) -> None:
 def write_depth(files: FrameFiles) -> None:
     """Write a frame's depth."""
     files.add_depth(f"depth/{files.name}.png")
+
+
+def write_depth_sensor(files: FrameFiles) -> None:
+    """Write a frame's depth as the scene's sensor measures it, and its unit as ``depth_sensor_scale`` [mm]."""
+    assert files.catalogue.depth_sensor is not None  # noqa: S101 - the scene's rule
+    measured = sensed_depth(files.frame, files.catalogue.depth_sensor)
+    files.record["depth_sensor_scale"] = depth_scale(measured)
+    files.add_png(f"depth-sensor/{files.name}.png", depth_picture(measured))
 
 
 def write_normals(files: FrameFiles) -> None:

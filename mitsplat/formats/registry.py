@@ -15,9 +15,9 @@ manifest. By their names in a scene file's ``output.formats``:
     See :mod:`mitsplat.formats.bop`; for cameras without lens distortion.
 ``colmap``
     See :mod:`mitsplat.formats.colmap`.
-``depth``, ``normals``, ``instances``, ``semantic``, ``flow``
+``depth``, ``depth-sensor``, ``normals``, ``instances``, ``semantic``, ``flow``
     ``<format>/<split>/NNNNNN.png`` (``.flo``), see :mod:`mitsplat.formats.maps`; a depth picture's unit is
-    ``depth_scale`` millimetres of the frame's line in the manifest.
+    ``depth_scale`` millimetres (``depth_sensor_scale``) of the frame's line in the manifest.
 ``exr``
     ``layers/<split>/NNNNNN.exr``: linear R, G, B; A (opacity); Z (depth along the camera's axis [m], 0 = nothing);
     instance and proxy_instance (ids); normal.X/Y/Z (world); light.R/G/B; and the frame's further layers by name.
@@ -58,6 +58,7 @@ TABLE = {
     "poses": Format(("annotations",), describe=coco.describe_poses),
     "semantic": Format(("semantic",), maps.write_semantic),
     "depth": Format(("depth",), maps.write_depth),
+    "depth-sensor": Format(("depth-sensor",), maps.write_depth_sensor),
     "bop": Format(("bop",), bop.write, bop.ScenesWriter),
     "colmap": Format(("colmap",), describe=ModelWriter),
     "normals": Format(("normals",), maps.write_normals),

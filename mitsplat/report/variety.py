@@ -41,6 +41,7 @@ _NO_DRAWS = frozenset(
         "rest",
         "depth_scale",
         "order_error",
+        "depth_sensor_scale",
     }
 )
 """Keys of a frame's record that state no draw, or that are looked at in another way."""

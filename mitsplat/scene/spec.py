@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from mitsplat.quality import PresetName
 from mitsplat.scene.spec_camera import CameraSpec
-from mitsplat.scene.spec_image import Composite, Randomise, Rendering
+from mitsplat.scene.spec_image import Composite, DepthSensor, Randomise, Rendering, StereoSensor
 from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec_materials import Background
 from mitsplat.scene.spec_objects import ObjectSpec, Settle
@@ -40,6 +40,7 @@ FormatName = Literal[
     "bop",
     "colmap",
     "depth",
+    "depth-sensor",
     "normals",
     "instances",
     "semantic",
@@ -154,6 +155,11 @@ class SceneSpec(StrictModel):
     lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
     composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
+    depth_sensor: DepthSensor | None = Field(
+        None,
+        exclude_if=lambda sensor: sensor is None,
+        description="What measures the depth of the format depth-sensor.",
+    )
     labels: LabelRules = Field(LabelRules(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     hold_out: HoldOut = Field(
@@ -186,6 +192,11 @@ class SceneSpec(StrictModel):
             raise FieldError(
                 ("lights", 0, "draw", "count"), "must be at least 1 where no other light is in every frame (got 0)"
             )
+        if "depth-sensor" in self.output.formats and self.depth_sensor is None:
+            raise FieldError(("output", "formats"), "depth-sensor needs a depth_sensor")
+        lens = self.camera.intrinsics
+        if isinstance(self.depth_sensor, StereoSensor) and (lens.lens == "fisheye" or any(lens.distortion)):
+            raise FieldError("depth_sensor", "stereo must have a camera without lens distortion")
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: give output.test")
         turn = sum(1 if camera.stereo is None else 2 for camera in (self.camera, *self.cameras))

@@ -26,6 +26,7 @@ from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec import FORMATS
 from mitsplat.scene.spec_camera import Intrinsics
+from mitsplat.scene.spec_image import TimeOfFlightSensor
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
@@ -39,7 +40,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 def write(scene: Scene, out: Path, formats: list[str], **options: Any) -> Path:
     output = scene.spec.output.model_copy(update={"formats": tuple(formats)})
-    changed = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
+    sensor = TimeOfFlightSensor()
+    changed = replace(scene, spec=scene.spec.model_copy(update={"output": output, "depth_sensor": sensor}))
     return write_dataset(changed, out, render=render_boxes, settle=scatter_boxes, **options).path
 
 
@@ -374,6 +376,12 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         changing(maps, "depth_picture", lambda made, *args: np.maximum(made // 1000, made > 0).astype(np.uint16)),
         "manifest.jsonl",
         "depth pictures put",
+    ),
+    "depth-sensor: metres": (
+        "depth-sensor exr",
+        changing(maps, "depth_picture", lambda made, *args: np.maximum(made // 1000, made > 0).astype(np.uint16)),
+        "depth-sensor/train/000000.png",
+        "of the true ones in the middle",
     ),
     "exr: distances for depths": (
         "exr depth",

@@ -32,6 +32,7 @@ from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import load_scene
 from mitsplat.scene.spec import FORMATS
+from mitsplat.scene.spec_image import StereoSensor
 from tests.labels.test_labels import Seen, read_yolo, resample, whole
 from tests.synthetic import CERTIFICATE, frame_around
 
@@ -164,7 +165,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
         objects=(),
         background=None,
     )
-    catalogue = Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES)
+    sensor = StereoSensor(noise=0, shift=0, step=1e-4, range=(0.9, 2))
+    catalogue = Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES, depth_sensor=sensor)
     frames = [frame_of(Drawn(covered), index) for index, covered in enumerate(LAYOUTS.values())]
     records = [write_frame(frame, root, spec, catalogue) for frame in frames]  # type: ignore[arg-type]
     write_collection(root, records, catalogue, FORMATS)
@@ -486,6 +488,10 @@ class TestMaps:
             name = f"{record['split']}/{frame.index:06d}.png"
             assert record["depth_scale"] == 0.1
             np.testing.assert_array_equal(png(written.root / "depth" / name), np.where(frame.instance > 0, 8000, 10000))
+            assert record["depth_sensor_scale"] == 0.1
+            measured = png(written.root / "depth-sensor" / name)
+            assert not measured[frame.instance > 0].any()  # which are nearer than what is measured
+            assert set(np.unique(measured)) == {0, 10000}
             normals = png(written.root / "normals" / name)
             assert (normals[frame.instance > 0] == [32768, 13107, 58982]).all()
             assert (normals[frame.instance == 0] == 0).all()

@@ -1,0 +1,136 @@
+"""Depth as a camera for depth measures it: by stereo or by time of flight, with the errors that each is known for.
+
+The true depth stays what it is; this is a second one, for detectors that are shown measured depth. Its numbers depend
+on the frame's seed alone.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.colour import LUMINANCE
+from mitsplat.frames.frame import Frame
+from mitsplat.scene.spec_image import DepthSensor, StereoSensor, TimeOfFlightSensor
+from mitsplat.scene.streams import random_stream
+
+LIGHT_SPEED = 299_792_458.0
+WINDOW = 9
+"""Pixels along each side of what passive stereo matches."""
+DARKEST = 0.02
+"""Least reflectance, for time of flight."""
+
+
+def sensed_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
+    """A frame's depth along the optical axis [m] as the sensor measures it, 0 where it does not, (H, W)."""
+    rng = random_stream(frame.plan.seed, "depth sensor")
+    depth = frame.depth.astype(np.float64)
+    if isinstance(sensor, StereoSensor):
+        return stereo_depth(depth, frame.camera.fx, sensor, rng, frame.image)
+    reflectance = np.clip(frame.layers.captured @ LUMINANCE, DARKEST, 1.0)
+    return time_of_flight_depth(depth, frame.camera, sensor, rng, reflectance, frame.normal)
+
+
+def stereo_depth(
+    depth: Float64Array, focal: float, sensor: StereoSensor, rng: np.random.Generator, picture: ByteImage
+) -> Float32Array:
+    """Depth (H, W) by the disparity to a second camera, beside the first in +x.
+
+    Disparities d = focal baseline / z are measured a little beside where they belong, with an error, and in steps:
+    step round((d(x + shift n1) + noise n2) / step), n normal, after Handa et al. (2014, "A benchmark for RGB-D visual
+    odometry, 3D reconstruction and SLAM"). So the standard deviation of depth grows with its square,
+    z^2 noise / (focal baseline) (Khoshelham and Elberink 2012, "Accuracy and resolution of Kinect depth data for indoor
+    mapping applications"). What the second camera does not see has no disparity, nor has what has no contrast.
+
+    Args:
+        depth: True depth along the optical axis [m], 0 where nothing is.
+        focal: Focal length [px].
+        sensor: Its values.
+        rng: Where the errors come from.
+        picture: What is matched, display-encoded, (H, W, 3).
+    """
+    height, width = depth.shape
+    rows, columns = np.mgrid[:height, :width]
+    disparity = np.divide(focal * sensor.baseline, depth, out=np.zeros_like(depth), where=depth > 0)
+    seen = (depth > 0) & ~hidden_from_second(disparity)
+    if sensor.contrast > 0:
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) / 255
+        mean, square = (cv2.blur(values, (WINDOW, WINDOW)) for values in (grey, grey * grey))
+        seen &= np.sqrt(np.maximum(square - mean**2, 0)) >= sensor.contrast
+    beside, below, error = rng.standard_normal((3, height, width))
+    rows = np.clip(np.rint(rows + sensor.shift * below).astype(int), 0, height - 1)
+    columns = np.clip(np.rint(columns + sensor.shift * beside).astype(int), 0, width - 1)
+    seen &= seen[rows, columns]
+    matched = sensor.step * np.rint((disparity[rows, columns] + sensor.noise * error) / sensor.step)
+    seen &= matched > 0
+    found = np.divide(focal * sensor.baseline, matched, out=np.zeros_like(depth), where=seen)
+    low, high = sensor.range
+    return np.where((found >= low) & (found <= high), found, 0).astype(np.float32)
+
+
+def hidden_from_second(disparity: Float64Array) -> BoolArray:
+    """Pixels that a second camera in +x, which is like the first, does not see: (H, W).
+
+    Every pixel with a disparity lies that far to the left in its image. There, it covers both pixels that it falls
+    between, and hides what is there with a disparity smaller by more than a pixel: other surfaces, and one that it sees
+    so much from the side that disparities grow by more than 0.4 px a pixel, which no window matches either. What falls
+    beyond the left border is not seen.
+    """
+    height, width = disparity.shape
+    rows, columns = np.mgrid[:height, :width]
+    place = columns - disparity
+    nearest = np.zeros_like(disparity)
+    for covered in (np.floor(place), np.ceil(place)):
+        column = covered.astype(int)
+        inside = (disparity > 0) & (column >= 0) & (column < width)
+        np.maximum.at(nearest, (rows[inside], column[inside]), disparity[inside])
+    own = np.rint(place).astype(int)
+    return np.asarray((own < 0) | (nearest[rows, np.clip(own, 0, width - 1)] > disparity + 1))
+
+
+def time_of_flight_depth(
+    depth: Float64Array,
+    camera: Camera,
+    sensor: TimeOfFlightSensor,
+    rng: np.random.Generator,
+    reflectance: Float64Array,
+    normal: Float32Array,
+) -> Float32Array:
+    """Depth (H, W) by the phase of modulated light that comes back.
+
+    A surface at distance r returns s = reflectance cos / r^2 (1 for a white one at 1 m that faces the sensor) with the
+    phase 2 pi r / u, where u = c / (2 modulation) is the longest distance that is told from 0. A pixel adds up what
+    falls on it, so that one at an edge measures neither surface but something between: a flying pixel. The standard
+    deviation of distances is noise sqrt(s + ambient) / s: shot noise of signal and ambient light (Lange and Seitz 2001,
+    "Solid-state time-of-flight range camera", for a constant modulation and exposure).
+
+    Args:
+        depth: True depth along the optical axis [m], 0 where nothing is.
+        camera: Its rays.
+        sensor: Its values.
+        rng: Where the noise comes from.
+        reflectance: From 0 to 1, (H, W).
+        normal: In the world, 0 where it is unknown and taken to face the sensor, (H, W, 3).
+    """
+    height, width = depth.shape
+    rows, columns = np.mgrid[:height, :width]
+    slopes = camera.ray_slopes(np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1))
+    rays = np.column_stack([slopes, np.ones(len(slopes))]).reshape(height, width, 3)
+    length = np.linalg.norm(rays, axis=-1)
+    away = depth * length
+    facing = np.abs(np.einsum("hwi,hwi->hw", normal @ camera.world_from_camera[:3, :3], rays)) / length
+    facing = np.where(normal.any(axis=-1), facing, 1.0)
+    signal = np.divide(reflectance * facing, away**2, out=np.zeros_like(depth), where=away > 0)
+    longest = LIGHT_SPEED / (2e6 * sensor.modulation)
+    waves = signal * np.exp(2j * np.pi * away / longest)
+    if sensor.blur > 0:
+        waves = sum(
+            cv2.GaussianBlur(part, (0, 0), sensor.blur) * unit for part, unit in ((waves.real, 1), (waves.imag, 1j))
+        )
+    signal = np.maximum(np.abs(waves), 1e-12)
+    spread = sensor.noise * np.sqrt(signal + sensor.ambient) / signal
+    measured = longest * np.angle(waves) / (2 * np.pi) + spread * rng.standard_normal((height, width))
+    found = measured % longest / length
+    return np.where(signal >= sensor.min_signal, found, 0).astype(np.float32)

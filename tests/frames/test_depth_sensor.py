@@ -1,0 +1,199 @@
+"""Measured depth against closed forms: the spread of its errors, what a second camera does not see, flying pixels."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.frames.depth_sensor import (
+    LIGHT_SPEED,
+    hidden_from_second,
+    sensed_depth,
+    stereo_depth,
+    time_of_flight_depth,
+)
+from mitsplat.scene.scene import load_scene
+from mitsplat.scene.spec_image import StereoSensor, TimeOfFlightSensor
+from tests.conftest import WriteScene
+
+FOCAL = 400.0
+PLAIN = np.full((96, 128, 3), 128, dtype=np.uint8)
+CAMERA = Camera.look_at((0, 0, 0), (0, 1, 0), width=128, height=96, fov_x=30)
+
+
+def stereo(depth: Any, picture: Any = PLAIN, seed: int = 0, **values: Any) -> Any:
+    sensor = StereoSensor(**values)
+    return stereo_depth(np.asarray(depth, dtype=np.float64), FOCAL, sensor, np.random.default_rng(seed), picture)
+
+
+def flight(depth: Any, reflectance: float = 1.0, normal: Any = None, **values: Any) -> Any:
+    normal = np.zeros((96, 128, 3), dtype=np.float32) if normal is None else normal
+    given = np.full((96, 128), reflectance), normal
+    return time_of_flight_depth(depth, CAMERA, TimeOfFlightSensor(**values), np.random.default_rng(0), *given)
+
+
+class TestStereo:
+    @pytest.mark.parametrize("away", [0.5, 1.0, 2.0])
+    def test_errors_grow_with_the_square_of_distance(self, away: float) -> None:
+        """Of a wall: the disparity's variance is noise^2 + step^2 / 12 (Sheppard), to first order in depth's error."""
+        noise, step, baseline = 0.2, 0.25, 0.055
+        found = stereo(np.full((96, 128), away), noise=noise, step=step, baseline=baseline)[:, 50:]
+        expected = away**2 / (FOCAL * baseline) * np.sqrt(noise**2 + step**2 / 12)
+        error = FOCAL * baseline / found - FOCAL * baseline / away
+        assert error.std() == pytest.approx(np.sqrt(noise**2 + step**2 / 12), rel=0.03)
+        assert found.std() == pytest.approx(expected, rel=0.05)
+        assert error.mean() == pytest.approx(0, abs=4 * error.std() / np.sqrt(error.size))
+
+    def test_disparities_are_whole_steps(self) -> None:
+        found = stereo(np.full((96, 128), 1.3), step=0.5)
+        steps = FOCAL * 0.055 / found[found > 0] / 0.5
+        np.testing.assert_allclose(steps, np.rint(steps), atol=1e-4)
+        assert len(np.unique(np.rint(steps))) in (2, 3)
+
+    def test_what_the_second_camera_does_not_see_has_no_depth(self) -> None:
+        """Beside a box before a wall: a strip to its left, as wide as the disparities differ, and the left border."""
+        near, far = FOCAL * 0.1 / 20, FOCAL * 0.1 / 6  # disparities of 20 and 6 px
+        depth = np.full((96, 128), far)
+        depth[20:70, 60:90] = near
+        found = stereo(depth, baseline=0.1, noise=0, shift=0, step=1)
+        holes = found == 0
+        expected = np.zeros_like(holes)
+        expected[:, :6] = True
+        expected[20:70, 60 - (20 - 6) : 60] = True
+        np.testing.assert_array_equal(holes, expected)
+        np.testing.assert_allclose(found[~holes], depth[~holes], rtol=1e-6)
+
+    def test_the_wall_beyond_a_thin_bar_is_seen(self) -> None:
+        """The bar hides a strip of its own width, at the difference of the disparities from it."""
+        disparity = np.full((4, 60), 3.0)
+        disparity[:, 40:42] = 15.0
+        hidden = hidden_from_second(disparity)
+        assert np.flatnonzero(hidden[0]).tolist() == [0, 1, 2, 28, 29]
+
+    def test_a_slope_is_seen_whole(self) -> None:
+        """Disparities that grow to the right by up to 0.4 px a pixel hide nothing of themselves."""
+        for slope in (-3.0, -0.9, 0.2, 0.4):
+            disparity = 60 + slope * (np.arange(40) - 20.0)
+            assert not hidden_from_second(np.tile(np.pad(disparity, (140, 0)), (3, 1)))[:, 141:].any()
+
+    def test_a_scan_line_at_a_time_is_the_same(self) -> None:
+        """A slow twin: every pixel against every other of its row."""
+        rng = np.random.default_rng(3)
+        disparity = np.repeat(rng.uniform(0, 12, (6, 10)), 5, axis=1)
+        disparity[rng.random(disparity.shape) < 0.1] = 0
+        place = np.arange(50) - disparity
+        for row in range(6):
+            for x in range(50):
+                own = np.rint(place[row, x])
+                covering = [
+                    other
+                    for other in range(50)
+                    if disparity[row, other] > disparity[row, x] + 1
+                    and own in (np.floor(place[row, other]), np.ceil(place[row, other]))
+                ]
+                assert hidden_from_second(disparity)[row, x] == (own < 0 or bool(covering)), (row, x)
+
+    def test_plain_surfaces_need_a_pattern(self) -> None:
+        picture = PLAIN.copy()
+        picture[:, 64:] = np.where(np.indices((96, 64)).sum(0)[..., None] % 2, 100, 150)
+        found = stereo(np.full((96, 128), 1.0), picture, contrast=0.05, shift=0)
+        assert not found[:, :59].any() and (found[:, 70:] > 0).all()
+        assert (stereo(np.full((96, 128), 1.0), picture)[:, 40:] > 0).all()
+
+    def test_range_and_nothing(self) -> None:
+        depth = np.full((96, 128), 0.5)
+        depth[:40], depth[40:50] = 3.0, 0.0
+        found = stereo(depth, range=(0.2, 2.0), shift=0)
+        assert not found[:50].any() and (found[50:, 50:] > 0).all()
+
+
+class TestTimeOfFlight:
+    @pytest.mark.parametrize(("away", "reflectance", "ambient"), [(1.0, 1.0, 0.0), (2.0, 0.5, 0.0), (1.5, 0.3, 2.0)])
+    def test_errors_are_of_the_light_that_comes_back(self, away: float, reflectance: float, ambient: float) -> None:
+        """Around the axis, where ray and axis are the same but for a per cent."""
+        found = flight(np.full((96, 128), away), reflectance, noise=0.001, ambient=ambient)[38:58, 50:78]
+        signal = reflectance / away**2
+        expected = 0.001 * np.sqrt(signal + ambient) / signal
+        assert found.std() == pytest.approx(expected, rel=0.1)
+        assert found.mean() == pytest.approx(away, abs=4 * expected / np.sqrt(found.size))
+
+    def test_a_surface_that_turns_away_returns_less(self) -> None:
+        normal = np.zeros((96, 128, 3), dtype=np.float32)
+        normal[:] = (0, -0.5, np.sqrt(0.75))  # 60 degrees from the axis, which is +y
+        facing, turned = (flight(np.full((96, 128), 1.0), normal=n, noise=0.001)[38:58, 50:78] for n in (None, normal))
+        assert turned.std() / facing.std() == pytest.approx(np.sqrt(2), rel=0.1)
+
+    def test_pixels_at_an_edge_fly(self) -> None:
+        """Phasors of both surfaces add up, by the Gaussian's share of each; away from the edge nothing changes."""
+        depth = np.full((96, 128), 1.0)
+        depth[:, 64:] = 1.5
+        found = flight(depth, reflectance=0.4, noise=0, blur=1.0)
+        taps = np.exp(-0.5 * np.arange(-4, 5) ** 2)
+        for beyond in range(4):  # pixels 63, 62, ... and as much of the Gaussian as lies on the other side
+            share = taps[5 + beyond :].sum() / taps.sum()
+            wave = (1 - share) * np.exp(8e7j * np.pi / LIGHT_SPEED) + share / 2.25 * np.exp(12e7j * np.pi / LIGHT_SPEED)
+            assert found[48, 63 - beyond] == pytest.approx(np.angle(wave) * LIGHT_SPEED / 8e7 / np.pi, abs=2e-3)
+        assert 1.05 < found[48, 63] < found[48, 64] < 1.45
+        np.testing.assert_allclose(found[:, :58], 1.0, atol=2e-3)  # whose rays differ in length, too
+        np.testing.assert_allclose(found[:, 70:], 1.5, atol=2e-3)
+        sharp = flight(depth, noise=0, blur=0)
+        np.testing.assert_allclose(sharp, depth, atol=1e-5)
+
+    def test_distances_wrap_around(self) -> None:
+        longest = LIGHT_SPEED / 2e8  # at 100 MHz
+        found = flight(np.full((96, 128), longest + 0.4), noise=0, blur=0, modulation=100)
+        assert found[48, 64] == pytest.approx(0.4, abs=1e-3)
+
+    def test_dark_and_far_things_are_not_measured(self) -> None:
+        depth = np.full((96, 128), 2.0)
+        depth[:, 64:] = 0
+        assert not flight(depth, reflectance=0.02, min_signal=0.006, blur=0).any()
+        found = flight(depth, reflectance=0.03, min_signal=0.006, blur=0, noise=0)
+        assert (found[40:56, 50:64] > 0).all() and not found[:, 64:].any()
+
+
+@pytest.mark.parametrize("sensor", [StereoSensor(), TimeOfFlightSensor()])
+def test_the_frame_s_seed_decides(sensor: Any) -> None:
+    depth = np.tile(np.linspace(0.8, 1.2, 128, dtype=np.float32), (96, 1))
+    layers = SimpleNamespace(captured=np.full((96, 128, 3), 0.5))
+    made = {"camera": CAMERA, "image": PLAIN, "layers": layers, "normal": np.zeros((96, 128, 3))}
+    frame: Any = SimpleNamespace(depth=depth, plan=SimpleNamespace(seed=5), **made)
+    one, again = sensed_depth(frame, sensor), sensed_depth(frame, sensor)
+    frame.plan.seed = 6
+    np.testing.assert_array_equal(one, again)
+    assert (one != sensed_depth(frame, sensor)).mean() > 0.3
+    assert one.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"output": {"formats": ["depth-sensor"]}}, "output.formats: depth-sensor needs a depth_sensor"),
+        ({"depth_sensor": {"kind": "stereo", "baseline": 0}}, "baseline: must be > 0"),
+        ({"depth_sensor": {"kind": "stereo", "range": [2, 1]}}, r"range: must be \[low, high\]"),
+        ({"depth_sensor": {"kind": "laser"}}, "depth_sensor"),
+        (
+            {
+                "depth_sensor": {"kind": "stereo"},
+                "camera": {
+                    "kind": "orbit",
+                    "target": [0, 0, 0],
+                    "radius": 1,
+                    "height": 1,
+                    "intrinsics": {"fov_x": 40, "distortion": [0.1, 0, 0, 0]},
+                },
+            },
+            "depth_sensor: stereo must have a camera without lens distortion",
+        ),
+    ],
+)
+def test_sensors_that_cannot_be_are_refused(
+    scene_data: dict[str, Any], write_scene: WriteScene, change: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        load_scene(write_scene(scene_data | change))

@@ -137,8 +137,9 @@ def _scene_hash(scene: Scene) -> str:
     shapes = [shape.model_copy(update={"materials": ()}) for shape in compress(spec.shapes, solid)]
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
-    if spec.empty or spec.hold_out.assets or any(entry.balance for entry in spec.objects):  # which depend on splits
-        add(spec.empty, spec.output.validation, spec.output.test, spec.hold_out.assets)
+    held_out = spec.hold_out.assets or spec.hold_out.environments
+    if spec.empty or held_out or any(entry.balance for entry in spec.objects):  # which depend on splits
+        add(spec.empty, spec.output.validation, spec.output.test, spec.hold_out)
     for mesh in compress(scene.shape_meshes, solid):
         add_mesh(mesh)
     surroundings = scene.environments if spec.environment_collides else ()

@@ -70,6 +70,8 @@ def draw_environment(spec: SceneSpec, layout: int) -> int:
     if not isinstance(spec.environment, tuple) or len(spec.environment) == 1:
         return 0
     weights = np.array(spec.environment_weights or np.ones(len(spec.environment)))
+    if spec.hold_out.environments and split_of(layout, spec.output.validation, spec.output.test) != "test":
+        weights = weights * [name not in spec.hold_out.environments for name in spec.environment]
     rng = random_stream(spec.seed, "environment", layout)
     return int(rng.choice(len(weights), p=weights / weights.sum()))
 

@@ -431,12 +431,20 @@ def _check_lens(spec: SceneSpec, path: Path) -> None:
 
 
 def _check_held_out(spec: SceneSpec, path: Path) -> None:
-    """Refuse to hold out what no entry of objects names."""
-    named = {name for _, name, _ in _object_assets(spec)}
-    for number, name in enumerate(spec.hold_out.assets):
-        if name not in named:
-            place = key_place(path, ("hold_out", "assets", number))
-            raise InputError(f"{place}: must be among the assets of objects, {', '.join(sorted(named))} (got {name})")
+    """Refuse to hold out what is not named, and all environments."""
+    named = {
+        "assets": {name for _, name, _ in _object_assets(spec)},
+        "environments": {name for _, name in _environments(spec)},
+    }
+    for kind, known in named.items():
+        held_out = getattr(spec.hold_out, kind)
+        for number, name in enumerate(held_out):
+            if name not in known:
+                place, listed = key_place(path, ("hold_out", kind, number)), ", ".join(sorted(known)) or "none"
+                raise InputError(f"{place}: must be among the {kind} of the scene, {listed} (got {name})")
+    if spec.hold_out.environments and named["environments"] <= set(spec.hold_out.environments):
+        place = key_place(path, ("hold_out", "environments"))
+        raise InputError(f"{place}: must leave an environment to training (got all {len(named['environments'])})")
 
 
 def whole(index: SupportsIndex, name: str) -> int:

@@ -87,6 +87,9 @@ class HoldOut(StrictModel):
     assets: tuple[str, ...] = Field(
         (), description="Asset folders of objects, as ``objects`` names them, that no other split has."
     )
+    environments: tuple[str, ...] = Field(
+        (), description="Those of several, as ``environment`` names them, that no other split has."
+    )
 
 
 class LabelRules(StrictModel):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mitsplat.errors import InputError
-from mitsplat.scene.contents import draw_objects, is_empty, split_of
+from mitsplat.scene.contents import draw_environment, draw_objects, is_empty, split_of
 from mitsplat.scene.scene import Scene, load_scene
 from tests.conftest import WriteScene, box_asset
 
@@ -187,7 +188,11 @@ def test_what_is_held_out_is_in_the_test_split_alone(
         ({"hold_out": {"assets": ["assets/nut"]}}, r"hold_out: needs a test split: give output\.test"),
         (
             {"hold_out": {"assets": ["assets/nail"]}, "output": {"test": 0.1}},
-            r"hold_out\.assets\[0\]: must be among the assets of objects, assets/bolt, assets/nut \(got assets/nail\)",
+            r"hold_out\.assets\[0\]: must be among the assets of the scene, .*assets/nut \(got assets/nail\)",
+        ),
+        (
+            {"hold_out": {"environments": ["assets/nut"]}, "output": {"test": 0.1}},
+            r"hold_out\.environments\[0\]: must be among the environments of the scene, none \(got assets/nut\)",
         ),
         ({"output": {"validation": 0.5, "test": 0.6}}, r"test: must be at most 1 - validation, 0\.5 \(got 0\.6\)"),
     ],
@@ -197,3 +202,22 @@ def test_splits_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         load_scene(write_scene(scene_data | change))
+
+
+def test_environments_that_are_held_out_are_in_the_test_split_alone(
+    scene_data: SceneData, write_scene: WriteScene, tmp_path: Path
+) -> None:
+    for name in ("hall", "yard", "cell"):
+        replace(box_asset(name), kind="environment").save(tmp_path / "assets" / name)
+    names = ("assets/cell", "assets/hall", "assets/yard")
+    scene_data |= {"environment": list(names), "output": {"layouts": 200, "test": 0.25}}
+    held_out = {"hold_out": {"environments": ["assets/hall"]}}
+    spec = load_scene(write_scene(scene_data | held_out)).spec
+    seen: dict[bool, set[str]] = {True: set(), False: set()}
+    for layout in range(200):
+        seen[split_of(layout, 0.2, 0.25) == "test"].add(names[draw_environment(spec, layout)])
+    assert seen == {True: set(names), False: {"assets/cell", "assets/yard"}}
+    with pytest.raises(
+        InputError, match=r"hold_out\.environments: must leave an environment to training \(got all 3\)"
+    ):
+        load_scene(write_scene(scene_data | {"hold_out": {"environments": list(names)}}))

@@ -166,9 +166,7 @@ class SceneSpec(StrictModel):
     labels: LabelRules = Field(LabelRules(), description="What is labelled.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     hold_out: HoldOut = Field(
-        HoldOut(),
-        exclude_if=lambda held: held == HoldOut(),
-        description="What is in the test split alone.",
+        HoldOut(), exclude_if=lambda held: held == HoldOut(), description="What is in the test split alone."
     )
     quality: PresetName = Field("balanced", description="Rendering preset.")
     rendering: Rendering = Field(Rendering(), description="How splats are drawn.")

@@ -59,14 +59,8 @@ class StereoSensor(StrictModel):
     baseline: Positive = Field(0.055, description="Distance of the two cameras [m].")
     noise: NonNegativeFloat = Field(0.1, description="Error of a disparity [px], 1 sigma.")
     step: Positive = Field(0.125, description="Steps that disparities are measured in [px].")
-    shift: NonNegativeFloat = Field(
-        0.5, description="Error of where a disparity is measured [px], 1 sigma, which frays edges."
-    )
-    contrast: Unit = Field(
-        0.0,
-        description="Contrast (standard deviation of 9x9 pixels, of 1) without which nothing is matched; 0 with a "
-        "projected pattern.",
-    )
+    shift: NonNegativeFloat = Field(0.5, description="Error of where it is measured [px], 1 sigma, which frays edges.")
+    contrast: Unit = Field(0.0, description="Least standard deviation of 9x9 pixels, of 1; 0 with a projected pattern.")
     range: PositiveRange = Field((0.1, 10.0), description="Depths that are measured [m].")
 
 
@@ -74,17 +68,11 @@ class TimeOfFlightSensor(StrictModel):
     """Depth by the phase of modulated light."""
 
     kind: Literal["tof"] = Field("tof", description="Time of flight.")
-    noise: NonNegativeFloat = Field(
-        0.002, description="Error of the distance of a white surface that faces the sensor at 1 m [m], 1 sigma."
-    )
+    noise: NonNegativeFloat = Field(0.002, description="Error of a white surface that faces it at 1 m [m], 1 sigma.")
     ambient: NonNegativeFloat = Field(0.0, description="Ambient light, relative to what such a surface returns.")
     blur: NonNegativeFloat = Field(0.6, description="Light of a pixel that its neighbours get [px], 1 sigma.")
-    modulation: Positive = Field(
-        20.0, description="Frequency [MHz]; distances wrap around at c / 2 of it, 7.5 m at 20 MHz."
-    )
-    min_signal: Positive = Field(
-        0.004, description="Light, relative to what such a surface returns, below which nothing is measured."
-    )
+    modulation: Positive = Field(20.0, description="Frequency [MHz]; distances wrap around at c / 2 of it, here 7.5 m.")
+    min_signal: Positive = Field(0.004, description="Least light that is measured, relative to the same.")
 
 
 DepthSensor = Annotated[StereoSensor | TimeOfFlightSensor, Field(discriminator="kind")]

@@ -20,7 +20,7 @@ from mitsplat.camera import Camera
 from mitsplat.mesh_points import points_inside
 
 if TYPE_CHECKING:
-    from mitsplat.scene.layout import Layout
+    from mitsplat.scene.layout import Instance, Layout
     from mitsplat.scene.scene import Scene
     from mitsplat.scene.spec_camera import Acceptance, Occlusion, Truncation
 
@@ -88,8 +88,12 @@ class Sight:
         self._points: Float64Array = np.concatenate(placed) if placed else np.zeros((0, 3))
         self._owner = np.repeat(np.arange(len(instances)), [len(points) for points in placed])
         self._spacing = _spacing(scene) * float(np.sqrt(step))
+        self._radii = np.array([np.linalg.norm(mesh.extents) / 2 for mesh in meshes])
         shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
         self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
+        here = scene.environment_of(layout.index)
+        around = [] if here is None or here.mesh is None else [here.mesh]
+        self._still = _Triangles(np.concatenate([self._triangles, *(mesh.triangles for mesh in around)]))
 
     @staticmethod
     @lru_cache(maxsize=2)
@@ -190,7 +194,7 @@ class Sight:
         """What a point is inside of, or empty."""
         if name := solid_around(self._scene, eye):
             return f"shape {name!r}"
-        for one in self._layout.instances:
+        for one in self._near(eye, 0.0):
             mesh = _mesh(self._scene, one.asset)
             if points_inside(mesh, _local(eye, one.world_from_object)[None])[0]:
                 return f"object {one.id}"
@@ -198,15 +202,16 @@ class Sight:
 
     def _clearance(self, eye: Float64Array, reach: float) -> float:
         """Distance of a point to the surface that is nearest [m], or ``reach`` if none is as near."""
-        scene = self._scene
-        shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
-        here = scene.environment_of(self._layout.index)
-        around = None if here is None else here.mesh
-        distances = [_distance(mesh, eye, reach) for mesh in (*shapes, around) if mesh is not None]
-        for one in self._layout.instances:
-            mesh = _mesh(scene, one.asset)
-            distances.append(_distance(mesh, _local(eye, one.world_from_object), reach))
-        return min(distances, default=reach)
+        distance = self._still.distance(eye, reach)
+        for one in self._near(eye, distance):
+            triangles = _Triangles(np.asarray(_mesh(self._scene, one.asset).triangles))
+            distance = triangles.distance(_local(eye, one.world_from_object), distance)
+        return distance
+
+    def _near(self, eye: Float64Array, reach: float) -> list[Instance]:
+        """Instances that a part of may be as near to a point."""
+        near = np.linalg.norm(self.centres - eye, axis=1) < self._radii + reach
+        return [one for one, is_near in zip(self._layout.instances, near, strict=True) if is_near]
 
 
 def solid_around(scene: Scene, point: Float64Array) -> str:
@@ -247,19 +252,22 @@ def _among(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
     return np.asarray((values >= bounds[0]) & (values <= bounds[1]))
 
 
-def _distance(mesh: trimesh.Trimesh, point: Float64Array, reach: float) -> float:
-    """Distance of a point to a mesh's triangles, or ``reach`` if none is as near."""
-    low, high = mesh.bounds
-    if np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high))) >= reach:
-        return reach
-    triangles = np.asarray(mesh.triangles)
-    # Of a triangle's box and the point, whatever is nearer than the reach along every axis.
-    apart = np.maximum(triangles.min(axis=1) - point, point - triangles.max(axis=1))
-    near = triangles[(apart < reach).all(axis=1)]
-    if not len(near):
-        return reach
-    closest = trimesh.triangles.closest_point(near, np.broadcast_to(point, (len(near), 3)))
-    return min(reach, float(np.linalg.norm(closest - point, axis=1).min()))
+class _Triangles:
+    """Triangles (T, 3, 3) [m] and the boxes around them, which tell most to be too far away."""
+
+    def __init__(self, triangles: Float64Array) -> None:
+        self._triangles = triangles
+        a, b, c = (triangles[:, corner] for corner in range(3))
+        self._low, self._high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+    def distance(self, point: Float64Array, reach: float) -> float:
+        """Distance of a point to the nearest triangle, or ``reach`` if none is as near."""
+        apart = np.maximum(self._low - point, point - self._high)
+        near = self._triangles[(apart < reach).all(axis=1)]
+        if not len(near):
+            return reach
+        closest = trimesh.triangles.closest_point(near, np.broadcast_to(point, (len(near), 3)))
+        return min(reach, float(np.linalg.norm(closest - point, axis=1).min()))
 
 
 def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:

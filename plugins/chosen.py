@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsplat.plugins.rays import View
 
@@ -80,3 +81,40 @@ class ChosenTiles:
         """Place of the first, and number, of those among ``size`` consecutive tiles from ``begin`` on."""
         first = dr.gather(mi.UInt32, self.before, begin)
         return first, dr.gather(mi.UInt32, self.before, begin + size) - first
+
+
+@dataclass(frozen=True, eq=False)
+class TileBox:
+    """All tiles of a view in a box of them, as :class:`ChosenTiles` that need no tables.
+
+    Attributes:
+        number: Theirs in the view, ascending.
+        count: How many they are.
+        left, top, columns: Its first column and row, and its columns, as opaque values.
+        across: The view's columns.
+    """
+
+    number: Any
+    count: int
+    left: Any
+    top: Any
+    columns: Any
+    across: int
+
+    @classmethod
+    def around(cls, boxes: Any, view: View) -> TileBox:
+        """The smallest around half-open ranges (x0, x1, y0, y1), four numbers each, none of which is empty."""
+        x0, x1, y0, y1 = dr.gather(mi.Array4u, boxes, dr.arange(mi.UInt32, dr.width(boxes) // 4))
+        ends = np.array(dr.concat([dr.min(x0), dr.max(x1), dr.min(y0), dr.max(y1)])).tolist()
+        left, right, top, bottom = (int(end) for end in ends)
+        place = dr.arange(mi.UInt32, (right - left) * (bottom - top))
+        first_column, first_row, columns = (dr.opaque(mi.UInt32, n) for n in (left, top, right - left))
+        row = place // columns
+        number = (first_row + row) * view.tiles_x + first_column + (place - row * columns)
+        dr.eval(number)
+        return cls(number, dr.width(number), first_column, first_row, columns, view.tiles_x)
+
+    def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
+        """Place of the first, and number, of ``size`` consecutive tiles in the box from ``begin`` on."""
+        row = begin // self.across
+        return (row - self.top) * self.columns + (begin - row * self.across - self.left), size

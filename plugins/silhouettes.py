@@ -62,8 +62,8 @@ def _cover(
     A canvas that is too crowded for the memory is looked at in parts.
     """
     try:
-        lists = bin_gaussians(clouds, objects, canvas, quality)
-        found = _occupied(lists, canvas, ids)
+        lists = bin_gaussians(clouds, objects, canvas, quality, fitted=True)
+        found = _occupied(lists, ids)
     except CrowdedError:
         if canvas.tiles_y == 1:
             raise
@@ -75,9 +75,10 @@ def _cover(
         return tile, slot, bits
     if found is None:
         return (np.zeros(0, dtype=np.uint32),) * 3
-    tile, slot = found
+    place, slot = found
+    tile = dr.gather(mi.UInt32, lists.tiles, place)
     instance = dr.gather(mi.Float, wrapped(mi.Float, ids.astype(np.float32)), slot)
-    return np.array(tile), np.array(slot), np.array(_covered(lists, canvas, quality, tile, instance))
+    return np.array(tile), np.array(slot), np.array(_covered(lists, canvas, quality, place, instance))
 
 
 def proxy_silhouettes(
@@ -140,14 +141,14 @@ def _margin(
     return MARGINS[-1]
 
 
-def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any] | None:
-    """Every pair of a tile and an instance (as position in ``ids``) that has a Gaussian in it; None if there is none.
+def _occupied(lists: TileLists, ids: np.ndarray) -> tuple[Any, Any] | None:
+    """Every pair of a tile (as place in ``lists``) and an instance (in ``ids``) that has a Gaussian in it, or None.
 
     They are found as one bit each.
     """
     if lists.pairs == 0:
         return None
-    tile = dr.arange(mi.UInt32, view.tiles_x * view.tiles_y)
+    tile = dr.arange(mi.UInt32, dr.width(lists.start))
     slot_of_id = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
     slot_of_id[ids] = np.arange(len(ids), dtype=np.uint32)
     slots, words = wrapped(mi.UInt32, slot_of_id), dr.opaque(mi.UInt32, -(-len(ids) // 32))
@@ -176,18 +177,19 @@ def _occupied(lists: TileLists, view: View, ids: np.ndarray) -> tuple[Any, Any] 
     return owner, slot
 
 
-def _covered(lists: TileLists, view: View, quality: Quality, tile: Any, instance: Any) -> Any:
+def _covered(lists: TileLists, view: View, quality: Quality, place: Any, instance: Any) -> Any:
     """For every pair and each column of its tile, the pixels that the instance covers, as bits from the top."""
-    lane = dr.arange(mi.UInt32, dr.width(tile) * TILE_WIDTH)
+    lane = dr.arange(mi.UInt32, dr.width(place) * TILE_WIDTH)
     pair, column = lane // TILE_WIDTH, lane % TILE_WIDTH
-    tile, instance = dr.gather(mi.UInt32, tile, pair), dr.gather(mi.Float, instance, pair)
+    place, instance = dr.gather(mi.UInt32, place, pair), dr.gather(mi.Float, instance, pair)
+    tile = dr.gather(mi.UInt32, lists.tiles, place)
     row = tile // view.tiles_x
     x = mi.Float((tile - row * view.tiles_x) * TILE_WIDTH + column)
     y = mi.Float(row * TILE_HEIGHT)
     centre = dr.opaque(mi.Float, 0.5)  # as in the instance image, whatever the number of samples
     slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
-    start, stop = dr.gather(mi.UInt32, lists.start, tile), dr.gather(mi.UInt32, lists.stop, tile)
+    start, stop = dr.gather(mi.UInt32, lists.start, place), dr.gather(mi.UInt32, lists.stop, place)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     near, shared_column = view.near_plane, not view.distortion
 

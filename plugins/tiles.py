@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import MissingResourceError
-from mitsplat.plugins.chosen import ChosenTiles
+from mitsplat.plugins.chosen import ChosenTiles, TileBox
 from mitsplat.plugins.device import concatenated
 from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD, conic_touches_rectangle, ellipse_span
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
@@ -87,6 +87,7 @@ def bin_gaussians(
     *,
     at_camera: bool = True,
     chosen: ChosenTiles | None = None,
+    fitted: bool = False,
 ) -> TileLists:
     """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
 
@@ -97,6 +98,7 @@ def bin_gaussians(
         quality: Order, cut-offs and kernel.
         at_camera: Whether Gaussians that reach the camera's plane are seen.
         chosen: The only tiles that have lists; all of the view's if None.
+        fitted: Whether only the tiles in a box around all that is seen have lists.
 
     Raises:
         CrowdedError: If the view has too many pairs to hold.
@@ -118,7 +120,10 @@ def bin_gaussians(
 
     records, near_rows, least, box = source.records(owner, local, near)
     ids = {placement.instance for placement in placements}
-    return bin_records(records, near_rows, least, box, view, quality, ids.pop() if len(ids) == 1 else None, chosen)
+    only = ids.pop() if len(ids) == 1 else None
+    return bin_records(
+        records, near_rows, least, box, view, quality, only, TileBox.around(box, view) if fitted else chosen
+    )
 
 
 def bin_records(
@@ -129,7 +134,7 @@ def bin_records(
     view: View,
     quality: Quality,
     only: int | None,
-    chosen: ChosenTiles | None = None,
+    chosen: ChosenTiles | TileBox | None = None,
 ) -> TileLists:
     """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
 
@@ -259,7 +264,7 @@ class _Pairs:
 
 
 def _pair(
-    records: Any, least: Any, box: Any, view: View, quality: Quality, chosen: ChosenTiles | None
+    records: Any, least: Any, box: Any, view: View, quality: Quality, chosen: ChosenTiles | TileBox | None
 ) -> _Pairs | None:
     """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
 

@@ -126,6 +126,22 @@ def test_chosen_tiles_are_counted_as_by_hand() -> None:
     assert np.array_equal(np.concatenate([np.array(half.number) for half in halves]), np.flatnonzero(flags))
 
 
+def test_a_box_of_tiles_counts_as_the_same_tiles_chosen_one_by_one() -> None:
+    from mitsplat.plugins.chosen import ChosenTiles, TileBox
+    from mitsplat.plugins.sensors import view_of
+    from mitsplat.render.layers import make_sensor
+
+    view = view_of(make_sensor(CAMERA))
+    box = TileBox.around(mi.UInt32([3, 5, 2, 4, 2, 4, 3, 7]), view)
+    flags = np.zeros((view.tiles_y, view.tiles_x), bool)
+    flags[2:7, 2:5] = True
+    chosen = ChosenTiles.of(mi.Bool(flags.ravel()), view)
+    assert (box.count, np.array(box.number).tolist()) == (15, np.array(chosen.number).tolist())
+    begin, size = (mi.UInt32([row * view.tiles_x + 3 for row in range(2, 7)]), mi.UInt32([2, 1, 0, 2, 1]))
+    for own, other in zip(box.among(begin, size), chosen.among(begin, size), strict=True):
+        assert np.array(own).tolist() == np.array(other).tolist()
+
+
 def test_splats_stay_as_wide_as_trainers_dilate_them() -> None:
     """Their dilation is in pixels of the picture, as in four rays of every pixel."""
     quality, scene = replace(PRESETS["exact"], kernel="3dgs"), scene_of()

@@ -158,7 +158,9 @@ def _occupied(lists: TileLists, ids: np.ndarray) -> tuple[Any, Any] | None:
         record = dr.gather(mi.UInt32, lists.entries, i)
         instance = dr.gather(mi.Float, lists.records, record * RECORD + RECORD - 1)
         slot = dr.gather(mi.UInt32, slots, mi.UInt32(instance))
-        dr.scatter_reduce(dr.ReduceOp.Or, seen, mi.UInt32(1) << (slot & 31), tile * words + (slot >> 5))
+        # A lane has words of its own; the default mode would write their number into the kernel.
+        bit, word = mi.UInt32(1) << (slot & 31), tile * words + (slot >> 5)
+        dr.scatter_reduce(dr.ReduceOp.Or, seen, bit, word, mode=dr.ReduceMode.NoConflicts)
         return (i + 1,)
 
     dr.while_loop((mi.UInt32(lists.start),), lambda i: i < lists.stop, mark, label="occupied")

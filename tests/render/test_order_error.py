@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import drjit as dr
@@ -11,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.camera import look_at_pose
+from mitsplat.camera import Camera, look_at_pose
 from mitsplat.colour import encode_srgb
-from mitsplat.quality import Quality
+from mitsplat.quality import PRESETS, PresetName, Quality
 from mitsplat.render.layers import (
     Layers,
     ensure_variant,
@@ -183,3 +184,48 @@ def test_the_largest_and_the_mean_error_are_those_of_the_pixels() -> None:
     largest, mean = largest_and_mean(mi.Float(values))
     assert largest[0] == values.max() and mean[0] == pytest.approx(values.mean(), rel=1e-4)
     assert largest_and_mean(mi.Float([3.0, 0.0]))[0][0] == 1
+
+
+def test_balanced_pops_less_than_fast() -> None:
+    """While a camera turns by a tenth of a degree, what the order of blending alone changes from picture to picture."""
+
+    def popping(preset: PresetName) -> float:
+        quality = PRESETS[preset]
+        cut_alike = replace(quality, tolerance=0.0)
+        wrong = [
+            display(render_splats(CROWD, camera, quality=quality))
+            - display(render_splats(CROWD, camera, quality=cut_alike))
+            for camera in TURNING
+        ]
+        return float(max(np.abs(after - before).max() for before, after in pairwise(wrong)))
+
+    assert popping("balanced") < 0.5 * popping("fast")
+
+
+def turned(degrees: float) -> Camera:
+    angle = math.radians(degrees)
+    return replace(WIDE, world_from_camera=look_at_pose((3 * math.sin(angle), 0, -3 * math.cos(angle)), (0, 0, 0)))
+
+
+TURNING = [turned(0.02 * step) for step in range(6)]
+
+
+def test_tiles_sort_by_depth_where_they_see_most_of_a_gaussian() -> None:
+    """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
+    ensure_variant()
+    from mitsplat.plugins.tiles import _depth_where_seen
+
+    box, centre, depth = (0.10, 0.14, -0.02, 0.01), np.array([0.125, -0.012]), 2.0
+    tilt = np.array([3.0, -2.0])  # E and F: depth falls and rises across the footprint
+    spread = np.diag([(box[1] - box[0]) ** 2, (box[3] - box[2]) ** 2]) / 12
+    for covariance in (np.array([[4e-5, 1e-5], [1e-5, 2e-5]]), np.array([[2e-3, -1e-3], [-1e-3, 1e-3]])):
+        inverse = np.linalg.inv(covariance)
+        scaled = inverse * 0.5 * math.log2(math.e)
+        middle = np.array([sum(box[:2]) / 2, sum(box[2:]) / 2])
+        mean = np.linalg.solve(inverse + np.linalg.inv(spread), inverse @ centre + np.linalg.inv(spread) @ middle)
+        du, dv = mean - centre
+        record = [*centre, scaled[0, 0], 2 * scaled[0, 1], scaled[1, 1], 0, 0, 0, 0, depth, *tilt, 0, 0, 0, 0]
+        found = _depth_where_seen([mi.Float(value) for value in record], tuple(mi.Float(side) for side in box))
+        expected = depth * (1 + (tilt @ (du, dv)) / 2) / (1 + tilt @ (du, dv))
+        assert np.array(found).item() == pytest.approx(expected, rel=1e-5)
+        assert abs(expected - depth) > 1e-4

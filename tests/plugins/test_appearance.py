@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -151,8 +152,8 @@ def test_dirt_turns_with_its_object() -> None:
 def test_mirrors_show_appearances() -> None:
     """A mirror shows what its rays meet: a ball of a quarter of the reflectance is darker there too."""
     ensure_variant()
-    _, plain = ball()
-    _, dark = ball(colours=" ".join(map(str, (0.25 * np.eye(3)).ravel())))
+    _, plain = ball(capture_light="scene")
+    _, dark = ball(capture_light="scene", colours=" ".join(map(str, (0.25 * np.eye(3)).ravel())))
     mirror = mi.load_dict(
         {
             "type": "rectangle",
@@ -166,8 +167,10 @@ def test_mirrors_show_appearances() -> None:
         integrator = make_integrator(shadow="none", quality="fast", mesh_samples=16)
         scene = mi.load_dict({"type": "scene", "ball": shape, "mirror": mirror})
         pictures.append(render_layers(integrator, scene, camera))
-    before, after = (layers.rgb[layers.instance == 0].sum() for layers in pictures)
-    assert before > 1 and after == pytest.approx(0.25 * before, rel=0.02)
+    # Beside the ball itself, whose rim the mirror is seen through.
+    beside = ~cv2.dilate(np.uint8(pictures[0].instance == 1), np.ones((5, 5))).astype(bool)
+    before, after = (layers.rgb[beside].sum() for layers in pictures)
+    assert before > 20 and after == pytest.approx(0.25 * before, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     most = [entry.count[1] for entry in spec.objects]
     meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
     volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
-    fill = float(np.dot(most, volumes) / np.prod(extent))
+    space = sum(float(np.prod(np.subtract(region.max, region.min))) for region, _ in spec.all_regions)
+    fill = float(np.dot(most, volumes)) / space
     yield Finding(
         "room", fill <= MAX_FILL or not spec.objects, f"at most {sum(most)} objects take {fill:.0%} of the region",
         "make the region larger, lower objects[].count, or use settle.arrangement: pile",

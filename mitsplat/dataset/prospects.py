@@ -24,7 +24,9 @@ from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
 from mitsplat.scene.spec import BACKDROP
 from mitsplat.scene.spec_lights import LocalLight
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds, stated_pose
+from mitsplat.scene.spec_objects import Arrangement
+from mitsplat.scene.spec_shapes import Region
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds, stated_pose, walls_beside
 from mitsplat.sight import solid_around
 
 MOST_OBJECTS = 65535
@@ -93,7 +95,7 @@ def count_faults(scene: Scene) -> Iterator[Finding]:
 
 def layout_faults(scene: Scene) -> Iterator[Finding]:
     """Why no layout can come to rest."""
-    settle, region = scene.spec.settle, scene.spec.region
+    settle = scene.spec.settle
     if settle.max_time / settle.timestep > MOST_STEPS:
         yield Finding(
             "time",
@@ -105,20 +107,33 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
     dropped = [i for i, entry in enumerate(scene.spec.objects) if not entry.poses]
     if not dropped:
         return
+    for number, (region, arrangement) in enumerate(scene.spec.all_regions):
+        where = f"regions[{number - 1}]" if number else "region"
+        here = [i for i in dropped if scene.spec.regions_of(scene.spec.objects[i]) == (number,)]
+        if here or not scene.spec.regions:
+            yield from _region_faults(scene, where, here, region, arrangement)
+
+
+def _region_faults(
+    scene: Scene, where: str, dropped: Sequence[int], region: Region, arrangement: Arrangement
+) -> Iterator[Finding]:
+    """Why the entries ``dropped``, which go nowhere else, cannot come to rest in a region."""
     low, high = np.array(region.min), np.array(region.max)
     supports = [mesh.bounds for name, mesh in _colliders(scene) if not name.startswith(ENCLOSURE)]
     if supports and not any(
         (box[0, :2] < high[:2]).all() and (box[1, :2] > low[:2]).all() and box[0, 2] < high[2] for box in supports
     ):
-        text = "region: nothing that collides is below it, so that all objects fall for ever"
+        text = f"{where}: nothing that collides is below it, so that all objects fall for ever"
         yield Finding("support", False, text, "move region above the table, or the table below it")
         return
-    if scene.spec.settle.arrangement == "pile":
+    if arrangement == "pile":
         high[2] += PILE_HEIGHT
-    yield from _room_faults(scene, dropped, low, high)
+    yield from _room_faults(scene, where, dropped, low, high)
 
 
-def _room_faults(scene: Scene, dropped: Sequence[int], low: Float64Array, high: Float64Array) -> Iterator[Finding]:
+def _room_faults(
+    scene: Scene, where: str, dropped: Sequence[int], low: Float64Array, high: Float64Array
+) -> Iterator[Finding]:
     """Whether there is room for the objects in a region: of what is in the way, and of their number."""
     pools = [[mesh for asset in scene.pools[i] if (mesh := scene.assets[asset].mesh) is not None] for i in dropped]
     meshes = [mesh for pool in pools for mesh in pool]
@@ -134,7 +149,7 @@ def _room_faults(scene: Scene, dropped: Sequence[int], low: Float64Array, high: 
             in_way.append(repr(name))
         taken |= inside
     if taken.all():
-        text = f"region: lies inside of what collides with objects, {' and '.join(in_way)}"
+        text = f"{where}: lies inside of what collides with objects, {' and '.join(in_way)}"
         yield Finding("region", False, text, "move region above it")
         return
     volume = float(np.prod(high - low)) * float((~taken).mean())
@@ -145,7 +160,7 @@ def _room_faults(scene: Scene, dropped: Sequence[int], low: Float64Array, high: 
         yield Finding(
             "room",
             False,
-            f"region: at most {sum(numbers)} objects of {1e3 * need:.3g} l must start in it at once "
+            f"{where}: at most {sum(numbers)} objects of {1e3 * need:.3g} l must start in it at once "
             f"(it has {1e3 * volume:.3g} l)",
             "lower objects[].count or make region larger",
         )
@@ -343,9 +358,14 @@ def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
         )
         if not (shape.visible or shape.proxy)
     ]
-    low, high = enclosed_bounds(region, boxes, walls)
-    if scene.spec.settle.arrangement == "pile":
-        high[2] += PILE_HEIGHT
+    names = [name for name, _ in colliders]
+    lows, highs = [], []
+    for number, (place, arrangement) in enumerate(scene.spec.all_regions):
+        low, high = enclosed_bounds(place, boxes, walls_beside(scene.spec, number, names, walls))
+        high[2] += PILE_HEIGHT if arrangement == "pile" else 0.0
+        lows.append(low)
+        highs.append(high)
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
     beyond = max(
         (float(np.linalg.norm(asset.mesh.extents)) for asset in scene.assets if asset.mesh is not None), default=0.0
     )

@@ -115,6 +115,7 @@ class _Drawn(_Stored):
     name: str
     scale: Annotated[float, Field(gt=0)]
     label: bool
+    region: str | None = None
 
 
 class _Appearance(_Stored):

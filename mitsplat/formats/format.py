@@ -99,7 +99,9 @@ class Catalogue:
 
 def _drawn(scene: Scene) -> list[dict[str, Any]]:
     """What the manifest states of each asset's instances, if the scene file leaves open which ones lie in a layout."""
-    if not any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in scene.spec.objects):
+    spec = scene.spec
+    told = any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in spec.objects)
+    if not told and not spec.regions:
         return []
     found: list[dict[str, Any]] = []
     for position, entry in enumerate(scene.spec.objects):

@@ -39,7 +39,7 @@ from mitsplat.formats import bop, coco, label_studio, maps, voc, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
 from mitsplat.render.places import draw_place
-from mitsplat.scene.contents import is_empty
+from mitsplat.scene.contents import draw_regions, is_empty
 from mitsplat.scene.spec import FORMATS, Output, SceneSpec
 
 if TYPE_CHECKING:
@@ -89,6 +89,10 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
     }
     if catalogue.drawn:
         record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
+        if spec.regions:
+            regions = draw_regions(spec, plan.layout)
+            for drawn, region in zip(record["objects"], regions, strict=True):
+                drawn["region"] = spec.region_names[region]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
     if place := draw_place(spec, frame.index).to_json(spec):

@@ -22,11 +22,11 @@ from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
-from mitsplat.scene.contents import draw_environment, draw_objects
+from mitsplat.scene.contents import draw_environment, draw_objects, draw_regions
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
 # What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
@@ -56,7 +56,7 @@ class _Ground:
 
     Attributes:
         contact_finder: For all objects and these colliders.
-        bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+        bounds: Corners of what centres of mass of each region's objects must not leave [m], shape (R, 3) each.
     """
 
     colliders: tuple[Collider, ...]
@@ -97,6 +97,7 @@ class Drop:
         self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float, int], World] = {}
         self._made = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
+        self._arrangements = tuple(arrangement for _, arrangement in scene.spec.all_regions)
         surroundings = scene.environments if scene.spec.environment_collides else ()
         self._grounds = tuple(self._make_ground(around, progress) for around in surroundings or (None,))
         for ground in self._grounds:
@@ -113,12 +114,15 @@ class Drop:
         if not assets:
             return Layout(index, (), NOTHING_TO_REST)
         frictions, number = self._draw_frictions(index), self._ground_of(index)
+        regions = draw_regions(spec, index)
         obstacles = self._grounds[number].obstacles
         for attempt in range(spec.settle.attempts):
-            start = self.draw_poses(assets, random_stream(spec.seed, "object poses", index, attempt), given, number)
+            start = self.draw_poses(
+                assets, random_stream(spec.seed, "object poses", index, attempt), given, number, regions
+            )
             world = self._world(assets, frictions, capacity, number)
             world.reset(start)
-            outcome = self._run(world, number)
+            outcome = self._run(world, number, regions, given)
             reason = outcome.refused
             if reason == OVERFLOW:
                 capacity *= 2
@@ -127,7 +131,7 @@ class Drop:
                 clearances = all_clearances(resting, obstacles, reach=_REACH)
                 gaps = _support_gaps(resting, clearances)
                 reason = _fault(clearances, gaps, obstacles) or self._disarray(
-                    resting, clearances, obstacles, start, outcome.poses, given
+                    resting, clearances, obstacles, start, outcome.poses, given, regions
                 )
             if reason:
                 refused.append(reason)
@@ -162,26 +166,37 @@ class Drop:
         certificate = layout.certificate
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
-        number = self._ground_of(layout.index)
+        number, regions = self._ground_of(layout.index), draw_regions(self.scene.spec, layout.index)
         world = self._world(assets, self._draw_frictions(layout.index), capacity, number)
-        world.reset(self.draw_poses(assets, rng, given, number))
+        world.reset(self.draw_poses(assets, rng, given, number, regions))
         moments = [world.poses]
 
         def observe(time: float, poses: Float64Array) -> None:
             if len(moments) * interval <= time <= certificate.time_to_rest:
                 moments.append(poses)
 
-        self._run(world, number, observe=observe)
+        self._run(world, number, regions, given, observe=observe)
         yield from moments
 
     def _ground_of(self, layout: int) -> int:
         """Which of the grounds a layout lies on: objects do not notice environments that do not collide."""
         return draw_environment(self.scene.spec, layout) if len(self._grounds) > 1 else 0
 
-    def _run(self, world: World, ground: int, **options: Any) -> Outcome:
+    def _run(
+        self,
+        world: World,
+        ground: int,
+        regions: Sequence[int],
+        given: Sequence[Float64Array | None],
+        **options: Any,
+    ) -> Outcome:
         settle = self.scene.spec.settle
-        fastest = _POURED if settle.arrangement == "pile" else np.inf
-        bounds = self._grounds[ground].bounds
+        fastest = _POURED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
+        low, high = self._grounds[ground].bounds
+        # What the scene file puts somewhere may be in any of the regions.
+        free = np.array([pose is None for pose in given])[:, None]
+        own = np.asarray(regions)
+        bounds = np.where(free, low[own], low.min(axis=0)), np.where(free, high[own], high.max(axis=0))
         return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, **options)
 
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
@@ -260,9 +275,14 @@ class Drop:
             obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
         if not colliders:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
-        bounds = enclosed_bounds(scene.spec.region, [item.bounds for item in obstacles], walls)
-        if scene.spec.settle.arrangement == "pile":
-            bounds[1][2] += PILE_HEIGHT
+        lows, highs = [], []
+        for number, (region, arrangement) in enumerate(scene.spec.all_regions):
+            beside = walls_beside(scene.spec, number, [item.name for item in obstacles], walls)
+            low, high = enclosed_bounds(region, [item.bounds for item in obstacles], beside)
+            high[2] += PILE_HEIGHT if arrangement == "pile" else 0.0
+            lows.append(low)
+            highs.append(high)
+        bounds = np.array(lows), np.array(highs)
         finder = ContactFinder(all_pieces((part.body for part in self._objects), colliders))
         return _Ground(tuple(colliders), tuple(obstacles), finder, bounds)
 
@@ -286,6 +306,7 @@ class Drop:
         rng: np.random.Generator,
         given: Sequence[Float64Array | None] = (),
         ground: int = 0,
+        regions: Sequence[int] | None = None,
     ) -> Float64Array:
         """Poses (N, 4, 4) to start from above one of the grounds, see :func:`mitsplat.physics.placement.draw_poses`.
 
@@ -293,14 +314,26 @@ class Drop:
             InputError: If objects find no room.
         """
         items = [
-            Item(asset, self._objects[asset].surface, self._objects[asset].body.outline, given[i] if given else None)
+            Item(
+                asset,
+                self._objects[asset].surface,
+                self._objects[asset].body.outline,
+                given[i] if given else None,
+                regions[i] if regions else 0,
+            )
             for i, asset in enumerate(assets)
         ]
         region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
         obstacles = self._grounds[ground].obstacles
-        poses = draw_poses(items, obstacles, region, arrangement, rng)
+        poses = draw_poses(items, obstacles, self.scene.spec.all_regions, rng)
         if poses is not None:
             return poses
+        if self.scene.spec.regions:
+            counts = Counter(self.scene.spec.region_names[item.region] for item in items if item.pose is None)
+            raise InputError(
+                f"{self.scene.path}: regions must be large enough to start all objects in (those of a layout find no "
+                f"room without overlap: {', '.join(f'{count} in {name}' for name, count in counts.items())})"
+            )
         size = np.subtract(region.max, region.min)
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
@@ -323,22 +356,21 @@ class Drop:
         start: Float64Array,
         end: Float64Array,
         given: Sequence[Float64Array | None],
+        regions: Sequence[int],
     ) -> str:
         """How a layout at rest is not arranged as asked for, or empty."""
-        arrangement = self.scene.spec.settle.arrangement
+        laid = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < _WIDEST_GAP:
                 return f"{pair.first.name} rests against the enclosure"
-        if arrangement == "scatter":
-            for pair in clearances:
-                if pair.second not in obstacles and pair.distance < _NEAREST:
-                    return f"{pair.first.name} and {pair.second.name} touch"
-        if arrangement in ("stack", "upright"):
-            # Angle between the world's vertical, carried along by the object, and the vertical.
-            tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
-            for item, tilt, pose in zip(resting, tilts, given, strict=True):
-                if pose is None and tilt > _FALLEN:
-                    return f"{item.name} fell over"
+        for pair in clearances:
+            if laid[pair.first] == "scatter" and pair.second not in obstacles and pair.distance < _NEAREST:
+                return f"{pair.first.name} and {pair.second.name} touch"
+        # Angle between the world's vertical, carried along by the object, and the vertical.
+        tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
+        for item, tilt, pose in zip(resting, tilts, given, strict=True):
+            if laid[item] in ("stack", "upright") and pose is None and tilt > _FALLEN:
+                return f"{item.name} fell over"
         return ""
 
     def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:

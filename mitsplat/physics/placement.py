@@ -32,19 +32,20 @@ class Item:
         surface: Its mesh.
         outline: Vertices of its convex hull [m], shape (N, 3).
         pose: Where the scene file puts it, or None.
+        region: Which of the regions it starts in.
     """
 
     asset: int
     surface: Surface
     outline: Float64Array
     pose: Float64Array | None = None
+    region: int = 0
 
 
 def draw_poses(
     items: Sequence[Item],
     obstacles: Sequence[PlacedSurface],
-    region: Region,
-    arrangement: Arrangement,
+    regions: Sequence[tuple[Region, Arrangement]],
     rng: np.random.Generator,
 ) -> Float64Array | None:
     """Poses (N, 4, 4) of all items; None if they find no room. None that is drawn touches another or an obstacle.
@@ -52,12 +53,11 @@ def draw_poses(
     Args:
         items: What to place.
         obstacles: What does not move.
-        region: Where.
-        arrangement: How, see :class:`mitsplat.scene.spec.Settle`.
+        regions: Where, and how, see :class:`mitsplat.scene.spec.Settle`; one region after the other.
         rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
     """
     for _ in range(_DRAWS):
-        poses = _Draw(items, obstacles, region, rng).all_poses(arrangement)
+        poses = _Draw(items, obstacles, rng).all_poses(regions)
         if poses is not None:
             return poses
     return None
@@ -78,16 +78,14 @@ def resting_turn(outline: Float64Array) -> Float64Array:
 class _Draw:
     """One attempt to place all items."""
 
-    def __init__(
-        self, items: Sequence[Item], obstacles: Sequence[PlacedSurface], region: Region, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, items: Sequence[Item], obstacles: Sequence[PlacedSurface], rng: np.random.Generator) -> None:
         self._items, self._obstacles, self._rng = items, obstacles, rng
-        self._low, self._high = np.array(region.min), np.array(region.max)
-        self._foot = self._low.copy()  # of what is still free of a pile's column
+        self._low = self._high = self._foot = np.zeros(3)
+        self._sky = np.inf
         self._poses = np.tile(np.eye(4), (len(items), 1, 1))
         self._taken: list[Float64Array] = []
 
-    def all_poses(self, arrangement: Arrangement) -> Float64Array | None:
+    def all_poses(self, regions: Sequence[tuple[Region, Arrangement]]) -> Float64Array | None:
         free = []
         for i, item in enumerate(self._items):
             if item.pose is None:
@@ -96,18 +94,26 @@ class _Draw:
                 self._take(i, item.pose, _bounds(item.outline, item.pose))
         # Large ones first, for which room is scarce.
         free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
+        for number, (region, arrangement) in enumerate(regions):
+            self._low, self._high = np.array(region.min), np.array(region.max)
+            self._sky = float(self._high[2]) if len(regions) > 1 else np.inf  # there may be another region above
+            self._foot = self._low.copy()  # of what is still free of a pile's column
+            if not self._fill([i for i in free if self._items[i].region == number], arrangement):
+                return None
+        return self._poses
+
+    def _fill(self, free: Sequence[int], arrangement: Arrangement) -> bool:
+        """Put items into the region at hand."""
         if arrangement == "stack":
             assets = dict.fromkeys(self._items[i].asset for i in free)
-            done = all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
-        else:
-            place: dict[str, Callable[[int], bool]] = {
-                "drop": self._drop,
-                "pile": self._pour,
-                "scatter": self._scatter,
-                "upright": lambda i: self._stand(i, np.eye(3)),
-            }
-            done = all(place[arrangement](i) for i in free)
-        return self._poses if done else None
+            return all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
+        place: dict[str, Callable[[int], bool]] = {
+            "drop": self._drop,
+            "pile": self._pour,
+            "scatter": self._scatter,
+            "upright": lambda i: self._stand(i, np.eye(3)),
+        }
+        return all(place[arrangement](i) for i in free)
 
     def _drop(self, i: int) -> bool:
         return self._try(i, self._low, self._high)
@@ -216,7 +222,7 @@ class _Draw:
     def _free(self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False) -> bool:
         """Whether nothing is in the way; ``above`` asks for free sky as well, which whatever stands there needs."""
         if above:
-            box = np.stack([box[0], [*box[1][:2], np.inf]])
+            box = np.stack([box[0], [*box[1][:2], self._sky]])
         if self._taken and _boxes_meet(box, np.stack(self._taken)).any():
             return False
         placed = PlacedSurface("", self._items[i].surface, pose)

@@ -57,7 +57,7 @@ def run_to_rest(
     Args:
         world: Changed in place.
         max_time: When they must have come to rest [s].
-        bounds: Corners of what centres of mass must not leave [m], shape (3,) each.
+        bounds: Corners of what centres of mass must not leave [m], shape (3,) each, or (N, 3) for each body.
         fastest: Speed to which faster bodies are slowed down after each advance [m/s].
         observe: Told the time [s] and the poses (N, 4, 4) after each advance.
     """

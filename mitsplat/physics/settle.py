@@ -143,6 +143,8 @@ def _scene_hash(scene: Scene) -> str:
     for mesh in compress(scene.shape_meshes, solid):
         add_mesh(mesh)
     surroundings = scene.environments if spec.environment_collides else ()
+    if spec.regions:
+        add(spec.regions)
     if len(surroundings) > 1:
         add(spec.environment_weights)
     for asset in (*scene.assets, *surroundings):

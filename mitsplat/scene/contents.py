@@ -94,6 +94,20 @@ def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Floa
     return tuple(assets), tuple(given)
 
 
+def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
+    """Which of the regions each object of a layout starts in, drawn by floor area among those of its entry."""
+    areas = np.array([np.prod(np.subtract(region.max, region.min)[:2]) for region, _ in spec.all_regions])
+    found: list[int] = []
+    for position, (entry, count) in enumerate(zip(spec.objects, _counts(spec, layout), strict=True)):
+        among = list(spec.regions_of(entry))
+        if len(among) == 1:
+            found += among * count
+            continue
+        rng = random_stream(spec.seed, f"object region {position}", layout)
+        found += [among[i] for i in rng.choice(len(among), count, p=areas[among] / areas[among].sum())]
+    return tuple(found)
+
+
 def _counts(spec: SceneSpec, layout: int) -> list[int]:
     """How many objects of each entry a layout has."""
     counts = random_stream(spec.seed, "object counts", layout)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, Literal, SupportsIndex
+from typing import Any, Literal, SupportsIndex, cast
 
 import numpy as np
 import trimesh
@@ -31,7 +31,7 @@ from mitsplat.scene.primitives import make_primitives
 from mitsplat.scene.spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
 from mitsplat.scene.spec_materials import ImageMaterial, Material
-from mitsplat.scene.spec_objects import PRIMITIVES, ObjectSpec
+from mitsplat.scene.spec_objects import MAIN, PRIMITIVES, ObjectSpec
 from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.viewpoints import camera_at, view_of
@@ -240,7 +240,10 @@ def _sized_objects(spec: SceneSpec, path: Path, named: _Named) -> tuple[Asset, .
                     asset = named.assets[name]
                     asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
                     sized[key] = asset if scale == 1.0 else asset.scaled(scale)
-                    _check_fit(sized[key], spec.region)
+                    _check_object(sized[key])
+            with _blaming(path, *keys):
+                for number in spec.regions_of(entry) if not entry.poses or not spec.regions else ():
+                    _check_fit(sized[key], spec.all_regions[number][0], spec.region_names[number])
             assets.append(replace(sized[key], class_name=entry.class_name or sized[key].class_name))
     return tuple(assets)
 
@@ -388,15 +391,19 @@ def _matches(
 
 
 def _walled(spec: SceneSpec, named: _Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
-    """The specification with its enclosure written out as shapes, and the mesh of every shape."""
-    if spec.enclosure is None:
+    """The specification with its enclosures written out as shapes, and the mesh of every shape."""
+    enclosures = (spec.enclosure, *(region.enclosure for region in spec.regions))
+    if not any(enclosures):
         return spec, named.shape_meshes
     supports = [mesh for shape, mesh in zip(spec.shapes, named.shape_meshes, strict=True) if shape.collider]
     if spec.environment_collides:
         supports += [environment.mesh for environment in named.environments if environment.mesh is not None]
-    walls = enclosure_walls(spec.enclosure, spec, assets, supports)
+    around = [enclosure_walls(one, spec, assets, supports, i) for i, one in enumerate(enclosures) if one is not None]
+    walls = [wall for some in around for wall in some]
     meshes = tuple(_shape_mesh(wall, Path()) for wall in walls)  # boxes, which no file holds
-    return spec.model_copy(update={"shapes": (*spec.shapes, *walls), "enclosure": None}), (*named.shape_meshes, *meshes)
+    regions = tuple(region.model_copy(update={"enclosure": None}) for region in spec.regions)
+    update = {"shapes": (*spec.shapes, *walls), "enclosure": None, "regions": regions}
+    return spec.model_copy(update=update), (*named.shape_meshes, *meshes)
 
 
 def _confine(spec: SceneSpec, path: Path) -> None:
@@ -526,15 +533,20 @@ def _metric(asset: Asset) -> Asset:
     return asset
 
 
-def _check_fit(asset: Asset, region: Region) -> None:
-    """Refuse an object that physics cannot move, or that could not lie in the region on its largest side."""
+def _check_object(asset: Asset) -> None:
+    """Refuse an object that physics cannot move."""
     if asset.kind != "object" or asset.mesh is None:
         raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh to be dropped")
-    footprint = np.sort(asset.mesh.extents)[1:]
+
+
+def _check_fit(asset: Asset, region: Region, name: str) -> None:
+    """Refuse an object that could not lie in a region on its largest side."""
+    where = "the region" if name == MAIN else f"region {name!r}"
+    footprint = np.sort(cast(trimesh.Trimesh, asset.mesh).extents)[1:]  # no object is without
     space = np.sort(np.subtract(region.max, region.min)[:2])
     if (footprint > space).any():
         raise InputError(
-            f"asset {asset.name!r} must fit into the region of {space[0]:.3g} x {space[1]:.3g} m "
+            f"asset {asset.name!r} must fit into {where} of {space[0]:.3g} x {space[1]:.3g} m "
             f"(it measures {footprint[0]:.3g} x {footprint[1]:.3g} m)"
         )
 

@@ -14,8 +14,8 @@ from mitsplat.scene.spec_camera import CameraSpec
 from mitsplat.scene.spec_image import Composite, DepthSensor, Randomise, Rendering, StereoSensor
 from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec_materials import Background
-from mitsplat.scene.spec_objects import ObjectSpec, Settle
-from mitsplat.scene.spec_shapes import Backdrop, Enclosure, Region, Shape
+from mitsplat.scene.spec_objects import MAIN, Arrangement, ObjectSpec, Settle
+from mitsplat.scene.spec_shapes import Backdrop, Enclosure, NamedRegion, Region, Shape
 from mitsplat.scene.spec_types import Positive, StrictModel, Unit
 from mitsplat.yaml_input import FieldError
 
@@ -146,6 +146,11 @@ class SceneSpec(StrictModel):
         description="Share of layouts, in each split, that nothing which is labelled lies in.",
     )
     region: Region = Field(description="Where objects are dropped from.")
+    regions: tuple[NamedRegion, ...] = Field(
+        (),
+        exclude_if=lambda regions: not regions,
+        description="Further regions: other tables, levels of a shelf, bins, the floor.",
+    )
     enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
     settle: Settle = Field(Settle(), description="How objects come to rest.")
     camera: CameraSpec = Field(description="Where images are taken from.")
@@ -205,12 +210,44 @@ class SceneSpec(StrictModel):
             raise FieldError(
                 ("output", "views"), f"must be a multiple of {turn}, so that pairs are whole (got {self.output.views})"
             )
-        if self.enclosure is not None and self.enclosure.floor >= self.region.max[2]:
-            raise FieldError(
-                ("enclosure", "floor"),
-                f"must be below the region's top at {self.region.max[2]:g} m (got {self.enclosure.floor:g})",
-            )
+        self._check_regions()
         return self
+
+    def _check_regions(self) -> None:
+        """Refuse walls that end above their region, and regions that are not told apart or not there."""
+        stated: list[tuple[tuple[str | int, ...], Region, Enclosure | None]] = [((), self.region, self.enclosure)]
+        stated += [(("regions", i), region, region.enclosure) for i, region in enumerate(self.regions)]
+        for keys, region, walls in stated:
+            if walls is not None and walls.floor >= region.max[2]:
+                text = f"must be below the region's top at {region.max[2]:g} m (got {walls.floor:g})"
+                raise FieldError((*keys, "enclosure", "floor"), text)
+        names = self.region_names
+        for number, name in enumerate(names[1:]):
+            if name in names[: number + 1]:
+                raise FieldError(("regions", number, "name"), f"must be unique (got {name!r} again)")
+        for number, entry in enumerate(self.objects):
+            for name in (entry.region,) if isinstance(entry.region, str) else entry.region or ():
+                if name not in names:
+                    text = f"must be one of the regions, {', '.join(names)} (got {name!r})"
+                    raise FieldError(("objects", number, "region"), text)
+            if entry.region == ():
+                raise FieldError(("objects", number, "region"), "must name at least one region (got [])")
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """Names of all regions, the main one first."""
+        return (MAIN, *(region.name for region in self.regions))
+
+    @property
+    def all_regions(self) -> tuple[tuple[Region, Arrangement], ...]:
+        """All regions, and how objects are laid out in them."""
+        usual = self.settle.arrangement
+        return ((self.region, usual), *((region, region.arrangement or usual) for region in self.regions))
+
+    def regions_of(self, entry: ObjectSpec) -> tuple[int, ...]:
+        """Positions among all regions of those that an entry's objects may start in."""
+        named = (entry.region,) if isinstance(entry.region, str) else entry.region or self.region_names
+        return tuple(map(self.region_names.index, named))
 
     def check_environment_weights(self) -> None:
         """Refuse weights of another number than there are environments."""

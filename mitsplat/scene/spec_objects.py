@@ -46,6 +46,9 @@ PRIMITIVES = "primitives"
 
 NUM_PRIMITIVES = 15
 
+MAIN = "main"
+"""What the region is called that the key ``region`` states."""
+
 SIZES = 5
 """How many sizes a range of scales has, evenly spaced in ratio: each is a rigid model of its own in every format."""
 
@@ -115,6 +118,12 @@ class ObjectSpec(StrictModel):
         f"has one of {SIZES} sizes evenly spaced in ratio.",
     )
     class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
+    region: str | tuple[str, ...] | None = Field(
+        None,
+        exclude_if=lambda region: region is None,
+        description="Name of the region that it starts in, or of several that each object is drawn among by floor "
+        f"area; all if absent. The one of the key ``region`` is called ``{MAIN}``.",
+    )
     poses: tuple[ObjectPose, ...] = Field(
         (), description="Where each starts, instead of count; from there it settles like the others."
     )
@@ -141,7 +150,7 @@ class ObjectSpec(StrictModel):
         if self.pool == PRIMITIVES and self.size is not None:
             raise FieldError("size", "must not be given for primitives, which take a scale")
         if self.poses:
-            for key in ("count", "pool"):
+            for key in ("count", "pool", "region"):
                 if key in self.model_fields_set:
                     raise FieldError(key, "must not be given together with poses")
             if isinstance(self.scale, tuple):

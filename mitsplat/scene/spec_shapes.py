@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, NonNegativeFloat, model_validator
 
 from mitsplat.scene.spec_materials import ColourMaterial, Material, NoiseMaterial
+from mitsplat.scene.spec_objects import Arrangement
 from mitsplat.scene.spec_types import Positive, StrictModel, Unit, Vec3
 from mitsplat.yaml_input import FieldError
 
@@ -118,3 +119,15 @@ class Enclosure(StrictModel):
     )
     floor: float = Field(0.0, description="Height of the walls' lower edge [m].")
     thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")
+
+
+class NamedRegion(Region):
+    """A further region, with a name by which objects are sent there."""
+
+    name: str = Field(min_length=1, description="Name, unique among the regions.")
+    enclosure: Enclosure | None = Field(
+        None, description="Invisible walls around it; their ``floor`` is the height of what its objects lie on."
+    )
+    arrangement: Arrangement | None = Field(
+        None, description="How objects are laid out in it, if not as ``settle.arrangement`` says."
+    )

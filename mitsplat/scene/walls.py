@@ -30,14 +30,19 @@ PILE_HEIGHT = 1.0
 
 
 def enclosure_walls(
-    enclosure: Enclosure, spec: SceneSpec, assets: Sequence[Asset], supports: Sequence[trimesh.Trimesh]
+    enclosure: Enclosure,
+    spec: SceneSpec,
+    assets: Sequence[Asset],
+    supports: Sequence[trimesh.Trimesh],
+    number: int = 0,
 ) -> list[Shape]:
-    """The enclosure as five invisible boxes: walls from its floor up to the region's top or a pile's, and a lid.
+    """The enclosure of a region as five invisible boxes: walls from its floor up to its top or a pile's, and a lid.
 
     Without a margin of its own the largest object finds room between region and walls, but no wall stands where there
     is nothing to lie on before it.
     """
-    inner_low, inner_high = np.array(spec.region.min), np.array(spec.region.max)
+    region, arrangement = spec.all_regions[number]
+    inner_low, inner_high = np.array(region.min), np.array(region.max)
     if enclosure.margin is not None:
         low, high = inner_low - enclosure.margin, inner_high + enclosure.margin
     else:
@@ -46,7 +51,7 @@ def enclosure_walls(
         low = np.minimum(inner_low, np.maximum(inner_low - margin, bounds[:, 0].min(axis=0)))
         high = np.maximum(inner_high, np.minimum(inner_high + margin, bounds[:, 1].max(axis=0)))
     low[2], high[2] = enclosure.floor, inner_high[2]
-    if spec.settle.arrangement == "pile":
+    if arrangement == "pile":
         high[2] += PILE_HEIGHT
     middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
     walls = []
@@ -57,8 +62,21 @@ def enclosure_walls(
         extents[axis] = thickness
         extents[2] = thickness if name == "lid" else size[2]
         box = Box(size=tuple(extents.tolist()), position=tuple(position.tolist()))
-        walls.append(Shape(name=f"{ENCLOSURE}{name}", box=box))
+        walls.append(Shape(name=f"{ENCLOSURE}{_of_region(spec, number)}{name}", box=box))
     return walls
+
+
+def _of_region(spec: SceneSpec, number: int) -> str:
+    """What names of a region's walls have before their side."""
+    return f"{spec.region_names[number]} " if number else ""
+
+
+def walls_beside(spec: SceneSpec, number: int, names: Sequence[str], walls: Sequence[int]) -> list[int]:
+    """Those of some walls, positions among ``names``, that no other region has of its own."""
+    others = [f"{ENCLOSURE}{_of_region(spec, i)}" for i in range(len(spec.all_regions)) if i != number]
+    sides = ("-x", "+x", "-y", "+y", "lid")
+    foreign = {f"{other}{side}" for other in others for side in sides}
+    return [position for position in walls if names[position] not in foreign]
 
 
 def backdrop_shapes(room: Backdrop) -> list[Shape]:

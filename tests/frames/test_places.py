@@ -18,6 +18,7 @@ from mitsplat.colour import encode_srgb
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.mitsuba_xml import export_xml
 from mitsplat.render.places import draw_place
+from mitsplat.scene.contents import draw_regions
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from mitsplat.scene.spec import FORMATS
 from tests.conftest import WriteScene, box_asset
@@ -132,3 +133,18 @@ def test_xml_shows_the_same_place(
     shown = encode_srgb(image[..., :3])
     expected = encode_srgb(frame.layers.rgb)
     assert np.abs(shown - expected).mean() < 0.004
+
+
+def test_the_manifest_states_the_region_of_each_object(
+    scene_data: SceneData, write_scene: WriteScene, tmp_path: Path
+) -> None:
+    scene_data |= {"regions": [{"name": "shelf", "min": [-0.2, -0.2, 0.3], "max": [0.2, 0.2, 0.5]}]}
+    scene_data["objects"] = [{"asset": "assets/nut", "scale": 4}]
+    scene_data["output"] |= {"layouts": 4, "views": 1}
+    scene = ms.load_scene(write_scene(scene_data))
+    out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
+    assert audit_dataset(out).violations == ()
+    records = [json.loads(line) for line in (out / "manifest.jsonl").read_bytes().splitlines()]
+    told = [record["objects"][0]["region"] for record in records]
+    assert told == [("main", "shelf")[draw_regions(scene.spec, index)[0]] for index in range(4)]
+    assert set(told) == {"main", "shelf"}

@@ -6,9 +6,11 @@ import ast
 import gc
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from weakref import ref
@@ -19,9 +21,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
+from mitsplat.dataset.prospects import layout_faults
 from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
 from mitsplat.render.places import draw_place
+from mitsplat.scene.contents import draw_regions
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import load_scene
 from tests.bodies import STEPPERS, lowest, pose_at
@@ -331,6 +335,88 @@ def test_objects_lie_on_the_environment_that_their_layout_draws(scene_data, writ
             assert lowest(mesh, instance.world_from_object) == pytest.approx(tops[number], abs=5e-4)
     alone = settle_layout(replace(scene), index, cached=False)
     assert alone.to_json() == layout.to_json()
+
+
+@pytest.fixture
+def shelf(scene_data):
+    """A table, a board above it and a bin beside it; objects of three entries."""
+    scene_data["shapes"] += [
+        {"name": "board", "box": {"size": [0.5, 0.5, 0.02], "position": [0, 0, 0.29]}},
+        {"name": "bin", "bin": {"size": [0.15, 0.15, 0.06], "position": [0.4, 0, 0.004]}, "visible": True},
+    ]
+    scene_data["regions"] = [
+        {"name": "board", "min": [-0.2, -0.2, 0.32], "max": [0.2, 0.2, 0.5], "arrangement": "upright",
+         "enclosure": {"floor": 0.3}},
+        {"name": "bin", "min": [0.33, -0.07, 0.02], "max": [0.47, 0.07, 0.06], "arrangement": "pile"},
+    ]  # fmt: skip
+    scene_data["objects"] = [
+        {"asset": "assets/nut", "count": 3},
+        {"asset": "assets/bolt", "count": 2, "region": "bin"},
+        {"asset": "assets/nut", "count": 2, "region": ["main", "board"]},
+    ]
+    return {**scene_data, "enclosure": {"margin": 0.03}, "settle": {"stepper": "mujoco"}}
+
+
+def test_each_object_lies_in_its_region(shelf, write_scene):
+    """On the board at 0.3 m, put upright; on the table below it; and within the walls of the bin."""
+    scene = load_scene(write_scene(shelf))
+    seen = set()
+    for index in range(2):
+        layout = settle_layout(scene, index, cached=False)
+        regions = draw_regions(scene.spec, index)
+        assert regions[3:5] == (2, 2) and set(regions[5:]) <= {0, 1}
+        seen |= set(regions)
+        for instance, region in zip(layout.instances, regions, strict=True):
+            mesh, pose = scene.assets[instance.asset].mesh, instance.world_from_object
+            low = lowest(mesh, pose)
+            if region == 1:
+                assert low == pytest.approx(0.3, abs=5e-4)
+                assert pose[2, 2] > 0.999
+            elif region == 0:
+                assert -5e-4 < low < 0.25 and (np.abs(pose[:2, 3]) < 0.25).all()
+            else:
+                assert 0.0 < low < 0.06 and np.abs(pose[:2, 3] - (0.4, 0)).max() < 0.075
+    assert seen == {0, 1, 2}
+    assert [shape.name for shape in scene.spec.shapes[-5:]] == [
+        f"enclosure board {side}" for side in ("-x", "+x", "-y", "+y", "lid")
+    ]
+
+
+def test_objects_are_drawn_among_regions_by_floor_area(shelf, write_scene):
+    shelf["output"]["layouts"] = 200
+    spec = load_scene(write_scene(shelf)).spec
+    drawn = Counter(region for index in range(200) for region in draw_regions(spec, index)[:3])
+    areas = np.array([0.16, 0.16, 0.14 * 0.14])
+    expected = 600 * areas / areas.sum()
+    assert all(abs(drawn[i] - expected[i]) < 4 * expected[i] ** 0.5 for i in range(3))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"objects": [{"asset": "assets/nut", "region": "shelf"}]},
+         "objects[0].region: must be one of the regions, main, board, bin (got 'shelf')"),
+        ({"objects": [{"asset": "assets/nut", "region": []}]}, "objects[0].region: must name at least one region"),
+        ({"objects": [{"asset": "assets/nut", "region": "bin", "poses": [{"position": [0, 0, 1]}]}]},
+         "objects[0].region: must not be given together with poses"),
+        ({"objects": [{"asset": "assets/nut", "scale": 6}]},
+         "objects[0].asset: asset 'nut' must fit into region 'bin' of 0.14 x 0.14 m (it measures 0.12 x 0.18 m)"),
+        ({"regions": [{"name": "main", "min": [0, 0, 0], "max": [1, 1, 1]}]},
+         "regions[0].name: must be unique (got 'main' again)"),
+        ({"regions": [{"name": "a", "min": [0, 0, 0], "max": [1, 1, 1], "enclosure": {"floor": 2}}]},
+         "regions[0].enclosure.floor: must be below the region's top at 1 m (got 2)"),
+    ],
+)  # fmt: skip
+def test_wrong_regions_are_refused(shelf, write_scene, changes, sentence):
+    shelf["objects"] = [shelf["objects"][0]]
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        load_scene(write_scene({**shelf, **changes}))
+
+
+def test_a_region_above_nothing_is_told_before_work_begins(shelf, write_scene):
+    shelf["regions"][1] |= {"min": [0.9, 0.9, 0.02], "max": [1.1, 1.1, 0.2]}
+    found = [fault.text for fault in layout_faults(load_scene(write_scene(shelf)))]
+    assert found == ["regions[1]: nothing that collides is below it, so that all objects fall for ever"]
 
 
 def drop_layout(scene_data, write_scene, **changes):

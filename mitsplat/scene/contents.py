@@ -100,9 +100,6 @@ def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
     found: list[int] = []
     for position, (entry, count) in enumerate(zip(spec.objects, _counts(spec, layout), strict=True)):
         among = list(spec.regions_of(entry))
-        if len(among) == 1:
-            found += among * count
-            continue
         rng = random_stream(spec.seed, f"object region {position}", layout)
         found += [among[i] for i in rng.choice(len(among), count, p=areas[among] / areas[among].sum())]
     return tuple(found)

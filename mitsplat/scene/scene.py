@@ -24,10 +24,10 @@ from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import is_inside
 from mitsplat.image_lists import WILDCARDS, glob_below, image_names, names_below
+from mitsplat.primitives import make_primitives
 from mitsplat.scene.contents import Split, draw_environment, split_of
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import lights_at, written_out
-from mitsplat.scene.primitives import make_primitives
 from mitsplat.scene.spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
 from mitsplat.scene.spec_materials import ImageMaterial, Material
@@ -184,7 +184,8 @@ def _read_named(spec: SceneSpec, path: Path) -> _Named:
             environments.append(Asset.load(folder / name))
     for keys, name, entry in _object_assets(spec):
         if entry.pool == PRIMITIVES:
-            assets |= {} if name in assets else dict(zip(entry.names, make_primitives(spec.seed), strict=True))
+            streams = (random_stream(spec.seed, "primitive", number) for number in range(len(entry.names)))
+            assets |= {} if name in assets else dict(zip(entry.names, make_primitives(streams), strict=True))
         elif name not in assets:
             with _blaming(path, *keys):
                 assets[name] = Asset.load(folder / name)

@@ -42,7 +42,7 @@ class ObjectPose(StrictModel):
 
 
 PRIMITIVES = "primitives"
-"""The pool that needs no folder, see :mod:`mitsplat.scene.primitives`."""
+"""The pool that needs no folder, see :mod:`mitsplat.primitives`."""
 
 NUM_PRIMITIVES = 15
 

@@ -74,8 +74,7 @@ def _of_region(spec: SceneSpec, number: int) -> str:
 def walls_beside(spec: SceneSpec, number: int, names: Sequence[str], walls: Sequence[int]) -> list[int]:
     """Those of some walls, positions among ``names``, that no other region has of its own."""
     others = [f"{ENCLOSURE}{_of_region(spec, i)}" for i in range(len(spec.all_regions)) if i != number]
-    sides = ("-x", "+x", "-y", "+y", "lid")
-    foreign = {f"{other}{side}" for other in others for side in sides}
+    foreign = {f"{other}{side}" for other in others for side in ("-x", "+x", "-y", "+y", "lid")}
     return [position for position in walls if names[position] not in foreign]
 
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from mitsplat.scene.primitives import make_primitives
+from mitsplat.primitives import make_primitives
 from mitsplat.scene.scene import load_scene
+from mitsplat.scene.streams import random_stream
 from tests.conftest import WriteScene
 
 
 def test_primitives_are_solids_that_their_splats_cover() -> None:
-    primitives = make_primitives(7)
+    primitives = make_primitives(random_stream(7, "primitive", number) for number in range(15))
     assert len({asset.name for asset in primitives}) == 15
     assert sorted({asset.class_name for asset in primitives}) == ["box", "capsule", "cone", "cylinder", "sphere"]
     for asset in primitives:
@@ -32,7 +33,9 @@ def test_primitives_are_solids_that_their_splats_cover() -> None:
 
 
 def test_a_seed_decides_them() -> None:
-    first, again, other = (make_primitives(seed) for seed in (3, 3, 4))
+    first, again, other = (
+        make_primitives(random_stream(seed, "primitive", number) for number in range(15)) for seed in (3, 3, 4)
+    )
     for one, same in zip(first, again, strict=True):
         assert one.mesh is not None and same.mesh is not None
         assert (one.mesh.vertices == same.mesh.vertices).all()

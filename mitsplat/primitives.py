@@ -7,6 +7,7 @@ specular reflectance. Nothing is traced: uniform light shows what hides nothing 
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.scene.spec_objects import NUM_PRIMITIVES
-from mitsplat.scene.streams import random_stream
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.surfels import Surfels, place_surfels
 
@@ -27,9 +26,9 @@ _SURFELS = 1200
 _LINING = 0.97  # size of the second layer
 
 
-def make_primitives(seed: int) -> tuple[Asset, ...]:
-    """The primitives that a scene's seed decides, as many of each kind; they take a second or two."""
-    return tuple(_make(number, random_stream(seed, "primitive", number)) for number in range(NUM_PRIMITIVES))
+def make_primitives(streams: Iterable[np.random.Generator]) -> tuple[Asset, ...]:
+    """The primitives that random numbers decide, one each, the kinds in turn; 15 take a second or two."""
+    return tuple(_make(number, rng) for number, rng in enumerate(streams))
 
 
 def _make(number: int, rng: np.random.Generator) -> Asset:

@@ -34,8 +34,10 @@ _HOME = {
     "Splats": "splats",
     "bake_asset": "bake.bake",
     "load_scene": "scene.scene",
+    "make_scene": "scene.scene",
     "remake_frame": "dataset.remake",
     "render_frame": "frames.frame",
+    "render_frames": "frames.sequence",
     "render_splats": "render.layers",
     "settle_layout": "physics.settle",
     "use_device": "device",
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame as Frame
     from mitsplat.frames.frame import Renderer as Renderer
     from mitsplat.frames.frame import render_frame as render_frame
+    from mitsplat.frames.sequence import render_frames as render_frames
     from mitsplat.labels.labels import Labels as Labels
     from mitsplat.physics.settle import settle_layout as settle_layout
     from mitsplat.quality import Quality as Quality
@@ -63,6 +66,7 @@ if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout as Layout
     from mitsplat.scene.scene import Scene as Scene
     from mitsplat.scene.scene import load_scene as load_scene
+    from mitsplat.scene.scene import make_scene as make_scene
     from mitsplat.scene.spec import SceneSpec as SceneSpec
     from mitsplat.splats import Splats as Splats
 

@@ -117,10 +117,27 @@ def load_yaml(
     raise InputError(_sentence(path, first.line, first.path, first.rule))
 
 
+def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
+    """The sentence that tells of ``values`` that break a rule of a model, which Python code and no file gave."""
+    data = _as_written(values)
+    findings = [_finding(details, model, data, None, {}) for details in error.errors()]
+    first = min(findings, key=lambda finding: _follows(finding, findings))
+    return _sentence(Path(model.__name__), None, first.path, first.rule)
+
+
 def key_place(path: str | Path, keys: KeyPath) -> str:
-    """Where the file says ``keys``, as errors begin: ``scene.yaml:41: objects[2].asset``."""
+    """Where a file says ``keys``, as errors begin: ``scene.yaml:41: objects[2].asset``; no line if there is no file."""
     path = Path(path)
-    return _place(path, _line(_parse(path), keys), keys)
+    return _place(path, _line(_parse(path), keys) if path.exists() else None, keys)
+
+
+def _as_written(value: Any) -> Any:
+    """What a file would have said: mappings and lists, down to what is neither."""
+    if isinstance(value, BaseModel):
+        return _as_written(dict(value))
+    if isinstance(value, Mapping):
+        return {str(key): _as_written(inner) for key, inner in value.items()}
+    return [_as_written(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def _parse(path: Path) -> CommentedMap:
@@ -195,10 +212,10 @@ def _finding(
     details: ErrorDetails,
     model: type[BaseModel],
     data: dict[str, Any],
-    tree: CommentedMap,
+    tree: CommentedMap | None,
     overridden: Mapping[tuple[str, ...], Any],
 ) -> _Finding:
-    """Pydantic's account of one error in terms of the file."""
+    """Pydantic's account of one error in terms of the file, if there is one."""
     kind, context, location = details["type"], details.get("ctx", {}), details["loc"]
     keys = _file_path(location, data, keep_last=kind == "missing")
     value: Any = details["input"]
@@ -223,9 +240,8 @@ def _finding(
         rule = f"{rule.replace('Input should', 'must')} (got {_shown(value)})"
     overlaps = [min(len(keys), len(override)) for override in overridden]
     from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))
-    return _Finding(
-        keys, rule, _line(tree, keys) if from_file else None, kind == "missing" and isinstance(location[-1], str)
-    )
+    line = _line(tree, keys) if tree is not None and from_file else None
+    return _Finding(keys, rule, line, kind == "missing" and isinstance(location[-1], str))
 
 
 def _follows(finding: _Finding, findings: Sequence[_Finding]) -> bool:

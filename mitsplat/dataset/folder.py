@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from ruamel.yaml import YAML
+
 from mitsplat.dataset.contact_sheet import ContactSheet
 from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.dataset.manifest import Manifest, cut_torn_line
@@ -272,9 +274,17 @@ def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[s
         write_text(out / CONTENT, json.dumps(content, indent=1) + "\n")
     (out / "layouts").mkdir(exist_ok=True)
     if not (out / "scene" / scene_file.name).exists():
-        write_file(out / "scene" / scene_file.name, lambda temporary: shutil.copyfile(scene_file, temporary))
+        write_file(out / "scene" / scene_file.name, lambda temporary: _write_scene(scene_file, content, temporary))
     cut_torn_line(out / TIMINGS)
     cut_torn_line(out / RUNS)
+
+
+def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
+    """Keep the scene file as it was given; of a scene made in Python, one that says the same."""
+    if scene_file.exists():
+        shutil.copyfile(scene_file, path)
+    else:
+        YAML(typ="safe", pure=True).dump(content["scene"], path)
 
 
 def _remove_dataset(out: Path) -> None:

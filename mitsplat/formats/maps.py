@@ -15,7 +15,6 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float32Array
-from mitsplat.camera import Camera
 from mitsplat.files import storage_error
 from mitsplat.frames.depth_sensor import sensed_depth
 from mitsplat.labels.labels import Labels
@@ -27,9 +26,6 @@ if TYPE_CHECKING:
 
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
 """Millimetres per unit of a depth picture: the first by which the frame's farthest depth fits 16 bits."""
-
-UNKNOWN_FLOW = 1e10
-"""Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
 
 
 def write_instances(files: FrameFiles) -> None:
@@ -63,9 +59,7 @@ def write_normals(files: FrameFiles) -> None:
 
 def write_flow(files: FrameFiles) -> None:
     """Write the flow to the next view of the frame's layout, if there is one."""
-    frame = files.frame
-    if frame.plan.next_camera is not None:
-        flow = optical_flow(frame.depth, frame.camera, frame.plan.next_camera)
+    if (flow := files.frame.flow) is not None:
         files.add_bytes(f"flow/{files.name}.flo", encode_flow(flow))
 
 
@@ -197,24 +191,6 @@ def semantic_picture(labels: Labels, ids: npt.NDArray[np.integer[Any]], class_na
         x0, y0, x1, y1 = label.box
         picture[y0:y1, x0:x1][label.mask] = label.class_index + 1
     return picture
-
-
-def optical_flow(depth: npt.NDArray[np.floating[Any]], camera: Camera, following: Camera) -> Float32Array:
-    """Motion of every pixel to the next view of the same, still layout [px], (H, W, 2).
-
-    :data:`UNKNOWN_FLOW` where nothing is seen, or what is seen lies behind the next camera. Points that something hides
-    from the next camera have a flow like any other.
-    """
-    height, width = depth.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    z = np.asarray(depth, dtype=np.float64).reshape(-1, 1)
-    local = np.concatenate([camera.ray_slopes(pixels) * z, z], axis=1)
-    pose = camera.world_from_camera
-    moved, ahead = following.project(local @ pose[:3, :3].T + pose[:3, 3])
-    known = (z[:, 0] > 0) & (ahead > following.near)
-    flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
-    return flow.reshape(height, width, 2).astype(np.float32)
 
 
 def encode_flow(flow: Float32Array) -> bytes:

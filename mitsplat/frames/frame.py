@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -22,7 +22,9 @@ from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND, develop_layers, light_layers
+from mitsplat.frames.flow import motions_of, optical_flow
 from mitsplat.labels.labels import Labels, Truth, label_instances
+from mitsplat.labels.overlay import draw_labels
 from mitsplat.masks import Silhouette
 from mitsplat.physics.settle import settle_layout
 from mitsplat.plugins.device import plain_mesh
@@ -44,7 +46,7 @@ from mitsplat.scene.appearance import Appearance, draw_appearances
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
-from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
+from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.splats import Splats
 from mitsplat.variant import ensure_variant, one_at_a_time
 
@@ -75,6 +77,7 @@ class Frame(Deferred):
         order_error: Estimated error of the pixels' display-encoded colours that the order of blending leaves, before
             light: ``largest`` and ``mean``. None where the quality estimates none.
         appearances: What was drawn of the appearance of objects, by instance id.
+        next_layout: Where the objects lie in the image that follows, None if they stay.
     """
 
     plan: FramePlan
@@ -86,6 +89,7 @@ class Frame(Deferred):
     seconds: Mapping[str, float]
     order_error: Mapping[str, float] | None = None
     appearances: Mapping[int, Appearance] = field(default_factory=dict)
+    next_layout: Layout | None = None
 
     @property
     def index(self) -> int:
@@ -127,13 +131,34 @@ class Frame(Deferred):
         """Factor of light and shadow on the linear colour, (H, W, 3)."""
         return self.layers.light
 
+    @property
+    def flow(self) -> Float32Array | None:
+        """Motion of every pixel to the image that follows [px], (H, W, 2); None if none follows.
+
+        Components are 1e10 where it is unknown, see :func:`mitsplat.frames.flow.optical_flow`.
+        """
+        if self.plan.next_camera is None:
+            return None
+        motions = {} if self.next_layout is None else motions_of(self.layout, self.next_layout)
+        return optical_flow(self.depth, self.camera, self.plan.next_camera, self.instance if motions else None, motions)
+
     def _repr_png_(self) -> bytes:
-        _, data = cv2.imencode(".png", cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR))
+        """The image and, beside it, its labels drawn over it."""
+        sheet = np.hstack([self.image, draw_labels(self.image, self.labels)])
+        _, data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
         return bytes(data)
 
 
 def render_frame(
-    scene: Scene, index: int, *, quality: str | Quality | None = None, layout: Layout | None = None
+    scene: Scene,
+    index: int,
+    *,
+    quality: str | Quality | None = None,
+    layout: Layout | None = None,
+    camera: Camera | None = None,
+    lights: Sequence[LightEntry] | None = None,
+    next_layout: Layout | None = None,
+    next_camera: Camera | None = None,
 ) -> Frame:
     """Render and label one frame, by a :class:`Renderer` that is kept for the next one of the scene.
 
@@ -142,14 +167,22 @@ def render_frame(
         index: Frame index, below ``scene.num_frames``.
         quality: Preset of the splat renderer, which the scene file's ``rendering`` refines, or all its values; the
             preset of the scene file by default.
-        layout: The frame's settled layout; settled here when not given.
+        layout: The frame's settled layout, or one of your own (:meth:`mitsplat.Layout.of_poses`); settled here when not
+            given.
+        camera: In place of the scene's.
+        lights: Entries in place of the scene's, as in a scene file: models, or mappings of keys to values.
+        next_layout: Where the objects lie in the image that follows, for the flow; they stay when not given.
+        next_camera: Where that image is taken from; by default the scene's next view of the layout, or ``camera`` if
+            that is given and objects move.
 
     Raises:
-        InputError: If the index is out of range, or the layout cannot be settled.
+        InputError: If the index is out of range, the layout cannot be settled, or the lights break a rule.
     """
     layout_of(scene, index)  # a wrong index costs nothing
     ensure_variant()
-    return _kept_renderer(scene, quality, str(mi.variant())).render(index, layout=layout)
+    return _kept_renderer(scene, quality, str(mi.variant())).render(
+        index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
+    )
 
 
 @one_at_a_time
@@ -211,7 +244,16 @@ class Renderer:
         self._settled.clear()
 
     @one_at_a_time
-    def render(self, index: int, *, layout: Layout | None = None) -> Frame:
+    def render(
+        self,
+        index: int,
+        *,
+        layout: Layout | None = None,
+        camera: Camera | None = None,
+        lights: Sequence[LightEntry] | None = None,
+        next_layout: Layout | None = None,
+        next_camera: Camera | None = None,
+    ) -> Frame:
         """Render and label one frame; see :func:`render_frame`.
 
         Raises:
@@ -226,10 +268,18 @@ class Renderer:
             with _timed(seconds, "settle"):
                 layout = self._settle(layout_of(self.scene, index))
         with _timed(seconds, "place"):
-            plan = plan_frame(self.scene, index, layout)
+            plan = plan_frame(
+                self.scene,
+                index,
+                layout,
+                camera=camera,
+                next_layout=next_layout,
+                next_camera=next_camera,
+                lights=lights,
+            )
         with _timed(seconds, "place"):
             # Its few parts are made sooner than threads are woken.
-            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights), parallel=False)
+            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights, lights is not None), parallel=False)
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
@@ -249,7 +299,7 @@ class Renderer:
         made = {"plan": plan, "layout": layout, "layers": layers, "image": image, "labels": labels, "seconds": seconds}
         made["order_error"] = layers.order_error
         made["appearances"] = draw_appearances(self.scene, layout)
-        return Frame.later({"rgb": partial(host_array, linear, shape)}, **made)
+        return Frame.later({"rgb": partial(host_array, linear, shape)}, **made, next_layout=next_layout)
 
     def _settle(self, index: int) -> Layout:
         """A layout, kept for the next views of it."""
@@ -274,8 +324,11 @@ class Renderer:
             keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
         )
 
-    def describe(self, layout: Layout, lights: tuple[LightSpec, ...]) -> dict[str, Any]:
-        """Mitsuba's dictionary of a layout under some lights. Shapes stay the same objects while the layout does."""
+    def describe(self, layout: Layout, lights: tuple[LightSpec, ...], replaced: bool = False) -> dict[str, Any]:
+        """Mitsuba's dictionary of a layout under some lights. Shapes stay the same objects while the layout does.
+
+        No kernel is compiled when lights that are not the scene's, but ``replaced`` them, move.
+        """
         if self._placed is None or self._placed[0] is not layout:
             objects, appearances = {}, draw_appearances(self.scene, layout)
             for instance in layout.instances:
@@ -284,7 +337,7 @@ class Renderer:
                     asset, instance.world_from_object, instance.id, appearances.get(instance.id)
                 )
             self._placed = layout, objects
-        emitters = {f"light_{i}": self._made(self._emitter(light)) for i, light in enumerate(lights)}
+        emitters = {f"light_{i}": self._made(self._emitter(light), replaced) for i, light in enumerate(lights)}
         place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
         return {"type": "scene", **self._surroundings(place), **self._placed[1], **emitters}
 
@@ -293,13 +346,14 @@ class Renderer:
             light = light.model_copy(update={"image": str(self.scene.images[light.image])})
         return emitter_dict(light)
 
-    def _made(self, emitter: dict[str, Any]) -> Any:
+    def _made(self, emitter: dict[str, Any], replaced: bool) -> Any:
         """An emitter; that of the last image if it has the same one, for to read a large one takes longer than a frame.
 
         Lights that are drawn are made so that no kernel is compiled when they move.
         """
         if emitter["type"] != "envmap":
-            return movable(emitter) if any(light.draw for light in written_out(self.scene.spec)) else emitter
+            moves = replaced or any(light.draw for light in written_out(self.scene.spec))
+            return movable(emitter) if moves else emitter
         if self._sky is None or self._sky[0] != emitter["filename"]:
             self._sky = emitter["filename"], mi.load_dict(emitter)
         state = mi.traverse(self._sky[1])

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
+from mitsplat.errors import InputError
+from mitsplat.given_poses import asset_named, rigid_pose
+
+if TYPE_CHECKING:
+    from mitsplat.scene.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +96,44 @@ class Layout:
     index: int
     instances: tuple[Instance, ...]
     certificate: RestCertificate
+
+    @classmethod
+    def of_poses(
+        cls, scene: Scene, poses: Mapping[str | int, Sequence[npt.ArrayLike | None]], *, index: int = 0
+    ) -> Layout:
+        """A layout of objects at given poses, such as a simulator's, without physics: nothing has to rest.
+
+        Objects are numbered from 1 by asset, then by their place in the lists, whatever the mapping's order: those of
+        the same lists have the same ids from layout to layout of a sequence.
+
+        Args:
+            scene: The scene whose assets they are.
+            poses: For each asset a list of rigid transforms ``world_from_object`` [m], (4, 4) each, one an object; None
+                for an object that is not there, whose id stays free. An asset is named by its name or its path in the
+                scene file, or by its position in ``scene.assets`` where it has several sizes or classes.
+            index: Of the layout, by which its surroundings and the looks of objects are drawn: one for all of a film.
+
+        Raises:
+            InputError: If a name is not one asset's, or a matrix is no rotation and translation.
+        """
+        paths = [path for entry in scene.spec.objects for path in entry.names for _ in entry.scales]
+        names = [(asset.name, path) for asset, path in zip(scene.assets, paths, strict=True)]
+        lists: dict[int, Sequence[npt.ArrayLike | None]] = {}
+        for name, given in poses.items():
+            asset = asset_named(name, names)
+            if asset in lists:
+                raise InputError(f"poses[{name!r}]: must not be an asset that has poses already (it is asset {asset})")
+            lists[asset] = [
+                None if pose is None else rigid_pose(pose, f"poses[{name!r}][{number}]")
+                for number, pose in enumerate(given)
+            ]
+        listed = [(asset, pose) for asset in sorted(lists) for pose in lists[asset]]
+        instances = tuple(
+            Instance(number, asset, scene.class_index(asset), np.asarray(pose))
+            for number, (asset, pose) in enumerate(listed, start=1)
+            if pose is not None
+        )
+        return cls(index, instances, NOTHING_TO_REST)
 
     def to_json(self) -> dict[str, Any]:
         """The layout as JSON values; floats survive the round trip exactly."""

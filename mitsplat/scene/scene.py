@@ -29,12 +29,12 @@ from mitsplat.scene.contents import Split, draw_environment, split_of
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import lights_at, written_out
 from mitsplat.scene.spec import SCHEMA_VERSION, SceneSpec
-from mitsplat.scene.spec_lights import EnvironmentLight, LightSpec
+from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.scene.spec_materials import ImageMaterial, Material
 from mitsplat.scene.spec_objects import MAIN, PRIMITIVES, ObjectSpec
 from mitsplat.scene.spec_shapes import Region, Shape
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.viewpoints import camera_at, view_of
+from mitsplat.scene.viewpoints import View, camera_at, view_of
 from mitsplat.scene.walls import backdrop_shapes, bin_walls, enclosure_walls, stated_pose
 from mitsplat.untrusted_images import IMAGES, check_images
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
@@ -48,6 +48,9 @@ _DRAWN = (
 _MOST_IMAGES = 500
 """Tried in one process, which is given their names as arguments."""
 
+_MADE_IN_PYTHON = "<python>.yaml"
+"""Name of the scene file that a scene made in Python has not: errors begin with it, datasets keep such a file."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -56,7 +59,7 @@ class Scene:
     Attributes:
         spec: What the file says, its enclosure written out as shapes, rooms as lights, and patterns of pools as what
             they match.
-        path: The scene file.
+        path: The scene file; of a scene that was made in Python, one that does not exist, in its folder.
         environments: The surroundings, of which each layout has one; empty if there are none.
         assets: Assets of each entry of ``spec.objects`` in turn, in each of its scales, with its class name.
         shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
@@ -137,7 +140,25 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     """
     path = Path(path)
     refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
-    spec = load_yaml(path, SceneSpec, overrides=overrides)
+    return _scene_of(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
+
+
+def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
+    """A scene of a specification that was made in Python; no file is read but what it names.
+
+    Args:
+        spec: The scene, as ``ms.SceneSpec(name=..., region={"min": ...}, ...)`` makes it: its keys are those of scene
+            files, and a mapping stands for each part that is not made of its own model. It may name files anywhere.
+        folder: What its paths are relative to [the working directory].
+
+    Raises:
+        InputError: If something that it names is missing or breaks a rule.
+    """
+    return _scene_of(spec, Path(folder) / _MADE_IN_PYTHON, allow_outside=True)
+
+
+def _scene_of(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
+    """The scene of what a file says, or of what stands for one."""
     if not allow_outside:
         _confine(spec, path)
     spec = _matched(spec, path, allow_outside=allow_outside)
@@ -475,30 +496,53 @@ def layout_of(scene: Scene, index: int) -> int:
     return index // scene.spec.output.views
 
 
-def plan_frame(scene: Scene, index: int, layout: Layout | None = None) -> FramePlan:
+def plan_frame(
+    scene: Scene,
+    index: int,
+    layout: Layout | None = None,
+    *,
+    camera: Camera | None = None,
+    next_layout: Layout | None = None,
+    next_camera: Camera | None = None,
+    lights: Sequence[LightEntry] | None = None,
+) -> FramePlan:
     """The plan of frame ``index``, from the seed and the index alone, which decide its layout as well.
 
     Args:
         scene: The scene.
         index: Index of the frame.
         layout: Where its objects lie. Without it, cameras that are chosen by what lies there are ones that may be.
+        camera: In place of the scene's; nothing is then drawn or chosen of it.
+        next_layout: Where its objects lie in the next image, if they move.
+        next_camera: Where the next image is taken from. Without it that is the scene's next view of the layout, or
+            ``camera`` if that is given and objects move.
+        lights: Entries in place of the scene's, drawn and moved as those would be.
 
     Raises:
-        InputError: If there is no such frame, or none of its views is as the scene file says that they must be.
+        InputError: If there is no such frame, none of its views is as the scene file says that they must be, or the
+            lights break a rule.
     """
     index = whole(index, "frame")
     spec, number = scene.spec, layout_of(scene, index)
+    if lights is not None:
+        spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # by which they are checked
+        if unknown := {name for _, name in _light_images(spec)} - set(scene.images):
+            raise InputError(f"images of lights must be among those of the scene's own (got {min(unknown)!r})")
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
-    here = view_of(scene, index, layout)
+    here = view_of(scene, index, layout) if camera is None else View(camera)
+    if next_camera is None and camera is not None:
+        next_camera = None if next_layout is None else camera
+    elif next_camera is None and view + 1 < spec.output.views:
+        next_camera = view_of(scene, index + 1, layout if next_layout is None else next_layout).camera
     return FramePlan(
         index=index,
         layout=number,
         view=view,
         split=split_of(number, spec.output.validation, spec.output.test),
         camera=here.camera,
-        next_camera=view_of(scene, index + 1, layout).camera if view + 1 < spec.output.views else None,
+        next_camera=next_camera,
         lights=lights_at(spec, number, index, time),
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))

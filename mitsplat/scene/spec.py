@@ -16,7 +16,7 @@ from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec_materials import Background
 from mitsplat.scene.spec_objects import MAIN, Arrangement, ObjectSpec, Settle
 from mitsplat.scene.spec_shapes import Backdrop, Enclosure, NamedRegion, Region, Shape
-from mitsplat.scene.spec_types import Positive, StrictModel, Unit
+from mitsplat.spec_types import Positive, StrictModel, Unit
 from mitsplat.yaml_input import FieldError
 
 BACKDROP = "backdrop "

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, NonNegativeFloat, model_validator
 
 from mitsplat.camera import Lens
-from mitsplat.scene.spec_types import Elevation, Positive, PositiveRange, Range, StrictModel, Unit, Vec3, ordered
+from mitsplat.spec_types import Elevation, Positive, PositiveRange, Range, StrictModel, Unit, Vec3, ordered
 from mitsplat.yaml_input import FieldError
 
 

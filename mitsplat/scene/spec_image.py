@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, NonNegativeFloat
 
 from mitsplat.quality import KernelName, ResponseName
-from mitsplat.scene.spec_types import (
+from mitsplat.spec_types import (
     JpegQuality,
     Kelvin,
     NonNegativeRange,

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mitsplat.scene.spec_types import (
+from mitsplat.spec_types import (
     CountRange,
     ElevationRange,
     EmittedColour,

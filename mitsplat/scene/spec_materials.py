@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from mitsplat.scene.spec_types import PositiveRange, Range, StrictModel, Unit, ordered
+from mitsplat.spec_types import PositiveRange, Range, StrictModel, Unit, ordered
 
 UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
 Share = Annotated[float, Field(gt=0, le=1)]

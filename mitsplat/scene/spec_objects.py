@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from mitsplat.scene.spec_types import (
+from mitsplat.spec_types import (
     CountRange,
     Positive,
     Scale,

@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeFloat, model_validator
 
 from mitsplat.scene.spec_materials import ColourMaterial, Material, NoiseMaterial
 from mitsplat.scene.spec_objects import Arrangement
-from mitsplat.scene.spec_types import Positive, StrictModel, Unit, Vec3
+from mitsplat.spec_types import Positive, StrictModel, Unit, Vec3
 from mitsplat.yaml_input import FieldError
 
 

@@ -13,7 +13,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.scene.spec import BACKDROP, SceneSpec
 from mitsplat.scene.spec_objects import ObjectPose
 from mitsplat.scene.spec_shapes import Backdrop, Bin, Box, Enclosure, Region, Shape
-from mitsplat.scene.spec_types import Vec3
+from mitsplat.spec_types import Vec3
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset

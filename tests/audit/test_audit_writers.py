@@ -22,6 +22,7 @@ from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.formats import bop, coco, colmap, label_studio, maps, voc, yolo
 from mitsplat.formats import registry as writers
+from mitsplat.frames import frame
 from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec import FORMATS
@@ -397,7 +398,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "flow: backwards": (
         "depth flow",
-        changing(maps, "optical_flow", lambda made, *args: -made),
+        changing(frame, "optical_flow", lambda made, *args: -made),
         "flow/train/000000.flo",
         "do not move",
     ),

@@ -26,6 +26,7 @@ from mitsplat.files import Record
 from mitsplat.formats import coco, maps, voc
 from mitsplat.formats.registry import Catalogue, write_collection, write_frame
 from mitsplat.formats.yolo import rotated_box
+from mitsplat.frames.flow import optical_flow
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.masks import Silhouette
@@ -519,7 +520,7 @@ class TestMaps:
             np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
     def test_flow_is_unknown_where_nothing_is(self) -> None:
-        flow = maps.optical_flow(np.array([[0.0, 1.0]]), CAMERA.resized(2, 1), CAMERA.resized(2, 1))
+        flow = optical_flow(np.array([[0.0, 1.0]]), CAMERA.resized(2, 1), CAMERA.resized(2, 1))
         assert (np.abs(flow[0, 0]) > 1e9).all()
         np.testing.assert_allclose(flow[0, 1], 0, atol=1e-5)
 

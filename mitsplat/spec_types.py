@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, ValidationError
 
-from mitsplat.yaml_input import FieldError
+from mitsplat.errors import InputError
+from mitsplat.yaml_input import FieldError, sentence_of_model
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
 
 Vector = TypeVar("Vector", bound=tuple[float, ...])
 
 
-class StrictModel(BaseModel):
+class _TellsInOneSentence(ModelMetaclass):
+    """Values that a model is made of in Python are refused in the words that a file's would be."""
+
+    if not TYPE_CHECKING:  # editors complete the keys of models that their fields declare
+
+        def __call__(cls, **values: Any) -> Any:
+            try:
+                return super().__call__(**values)
+            except ValidationError as error:
+                raise InputError(sentence_of_model(error, cls, values)) from None
+
+
+class StrictModel(BaseModel, metaclass=_TellsInOneSentence):
     """Immutable, without unknown keys, infinities or NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -1,0 +1,68 @@
+"""Optical flow: where what a pixel shows is in the next image, if the camera moves, and objects do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.scene.layout import Layout
+
+UNKNOWN_FLOW = 1e10
+"""Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
+
+
+def optical_flow(
+    depth: npt.NDArray[np.floating[Any]],
+    camera: Camera,
+    following: Camera,
+    ids: npt.NDArray[np.integer[Any]] | None = None,
+    motions: Mapping[int, Float64Array | None] | None = None,
+) -> Float32Array:
+    """Motion of every pixel to the next image [px], (H, W, 2).
+
+    :data:`UNKNOWN_FLOW` where nothing is seen, or what is seen lies behind the next camera or is gone. Points that
+    something hides from the next camera have a flow like any other.
+
+    Args:
+        depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
+        camera: Where it is seen from.
+        following: Where the next image is taken from.
+        ids: Instance of every pixel, (H, W); needed where objects move.
+        motions: Of each instance that moves, the transform (4, 4) of the world that takes it to its place in the next
+            image; None if it is not there any more. What is not named stays where it is.
+    """
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    z = np.asarray(depth, dtype=np.float64).reshape(-1, 1)
+    known = z[:, 0] > 0
+    pose = camera.world_from_camera
+    points = np.concatenate([camera.ray_slopes(pixels) * z, z], axis=1) @ pose[:3, :3].T + pose[:3, 3]
+    for instance, motion in (motions or {}).items():
+        shown = np.ravel(ids == instance)
+        if motion is None:
+            known &= ~shown
+        else:
+            points[shown] = points[shown] @ motion[:3, :3].T + motion[:3, 3]
+    moved, ahead = following.project(points)
+    known &= ahead > following.near
+    flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
+    return flow.reshape(height, width, 2).astype(np.float32)
+
+
+def motions_of(before: Layout, after: Layout) -> dict[int, Float64Array | None]:
+    """What becomes of the instances of a layout in the next one: for :func:`optical_flow`."""
+    found: dict[int, Float64Array | None] = {}
+    there = {instance.id: instance.world_from_object for instance in after.instances}
+    for instance in before.instances:
+        pose, following = instance.world_from_object, there.get(instance.id)
+        if following is None:
+            found[instance.id] = None
+        elif not np.array_equal(pose, following):
+            found[instance.id] = following @ np.linalg.inv(pose)
+    return found

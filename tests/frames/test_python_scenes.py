@@ -1,0 +1,288 @@
+"""Scenes, layouts and cameras that Python code gives in place of files and physics, and the films made of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mitsplat as ms
+from mitsplat.dataset.write import write_dataset
+from mitsplat.frames.flow import UNKNOWN_FLOW, motions_of, optical_flow
+from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.spec_camera import CameraOrbit
+from mitsplat.scene.spec_lights import AreaLight
+from mitsplat.scene.spec_shapes import Shape
+from mitsplat.splats import Splats
+from tests.conftest import WriteScene, box_asset
+from tests.drawn import render_boxes, scatter_boxes
+
+
+def moved(x: float, y: float, z: float = 0.0, turn: float = 0.0) -> np.ndarray:
+    """A pose at a place [m], turned about z [degrees]."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+@pytest.fixture
+def scene(write_scene: WriteScene, scene_data: dict[str, Any], tmp_path: Path) -> ms.Scene:
+    """The small scene, made in Python next to its assets, of which the nut has a top that nothing shows through."""
+    nut = box_asset("nut", (0.04, 0.03, 0.01))
+    x, y = np.meshgrid(np.linspace(-0.018, 0.018, 10), np.linspace(-0.013, 0.013, 8))
+    top = Splats(
+        means=np.column_stack([x.ravel(), y.ravel(), np.full(80, 0.005)]).astype(np.float32),
+        quats=np.tile(np.float32([0, 0, 0, 1]), (80, 1)),
+        scales=np.tile(np.float32([0.003, 0.003, 1e-4]), (80, 1)),
+        opacities=np.full(80, 0.9, dtype=np.float32),
+        sh=np.zeros((80, 1, 3), dtype=np.float32),
+    )
+    replace(nut, splats=top).save(tmp_path / "assets/nut")
+    write_scene(scene_data)
+    camera = CameraOrbit(kind="orbit", target=(0, 0, 0), radius=0.25, height=0.25)
+    return ms.make_scene(ms.SceneSpec(**scene_data | {"camera": camera}), tmp_path)
+
+
+@pytest.fixture
+def above() -> ms.Camera:
+    """A camera 0.2 m above the table that looks down, its x to the world's and its y against it."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 0.2
+    return ms.Camera(64, 48, 160.0, 160.0, 32.0, 24.0, pose)
+
+
+# Scenes
+
+
+def test_a_scene_made_in_python_is_that_of_the_file(
+    write_scene: WriteScene, scene_data: dict[str, Any], tmp_path: Path
+) -> None:
+    read, made = load_scene(write_scene(scene_data)), ms.make_scene(ms.SceneSpec(**scene_data), tmp_path)
+    assert made.spec == read.spec
+    assert made.class_names == read.class_names
+    assert [asset.name for asset in made.assets] == [asset.name for asset in read.assets]
+    assert (
+        plan_frame(made, 5).camera.world_from_camera.tolist() == plan_frame(read, 5).camera.world_from_camera.tolist()
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"regoin": 1}, "SceneSpec: regoin: is not a known key (did you mean 'region'?)"),
+        ({"seed": -1}, "SceneSpec: seed: must be >= 0 (got -1)"),
+        ({"camera": {"kind": "drone"}}, "SceneSpec: camera.kind: must be one of 'path', 'orbit', 'hemisphere'"),
+        ({"objects": [{"asset": "assets/nut", "count": [3, 2]}]}, "SceneSpec: objects[0].count: must be [low, high]"),
+        (
+            {"shapes": (Shape(name="a", mesh="a.ply"), {"name": "b", "bxo": 1})},
+            "SceneSpec: shapes[1].bxo: is not a known",
+        ),
+    ],
+)
+def test_a_wrong_specification_is_one_sentence_with_its_key(
+    scene_data: dict[str, Any], change: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ms.InputError) as caught:
+        ms.SceneSpec(**scene_data | change)
+    assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
+
+
+def test_parts_of_a_specification_speak_for_themselves() -> None:
+    with pytest.raises(ms.InputError, match=r"^CameraOrbit: radius: must be > 0 \(got -1\)$"):
+        CameraOrbit(kind="orbit", target=(0, 0, 0), radius=-1, height=0.4)
+
+
+def test_what_a_scene_made_in_python_names_must_be_there(scene_data: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(ms.InputError, match=r"<python>\.yaml: objects\[0\]\.asset: .*assets/nut") as caught:
+        ms.make_scene(ms.SceneSpec(**scene_data), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_dataset_of_a_scene_made_in_python_keeps_a_file_that_makes_the_same(
+    scene_data: dict[str, Any], tmp_path: Path
+) -> None:
+    for size, name in (((0.12, 0.16, 0.08), "nut"), ((0.06, 0.07, 0.25), "bolt")):
+        box_asset(name, size).save(tmp_path / "assets" / name)
+    spec = ms.SceneSpec(**scene_data | {"enclosure": {"floor": -0.01}})
+    scene = ms.make_scene(spec, tmp_path)
+    write_dataset(scene, tmp_path / "out", frames=4, render=render_boxes, settle=scatter_boxes)
+    kept = tmp_path / "out/scene/<python>.yaml"
+    (tmp_path / "again.yaml").write_bytes(kept.read_bytes())
+    again = load_scene(tmp_path / "again.yaml", overrides={"output.layouts": scene.spec.output.layouts})
+    assert again.spec == scene.spec
+
+
+# Layouts
+
+
+def test_poses_make_a_layout_whose_ids_do_not_depend_on_their_order(scene: ms.Scene) -> None:
+    poses = [moved(0.1 * n, 0, turn=30 * n) for n in range(3)]
+    layout = ms.Layout.of_poses(scene, {"bolt": [poses[2]], "assets/nut": poses[:2]}, index=4)
+    other = ms.Layout.of_poses(scene, {0: np.array(poses[:2], dtype=np.float32), "bolt": poses[2:]})
+    assert [(one.id, one.asset, one.class_index) for one in layout.instances] == [(1, 0, 1), (2, 0, 1), (3, 1, 0)]
+    assert scene.class_names == ("bolt", "nut") and layout.index == 4
+    for one, same, pose in zip(layout.instances, other.instances, poses, strict=True):
+        np.testing.assert_array_equal(one.world_from_object, pose)
+        assert (one.id, one.asset) == (same.id, same.asset)
+        np.testing.assert_allclose(same.world_from_object, pose, atol=1e-7)
+    assert ms.Layout.from_json(layout.to_json()).to_json() == layout.to_json()
+
+
+def test_an_object_that_is_not_there_leaves_its_id_free(scene: ms.Scene) -> None:
+    layout = ms.Layout.of_poses(scene, {"nut": [None, moved(0, 0)], "bolt": [moved(0.1, 0)]})
+    assert [one.id for one in layout.instances] == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("poses", "sentence"),
+    [
+        ({"screw": [np.eye(4)]}, r"poses\['screw'\]: must be an asset of the scene \(bolt, nut\)"),
+        ({7: [np.eye(4)]}, r"poses\[7\]: must be an asset of the scene"),
+        ({"nut": [np.eye(4)], 0: [np.eye(4)]}, r"poses\[0\]: must not be an asset that has poses already"),
+        ({"nut": [np.eye(4), 2 * np.eye(4)]}, r"poses\['nut'\]\[1\]: must have the last row 0, 0, 0, 1"),
+        ({"nut": [np.diag([1, 1, 1.1, 1])]}, r"without scale or mirror \(got axes of lengths 1, 1, 1.1\)"),
+        ({"nut": [np.diag([1, 1, -1, 1])]}, r"\(got axes of a left-handed frame of lengths 1, 1, 1\)"),
+        ({"nut": [moved(0.1, 0).T]}, "is it transposed"),
+        ({"nut": np.eye(4)}, r"poses\['nut'\]\[0\]: must be a finite 4x4 matrix .* \(got an array of shape \(4,\)\)"),
+        ({"nut": [moved(math.nan, 0)]}, "must be a finite 4x4 matrix"),
+        ({"nut": ["here"]}, r"must be a finite 4x4 matrix world_from_object \(got 'here'\)"),
+    ],
+)
+def test_wrong_poses_are_one_sentence(scene: ms.Scene, poses: Any, sentence: str) -> None:
+    with pytest.raises(ms.InputError, match=sentence):
+        ms.Layout.of_poses(scene, poses)
+
+
+def test_an_asset_of_several_sizes_is_named_by_its_number(scene: ms.Scene) -> None:
+    twice = replace(scene, assets=(scene.assets[0], replace(scene.assets[1], name="nut")))
+    with pytest.raises(ms.InputError, match=r"must name one asset \(it names 2 of scene.assets: .* 0, 1\)"):
+        ms.Layout.of_poses(twice, {"nut": [np.eye(4)]})
+    assert ms.Layout.of_poses(twice, {1: [np.eye(4)]}).instances[0].asset == 1
+
+
+# Flow
+
+
+def test_flow_of_a_plane_that_turns_and_shifts_before_a_still_camera(scene: ms.Scene, above: ms.Camera) -> None:
+    """Seen from above, a turn of the world by a about z is one of the picture by -a about the foot of the axis."""
+    depth = np.full((48, 64), 0.2)
+    ids = np.zeros((48, 64), dtype=np.uint16)
+    ids[:, 32:] = 1
+    before = ms.Layout.of_poses(scene, {"nut": [moved(0.05, 0.02, turn=10)], "bolt": [moved(-0.1, 0)]})
+    after = ms.Layout.of_poses(scene, {"nut": [moved(0.07, 0.01, turn=40)], "bolt": [moved(-0.1, 0)]})
+    motions = motions_of(before, after)
+    assert set(motions) == {1}
+    flow = optical_flow(depth, above, above, ids, motions)
+    np.testing.assert_allclose(flow[:, :32], 0, atol=1e-5)
+    scale = 160.0 / 0.2  # px per metre in the plane
+    x, y = np.meshgrid(np.arange(32, 64) + 0.5, np.arange(48) + 0.5)
+    for part, expected in zip(np.moveaxis(flow[:, 32:], -1, 0), turned(x, y, scale), strict=True):
+        np.testing.assert_allclose(part, expected, atol=1e-4)
+
+
+def turned(x: np.ndarray, y: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Flow of the object above: by 30 degrees about its place (0.05, 0.02), which goes to (0.07, 0.01)."""
+    right, up = (x - 32) / scale - 0.05, (24 - y) / scale - 0.02
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    goes = c * right - s * up + 0.07, s * right + c * up + 0.01
+    return scale * goes[0] + 32 - x, 24 - scale * goes[1] - y
+
+
+def test_flow_of_what_is_gone_is_unknown(scene: ms.Scene, above: ms.Camera) -> None:
+    before = ms.Layout.of_poses(scene, {"nut": [moved(0, 0), moved(0.1, 0)]})
+    after = ms.Layout.of_poses(scene, {"nut": [None, moved(0.1, 0)]})
+    ids = np.array([[1, 2, 0]])
+    flow = optical_flow(np.full((1, 3), 0.2), above, above, ids, motions_of(before, after))
+    assert (flow[0, 0] == np.float32(UNKNOWN_FLOW)).all()
+    np.testing.assert_allclose(flow[0, 1:], 0, atol=1e-5)
+
+
+# Frames
+
+
+def test_a_film_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: ms.Camera) -> None:
+    """A nut that slides by 5 mm below the camera: f 0.005 / depth px, 0.19 m at its top, and the table stays."""
+    steps = [{"nut": [moved(0.005 * n - 0.005, 0, 0.005)], "bolt": [moved(0.03, 0.02, 0.025)]} for n in range(3)]
+    layouts = (ms.Layout.of_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # as a simulator gives them
+    film = list(ms.render_frames(scene, layouts=layouts, cameras=above, quality="fast"))
+    assert [frame.index for frame in film] == [0, 1, 2]
+    assert film[-1].flow is None
+    for frame in film[:-1]:
+        flow, nut = frame.flow, frame.instance == 1
+        assert flow is not None and nut.sum() > 300
+        np.testing.assert_allclose(flow[nut, 0], 160 * 0.005 / frame.depth[nut], rtol=1e-5)
+        np.testing.assert_allclose(np.median(frame.depth[nut]), 0.19, atol=1e-3)
+        np.testing.assert_allclose(flow[nut, 1], 0, atol=1e-5)
+        np.testing.assert_allclose(flow[~nut & (frame.depth > 0)], 0, atol=1e-4)
+    assert np.array_equal(film[1].camera.world_from_camera, above.world_from_camera)
+    x = [np.flatnonzero((frame.instance == 1).any(axis=0)).mean() for frame in film]
+    np.testing.assert_allclose(np.diff(x), 160 * 0.005 / 0.19, atol=0.5)  # of whole pixels
+
+
+def test_frames_of_a_scene_are_those_alone_and_go_on(scene: ms.Scene) -> None:
+    """Beyond the scene's 12 frames as well; and a frame is the same in whichever order it is rendered."""
+    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    alone = ms.render_frame(scene, 5, layout=layout, quality="fast")
+    shown = {frame.index: frame for frame in ms.render_frames(scene, [70, 5], layouts=layout, quality="fast")}
+    assert list(shown) == [70, 5]
+    assert shown[5].image.tobytes() == alone.image.tobytes()
+    assert shown[5].camera.world_from_camera.tolist() == alone.camera.world_from_camera.tolist()
+    endless = ms.render_frames(scene, itertools.count(11), layouts=itertools.repeat(layout), quality="fast")
+    assert [frame.index for frame in itertools.islice(endless, 3)] == [11, 12, 13]
+
+
+def test_settled_frames_are_those_of_the_scene(
+    scene: ms.Scene, monkeypatch: pytest.MonkeyPatch, above: ms.Camera
+) -> None:
+    """Without a layout of one's own, each is settled once, and flow does not lead from one to the next."""
+    asked = []
+
+    def settle(scene: ms.Scene, index: int) -> ms.Layout:
+        asked.append(index)
+        return ms.Layout.of_poses(scene, {"nut": [moved(0.01 * index, 0, 0.005)]}, index=index)
+
+    monkeypatch.setattr("mitsplat.frames.frame.settle_layout", settle)
+    frames = list(ms.render_frames(scene, 5, quality="fast"))
+    assert [frame.layout.index for frame in frames] == [0, 0, 0, 0, 1] and asked == [0, 1]
+    assert [frame.flow is None for frame in frames] == [False, False, False, True, False]
+    film = list(ms.render_frames(scene, 5, cameras=above, quality="fast"))
+    assert [frame.flow is None for frame in film] == [False, False, False, True, True]
+
+
+def test_lights_in_place_of_the_scenes(scene: ms.Scene) -> None:
+    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+
+    def lit(lights: Sequence[Any] | None) -> ms.Frame:
+        return ms.render_frame(scene, 0, layout=layout, quality="fast", lights=lights)
+
+    red = AreaLight(position=(0.5, 0, 1), colour=(1.0, 0.0, 0.0))
+    one, other = lit([red]), lit([{"kind": "area", "position": [0.5, 0, 1], "colour": [1, 0, 0]}])
+    table = one.rgb[one.proxy_instance == 0]
+    assert len(table) > 1000 and np.median(table[:, 0]) > 0.05 and not table[:, 1:].any()
+    assert other.plan.lights == one.plan.lights == (red,)
+    assert other.image.tobytes() == one.image.tobytes()
+    assert lit(scene.spec.lights).image.tobytes() == lit(None).image.tobytes()
+    with pytest.raises(ms.InputError, match=r"^SceneSpec: lights\[0\].radiance: must be "):
+        lit([{"kind": "area", "position": [0.5, 0, 1], "radiance": -4.0}])
+    with pytest.raises(ms.InputError, match="images of lights must be among those"):
+        lit([{"kind": "environment", "image": "sky.exr"}])
+
+
+def test_a_frame_shows_its_image_and_its_labels_side_by_side(scene: ms.Scene, above: ms.Camera) -> None:
+    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    frame = ms.render_frame(scene, 0, layout=layout, camera=above, quality="fast")
+    shown = cv2.imdecode(np.frombuffer(frame._repr_png_(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert shown.shape == (48, 128, 3)
+    assert np.array_equal(shown[:, :64], frame.image)
+    (label,) = frame.labels.instances
+    x0, y0, _, _ = label.box
+    assert (shown[:, 64:][y0, x0] != frame.image[y0, x0]).any()

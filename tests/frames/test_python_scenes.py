@@ -286,3 +286,16 @@ def test_a_frame_shows_its_image_and_its_labels_side_by_side(scene: ms.Scene, ab
     (label,) = frame.labels.instances
     x0, y0, _, _ = label.box
     assert (shown[:, 64:][y0, x0] != frame.image[y0, x0]).any()
+
+
+def test_the_example_of_the_documentation_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a clone, as it stands there."""
+    root = Path(__file__).parents[2]
+    (code,) = (
+        part for part in (root / "docs/api.md").read_text().split("```") if "of_poses" in part and "import" in part
+    )
+    monkeypatch.chdir(root)
+    names: dict[str, Any] = {}
+    exec(code.removeprefix("python\n"), names)
+    assert names["frame"].index == 2 and names["frame"].flow is None
+    assert [label.class_name for label in names["frame"].labels.instances] == ["washer"]

@@ -37,6 +37,7 @@ def _sections(root: Schema, model: Schema, path: str) -> Iterator[tuple[str, Sch
     yield path, model
     seen = set()
     for name, key in model.get("properties", {}).items():
+        key = _present(key)
         inside = _joined(re.sub(r" .*", "", path), name) + ("[]" if _item(key) is not key else "")
         kinds = [_resolved(root, kind) for kind in _item(key).get("oneOf", ())]
         if kinds and _shown_at(root, _item(key), inside) != inside:
@@ -54,7 +55,7 @@ def _sections(root: Schema, model: Schema, path: str) -> Iterator[tuple[str, Sch
 def _shown_at(root: Schema, key: Schema, path: str) -> str:
     """The first key of the file that holds the same kinds of mappings as another, where they are described."""
     for name, other in root["properties"].items():
-        if _item(other).get("oneOf") == key["oneOf"]:
+        if _item(_present(other)).get("oneOf") == key["oneOf"]:
             return name + ("[]" if _item(other) is not other else "")
     return path
 
@@ -64,6 +65,7 @@ def _section(root: Schema, path: str, model: Schema, pictures: dict[str, list[Pi
     title = f"`{where}` of kind `{kind}`" if kind else f"`{where}`" if where else "The file"
     keys = []
     for name, key in sorted(model["properties"].items(), key=lambda item: item[0] != "kind"):
+        key = _present(key)
         full = _joined(where, name)
         anchor = _anchor(_joined(f"{where}.{kind}" if kind else where, name))
         shown = [_type_of(root, _item(key), full + ("[]" if _item(key) is not key else ""))]
@@ -92,6 +94,12 @@ def _gallery(pictures: list[Picture]) -> str:
         lines[-1] += f"(pictures/scene/{picture.file.name})"
         lines += ["", "```yaml", *fragment.splitlines(), "```", "::::"]
     return _indented("\n".join([*lines, ":::::"]))
+
+
+def _present(key: Schema) -> Schema:
+    """A key that may be absent as one that is there, where it holds mappings of several kinds."""
+    kinds = [choice for choice in key.get("anyOf", ()) if "oneOf" in choice]
+    return {**{name: value for name, value in key.items() if name != "anyOf"}, **kinds[0]} if kinds else key
 
 
 def _item(key: Schema) -> Schema:

@@ -74,7 +74,14 @@ def test_it_is_seen_where_nothing_is_and_changes_no_label(
     frame = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
     empty = frame.layers.alpha == 0
     assert 0.1 < empty.mean() < 0.9
-    np.testing.assert_allclose(frame.rgb[empty], np.tile([0.5 * decode_srgb(200 / 255), 0, 0], (empty.sum(), 1)), 1e-5)
-    np.testing.assert_array_equal(frame.image[~empty], plain.image[~empty])
-    for name in ("depth", "instance", "normal", "proxy_depth"):
+    red = np.array([0.5 * decode_srgb(200 / 255), 0, 0])
+    np.testing.assert_allclose(frame.rgb[empty], np.tile(red, (empty.sum(), 1)), 1e-5)
+    full = frame.layers.alpha == 1
+    assert 0.1 < full.mean() < 0.9
+    np.testing.assert_array_equal(frame.image[full], plain.image[full])
+    border = ~empty & ~full  # of antialiased silhouettes, where some of a pixel's rays meet nothing
+    assert 0 < border.mean() < 0.1
+    through = 1 - frame.layers.alpha[border][:, None]
+    np.testing.assert_allclose(frame.rgb[border], frame.layers.rgb[border] + through * red, atol=1e-6)
+    for name in ("rgb", "alpha", "depth", "instance", "normal", "proxy_depth"):
         np.testing.assert_array_equal(getattr(frame.layers, name), getattr(plain.layers, name))

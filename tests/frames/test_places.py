@@ -103,6 +103,7 @@ def test_order_does_not_matter(places: SceneData, write_scene: WriteScene) -> No
 def test_a_dataset_of_places(places: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
     """Every draw is in the manifest, which its schema reads, and no label has anything of it."""
     places["labels"] = {"min_pixels": 1, "min_fragment": 1}
+    places["depth_sensor"] = {"kind": "tof"}
     places["output"] |= {"layouts": 3, "formats": [name for name in FORMATS if name not in ("colmap", "yolo-pose")]}
     scene = ms.load_scene(write_scene(places))
     out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path

@@ -14,6 +14,7 @@ from mitsplat.engine import pool as engine
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.frames import budget
 from mitsplat.frames.budget import worker_memory
+from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
 from tests.conftest import BOTH, nut_and_bolt, small_scene
@@ -101,8 +102,8 @@ def test_pairs_of_gaussians_and_tiles_are_no_fewer_than_there_are():
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=64, height=48, fov_x=50)
     for radius in (0.001, 0.02, 0.1):
         one = Splats([[0.01, 0.02, 0]], [[0, 0, 0, 1]], [[radius, radius, 1e-4]], [0.9], np.zeros((1, 1, 3)))
-        side = 2 * budget._REACH * radius * camera.fx / 2 / 4
-        assert side**2 <= budget._pairs(one, camera, 1) <= (side + 1) ** 2 * 1.001
+        across, down = 2 * budget._REACH * radius * camera.fx / 2 / np.array([TILE_WIDTH, TILE_HEIGHT])
+        assert across * down <= budget._pairs(one, camera, 1) <= (across + 1) * (down + 1) * 1.001
     behind = Splats([[0, 0, -3.0]], [[0, 0, 0, 1]], [[0.1] * 3], [0.9], np.zeros((1, 1, 3)))
     assert budget._pairs(behind, camera, 1) == 0
 

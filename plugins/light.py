@@ -139,8 +139,9 @@ def light_factor(
         part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
         dr.eval(own, part, shine, glare)
         open_light, mirrored = emitters.open_light(receiver(own.position, own.normal), Lobe.of(own), own.valid)
-        # Where no ray came from where the lobe is, as much of it arrives as of all light.
-        mirrored *= dr.select(glare > 0, shine / glare, dr.mean(part)) * (dr.pi / reference)
+        # Where no ray came from where the lobe is, as much of it arrives as of all light. (dr.mean would write the
+        # width of the array into the kernel.)
+        mirrored *= dr.select(glare > 0, shine / glare, dr.sum(part) / 3) * (dr.pi / reference)
         relit = part * open_light / reference
         mirrored -= dr.select(own.relit, relit * mirrored_tent(own), 0)
         dr.eval(relit, mirrored)

@@ -131,7 +131,7 @@ def test_frame_is_remade_from_its_record(
     scene_data["seed"] = 999
     other = ms.load_scene(write_scene(scene_data))
     assert ms.render_frame(other, 2, layout=layout).image.tobytes() != frame.image.tobytes()
-    monkeypatch.setattr("mitsplat.frames.frame.plan_frame", lambda *_: plan)
+    monkeypatch.setattr("mitsplat.frames.frame.plan_frame", lambda *_, **__: plan)
     assert ms.render_frame(other, 2, layout=layout).image.tobytes() == frame.image.tobytes()
 
 

@@ -103,17 +103,17 @@ def bin_gaussians(
     Raises:
         CrowdedError: If the view has too many pairs to hold.
     """
-    tiles = view.tiles_x * view.tiles_y if chosen is None else chosen.count
+    tiles, own = (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
     table, owner, local = placement_table(clouds, placements, view)
     if dr.width(local) == 0:
-        return _empty(tiles)
+        return replace(_empty(tiles), tiles=own)
     changed = any(placement.appearance is not None for placement in placements)
     source = Projector(clouds, table, view, quality, at_camera, changed)
 
     visible, near = source.cull(owner, local, chosen)
     index = dr.compress(visible)
     if dr.width(index) == 0:
-        return _empty(tiles)
+        return replace(_empty(tiles), tiles=own)
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     near = dr.gather(mi.Bool, near, index)
     dr.eval(owner, local, near)

@@ -79,13 +79,15 @@ def form(words: list[str]) -> tuple[str, ...]:
 
 
 def smaller(words: list[str]) -> list[str]:
-    """A command that is documented, made quick; a Mitsuba scene says its size itself."""
+    """A documented command made quick; a Mitsuba scene says its size itself, and one image has no number of them."""
     added = [] if words[2:3] == ["frame.xml"] else SMALLER.get(words[1], [])
     kept = list(words)
     for option in (word for word in added if word.startswith("-")):
         if option in kept:
             place = kept.index(option)
             del kept[place : place + 2]
+    if "--only" in kept and "-n" in added:
+        added = added[: added.index("-n")] + added[added.index("-n") + 2 :]
     return kept + added
 
 

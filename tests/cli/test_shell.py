@@ -43,6 +43,7 @@ SMALLER = {
     "asset": ["--gaussians", "300", "--iterations", "20", "--edge", "64", "--faces", "300"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],
+    "split": ["--folds", "2"],
 }
 """Options that are added to documented commands, in place of their own, so that they are quick."""
 
@@ -101,7 +102,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / "scenes" / name, folder / "scenes" / name)
     shipped["objects"] = [{"asset": name} for name in parts]
     shipped["settle"] = {"stepper": "mujoco"}
-    shipped["output"] |= {"width": 128, "height": 72}
+    shipped["output"] |= {"width": 128, "height": 72, "layouts": 12, "views": 1}
     for name in ("workcell", "tray"):
         YAML(typ="safe", pure=True).dump(shipped, folder / f"scenes/{name}.yaml")
     gear = trimesh.creation.box((30, 20, 10))

@@ -30,7 +30,7 @@ _HOME = {
     "Quality": "quality",
     "Renderer": "frames.frame",
     "Scene": "scene.scene",
-    "SceneSpec": "scene.spec",
+    "SceneSpec": "spec.spec",
     "Splats": "splats",
     "bake_asset": "bake.bake",
     "load_scene": "scene.scene",
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene as Scene
     from mitsplat.scene.scene import load_scene as load_scene
     from mitsplat.scene.scene import make_scene as make_scene
-    from mitsplat.scene.spec import SceneSpec as SceneSpec
+    from mitsplat.spec.spec import SceneSpec as SceneSpec
     from mitsplat.splats import Splats as Splats
 
 

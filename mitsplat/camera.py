@@ -242,6 +242,15 @@ def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
     return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
 
 
+def direction(azimuth: float, sine: float) -> Float64Array:
+    """Unit vector (3,) at an azimuth [rad], 0 along +x and counter-clockwise from above, and a sine of the elevation.
+
+    Azimuths and sines that are uniform give directions that are uniform by area on the sphere (Archimedes).
+    """
+    cosine = np.sqrt(1.0 - sine * sine)
+    return np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
+
+
 def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Float64Array:
     """``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that looks at ``target`` [m].
 

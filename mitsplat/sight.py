@@ -22,7 +22,7 @@ from mitsplat.mesh_points import points_inside
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Instance, Layout
     from mitsplat.scene.scene import Scene
-    from mitsplat.scene.spec_camera import Acceptance, Occlusion, Truncation
+    from mitsplat.spec.camera import Acceptance, Occlusion, Truncation
 
 _POINTS = 40_000
 """Of all objects of a layout together, at most."""

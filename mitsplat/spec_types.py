@@ -86,6 +86,7 @@ def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, floa
 Vec3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
+UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
 Range = Annotated[tuple[float, float], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_each_ordered)]

@@ -25,7 +25,7 @@ from mitsplat.errors import MissingResourceError
 from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.physics.settle import warp_settings
 from mitsplat.scene.scene import Scene, load_scene
-from mitsplat.scene.spec import FORMATS
+from mitsplat.spec.spec import FORMATS
 from mitsplat.splats import Splats
 
 if TYPE_CHECKING:

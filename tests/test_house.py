@@ -21,6 +21,7 @@ FLOORS = (
     ("fit", "frames"),
     ("labels", "physics", "render"),
     ("capture", "engine", "plugins", "scene"),
+    ("spec",),
     ("ground",),
 )
 """Wings from the roof down: each imports from floors below its own. Ground is what lies in ``mitsplat`` itself."""

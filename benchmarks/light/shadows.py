@@ -58,8 +58,8 @@ from mitsplat.render.layers import (
     make_splats_shape,
     render_layers,
 )
-from mitsplat.scene.spec_image import Composite
-from mitsplat.scene.spec_lights import AreaLight, EnvironmentLight, LightSpec, SpotLight
+from mitsplat.spec.image import Composite
+from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec, SpotLight
 from scenes.build import materials as m
 from scenes.build.parts import build_part
 

@@ -33,7 +33,7 @@ from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
 from mitsplat.mesh import convex_pieces
 from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.spec_lights import LightSpec
+from mitsplat.spec.lights import LightSpec
 from mitsplat.spherical_harmonics import sh_basis
 from mitsplat.surfels import Surfels, place_surfels
 from mitsplat.variant import one_at_a_time

@@ -32,7 +32,7 @@ from mitsplat.file_kinds import refuse_others
 from mitsplat.mesh_normals import corner_normals
 from mitsplat.plugins.device import ray_scene
 from mitsplat.render.emitters import emitter_dict, y_up_to_z_up
-from mitsplat.scene.spec_lights import LightSpec
+from mitsplat.spec.lights import LightSpec
 from mitsplat.variant import ensure_variant
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")

@@ -467,7 +467,7 @@ def _overrides(
     *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
 ) -> dict[str, Any]:
     """The options that were given, by the scene file's keys."""
-    from mitsplat.scene.spec import FORMATS
+    from mitsplat.spec.spec import FORMATS
 
     if seed is not None and seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import trimesh
 
 from mitsplat.content_hash import ContentHash, file_hash
-from mitsplat.scene.scene import image_lists
-from mitsplat.scene.spec_lights import EnvironmentLight
+from mitsplat.scene.references import image_lists
+from mitsplat.spec.lights import EnvironmentLight
 from mitsplat.splats import Splats
 
 if TYPE_CHECKING:

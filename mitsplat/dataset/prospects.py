@@ -22,12 +22,12 @@ from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
-from mitsplat.scene.spec import BACKDROP
-from mitsplat.scene.spec_lights import LocalLight
-from mitsplat.scene.spec_objects import Arrangement
-from mitsplat.scene.spec_shapes import Region
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds, stated_pose, walls_beside
 from mitsplat.sight import solid_around
+from mitsplat.spec.lights import LocalLight
+from mitsplat.spec.objects import Arrangement
+from mitsplat.spec.shapes import Region
+from mitsplat.spec.spec import BACKDROP
 
 MOST_OBJECTS = 65535
 """Instance ids have 16 bits."""

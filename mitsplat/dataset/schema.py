@@ -22,8 +22,8 @@ from mitsplat.dataset.manifest import parse_line
 from mitsplat.errors import InputError
 from mitsplat.files import Record, splits_of
 from mitsplat.format_version import FORMAT_VERSIONS, check_format_version
-from mitsplat.scene.spec import LabelRules, Output
-from mitsplat.scene.spec_camera import CameraSpec
+from mitsplat.spec.camera import CameraSpec
+from mitsplat.spec.spec import LabelRules, Output
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]

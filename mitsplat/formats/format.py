@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from mitsplat.frames.frame import Frame
     from mitsplat.scene.scene import Scene
-    from mitsplat.scene.spec_image import DepthSensor
+    from mitsplat.spec.image import DepthSensor
 
 
 @dataclass(frozen=True, eq=False)

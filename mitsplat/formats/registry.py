@@ -40,7 +40,7 @@ from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
 from mitsplat.render.places import draw_place
 from mitsplat.scene.contents import draw_regions, is_empty
-from mitsplat.scene.spec import FORMATS, Output, SceneSpec
+from mitsplat.spec.spec import FORMATS, Output, SceneSpec
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame

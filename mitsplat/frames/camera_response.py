@@ -17,7 +17,7 @@ from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.colour import LUMINANCE, colour_science, hue_matrix, saturation_matrix
 from mitsplat.plugins.device import wrapped
 from mitsplat.render.layers import Layers, device_array, host_array
-from mitsplat.scene.spec_image import Composite, ImageShadow, Sensor
+from mitsplat.spec.image import Composite, ImageShadow, Sensor
 from mitsplat.variant import one_at_a_time
 
 Tone: TypeAlias = Literal["neutral", "filmic"]

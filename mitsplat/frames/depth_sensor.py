@@ -13,8 +13,8 @@ from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.colour import LUMINANCE
 from mitsplat.frames.frame import Frame
-from mitsplat.scene.spec_image import DepthSensor, StereoSensor, TimeOfFlightSensor
 from mitsplat.scene.streams import random_stream
+from mitsplat.spec.image import DepthSensor, StereoSensor, TimeOfFlightSensor
 
 LIGHT_SPEED = 299_792_458.0
 WINDOW = 9

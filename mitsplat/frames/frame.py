@@ -46,7 +46,7 @@ from mitsplat.scene.appearance import Appearance, draw_appearances
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
-from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, LightSpec
+from mitsplat.spec.lights import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.splats import Splats
 from mitsplat.variant import ensure_variant, one_at_a_time
 

@@ -30,7 +30,7 @@ from mitsplat.render.places import Finish, draw_place
 from mitsplat.render.textures import finished_mesh, material, texture_image
 from mitsplat.scene.appearance import draw_appearances
 from mitsplat.scene.scene import Scene, layout_of, plan_frame
-from mitsplat.scene.spec_shapes import Shape
+from mitsplat.spec.shapes import Shape
 
 
 def export_xml(scene: Scene, index: int, path: str | Path) -> None:

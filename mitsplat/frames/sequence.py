@@ -16,8 +16,8 @@ from mitsplat.frames.frame import Frame, Renderer
 from mitsplat.quality import Quality
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, layout_of, whole
-from mitsplat.scene.spec_lights import LightEntry
 from mitsplat.scene.viewpoints import view_of
+from mitsplat.spec.lights import LightEntry
 
 Item = TypeVar("Item")
 Shot = tuple[int, Layout | None, Camera | None]

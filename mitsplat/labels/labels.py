@@ -37,7 +37,7 @@ from mitsplat.masks import (
     encode_mask,
     without_fragments,
 )
-from mitsplat.scene.spec import LabelRules as LabelRules
+from mitsplat.spec.spec import LabelRules as LabelRules
 
 if TYPE_CHECKING:
     from mitsplat.camera import Camera

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.mesh_distance import PlacedSurface, Surface, clearance
-from mitsplat.scene.spec_objects import Arrangement
-from mitsplat.scene.spec_shapes import Region
 from mitsplat.scene.walls import PILE_HEIGHT
+from mitsplat.spec.objects import Arrangement
+from mitsplat.spec.shapes import Region
 
 _PLACES = 200  # positions tried for an object before all are drawn anew
 _PLACES_IN_LAYER = 20  # of a pile
@@ -53,7 +53,7 @@ def draw_poses(
     Args:
         items: What to place.
         obstacles: What does not move.
-        regions: Where, and how, see :class:`mitsplat.scene.spec.Settle`; one region after the other.
+        regions: Where, and how, see :class:`mitsplat.spec.spec.Settle`; one region after the other.
         rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
     """
     for _ in range(_DRAWS):

@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.colour import black_body_colour
-from mitsplat.scene.spec_lights import LightSpec
+from mitsplat.spec.lights import LightSpec
 from mitsplat.variant import ensure_variant
 
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsplat.scene.contents import draw_environment
-from mitsplat.scene.spec import SceneSpec
-from mitsplat.scene.spec_materials import Background, BrushedMetalMaterial, ColourMaterial, ImageMaterial, Material
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import finish_name
+from mitsplat.spec.materials import Background, BrushedMetalMaterial, ColourMaterial, ImageMaterial, Material
+from mitsplat.spec.spec import SceneSpec
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset

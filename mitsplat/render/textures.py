@@ -14,8 +14,8 @@ from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.plugins.device import plain_mesh, wrapped
 from mitsplat.render.places import Finish
-from mitsplat.scene.spec_shapes import Shape
 from mitsplat.scene.walls import stated_pose
+from mitsplat.spec.shapes import Shape
 
 SIZE = 1024
 """Edge of a pattern's image [px]."""

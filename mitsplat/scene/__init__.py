@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from mitsplat.scene.layout import Instance, Layout, RestCertificate
 from mitsplat.scene.scene import FramePlan, Scene, load_scene, plan_frame, scene_json_schema
-from mitsplat.scene.spec import SceneSpec
 
 __all__ = [
     "FramePlan",
@@ -17,7 +16,6 @@ __all__ = [
     "Layout",
     "RestCertificate",
     "Scene",
-    "SceneSpec",
     "load_scene",
     "plan_frame",
     "scene_json_schema",

@@ -14,9 +14,9 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.files import SPLITS
-from mitsplat.scene.spec import SceneSpec
-from mitsplat.scene.streams import random_stream
+from mitsplat.scene.streams import random_stream, weighted_choice
 from mitsplat.scene.walls import stated_pose
+from mitsplat.spec.spec import SceneSpec
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
@@ -72,8 +72,7 @@ def draw_environment(spec: SceneSpec, layout: int) -> int:
     weights = np.array(spec.environment_weights or np.ones(len(spec.environment)))
     if spec.hold_out.environments and split_of(layout, spec.output.validation, spec.output.test) != "test":
         weights = weights * [name not in spec.hold_out.environments for name in spec.environment]
-    rng = random_stream(spec.seed, "environment", layout)
-    return int(rng.choice(len(weights), p=weights / weights.sum()))
+    return weighted_choice(random_stream(spec.seed, "environment", layout), weights)[0]
 
 
 @lru_cache
@@ -101,7 +100,7 @@ def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
     for position, (entry, count) in enumerate(zip(spec.objects, _counts(spec, layout), strict=True)):
         among = list(spec.regions_of(entry))
         rng = random_stream(spec.seed, f"object region {position}", layout)
-        found += [among[i] for i in rng.choice(len(among), count, p=areas[among] / areas[among].sum())]
+        found += [among[i] for i in weighted_choice(rng, areas[among], count)]
     return tuple(found)
 
 
@@ -135,7 +134,7 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
     weights = np.repeat(np.multiply(entry.weights or np.ones(len(allowed)), allowed), len(entry.scales))
     rng = random_stream(spec.seed, f"object pool {position}", layout)
     if not entry.balance:
-        return [pool[i] for i in rng.choice(len(pool), count, p=weights / weights.sum())]
+        return [pool[i] for i in weighted_choice(rng, weights, count)]
     members = defaultdict[str, list[int]](list)
     for i, asset in enumerate(pool):
         if weights[i]:
@@ -144,8 +143,7 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
     drawn = []
     for kind in _dealt(spec, position, layout, count, len(names)):
         among = members[names[kind]]
-        shares = weights[among] / weights[among].sum()
-        drawn.append(pool[among[int(rng.choice(len(among), p=shares))]])
+        drawn.append(pool[among[weighted_choice(rng, weights[among])[0]]])
     return drawn
 
 

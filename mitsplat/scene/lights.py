@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from mitsplat.scene.spec import SceneSpec
-from mitsplat.scene.spec_lights import EnvironmentLight, LightDraw, LightSpec, PointLight, RoomLight, SpotLight
-from mitsplat.scene.streams import random_stream
+from mitsplat.camera import direction
+from mitsplat.scene.streams import random_stream, weighted_choice
+from mitsplat.spec.lights import EnvironmentLight, LightDraw, LightSpec, PointLight, RoomLight, SpotLight
+from mitsplat.spec.spec import SceneSpec
 
 _UNIFORM = ("position", "target", "size", "cone", "radiance", "intensity", "rotate_z")
 """Keys whose values, or components, are uniform between two bounds."""
@@ -49,8 +50,7 @@ def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentL
     """A sky with one image of its pool."""
     if sky.pool is None:
         return sky
-    weights = np.array(sky.weights or np.ones(len(sky.names)))
-    image = sky.names[int(rng.choice(len(sky.names), p=weights / weights.sum()))]
+    image = sky.names[weighted_choice(rng, sky.weights or np.ones(len(sky.names)))[0]]
     return sky.model_copy(update={"image": image, "pool": None, "weights": ()})
 
 
@@ -75,9 +75,8 @@ def _drawn(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int)
         azimuth = np.radians(uniform("azimuth", *draw.azimuth))
         # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
         sine = uniform("elevation", *np.sin(np.radians(draw.elevation)))
-        cosine = np.sqrt(1.0 - sine * sine)
-        towards = np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
-        state["position"] = tuple(np.add(around, uniform("distance", *draw.distance) * towards).tolist())
+        offset = uniform("distance", *draw.distance) * direction(azimuth, sine)
+        state["position"] = tuple(np.add(around, offset).tolist())
     return light.model_copy(update=state)
 
 

@@ -16,12 +16,12 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera, interpolate_poses, look_at_pose
+from mitsplat.camera import Camera, direction, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
-from mitsplat.scene.spec import Output
-from mitsplat.scene.spec_camera import CameraHemisphere, CameraOrbit, CameraSpec, CameraWalk, Handheld, Intrinsics
 from mitsplat.scene.streams import random_stream
 from mitsplat.sight import Prospect, Sight
+from mitsplat.spec.camera import CameraHemisphere, CameraOrbit, CameraSpec, CameraWalk, Handheld, Intrinsics
+from mitsplat.spec.spec import Output
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
@@ -198,9 +198,7 @@ def _walk_pose(camera: CameraWalk, here: _Turn) -> Float64Array:
 
 def _pose_around(target: Float64Array, azimuth: float, sine: float, radius: float) -> Float64Array:
     """Pose that looks at a target [m] from an azimuth [rad], a sine of the elevation and a distance [m]."""
-    cosine = np.sqrt(1.0 - sine * sine)
-    offset = radius * np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
-    return look_at_pose(target + offset, target)
+    return look_at_pose(target + radius * direction(azimuth, sine), target)
 
 
 def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout: Layout | None) -> View:

@@ -10,9 +10,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.scene.spec import BACKDROP, SceneSpec
-from mitsplat.scene.spec_objects import ObjectPose
-from mitsplat.scene.spec_shapes import Backdrop, Bin, Box, Enclosure, Region, Shape
+from mitsplat.spec.objects import ObjectPose
+from mitsplat.spec.shapes import Backdrop, Bin, Box, Enclosure, Region, Shape
+from mitsplat.spec.spec import BACKDROP, SceneSpec
 from mitsplat.spec_types import Vec3
 
 if TYPE_CHECKING:

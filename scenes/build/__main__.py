@@ -14,7 +14,7 @@ from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.camera import Camera
 from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.spec import SceneSpec
+from mitsplat.spec.spec import SceneSpec
 from mitsplat.yaml_input import load_yaml
 from scenes.build.parts import PARTS, build_part
 from scenes.build.workcell import build_workcell, densities

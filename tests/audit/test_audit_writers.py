@@ -25,9 +25,9 @@ from mitsplat.formats import registry as writers
 from mitsplat.frames import frame
 from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec import FORMATS
-from mitsplat.scene.spec_camera import Intrinsics
-from mitsplat.scene.spec_image import TimeOfFlightSensor
+from mitsplat.spec.camera import Intrinsics
+from mitsplat.spec.image import TimeOfFlightSensor
+from mitsplat.spec.spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 

@@ -21,7 +21,7 @@ from mitsplat.errors import InputError
 from mitsplat.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.spec_lights import AreaLight, EnvironmentLight
+from mitsplat.spec.lights import AreaLight, EnvironmentLight
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats
 from mitsplat.surfels import place_surfels, poisson_subset

@@ -22,8 +22,8 @@ from mitsplat.formats.registry import write_frame
 from mitsplat.scene.contents import draw_objects
 from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec import FORMATS
 from mitsplat.scene.streams import random_stream
+from mitsplat.spec.spec import FORMATS
 from tests.conftest import box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes
 from tests.synthetic import CERTIFICATE

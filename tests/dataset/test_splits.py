@@ -18,7 +18,7 @@ from mitsplat.dataset.folds import assign_folds, write_folds
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.scene.scene import load_scene
-from mitsplat.scene.spec import FORMATS, HoldOut
+from mitsplat.spec.spec import FORMATS, HoldOut
 from tests.audit.test_audit import records_of, store
 from tests.cli.test_cli import run
 from tests.conftest import box_asset, small_scene

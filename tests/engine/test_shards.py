@@ -27,7 +27,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import Renderer
 from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.scene.spec import FORMATS
+from mitsplat.spec.spec import FORMATS
 from tests.cli.test_cli import run
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, render, settle, write

@@ -32,8 +32,8 @@ from mitsplat.labels.polygons import fill_polygon
 from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import load_scene
-from mitsplat.scene.spec import FORMATS
-from mitsplat.scene.spec_image import StereoSensor
+from mitsplat.spec.image import StereoSensor
+from mitsplat.spec.spec import FORMATS
 from tests.labels.test_labels import Seen, read_yolo, resample, whole
 from tests.synthetic import CERTIFICATE, frame_around
 

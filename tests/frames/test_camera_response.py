@@ -26,7 +26,7 @@ from mitsplat.frames.camera_response import (
     tone_curve,
 )
 from mitsplat.render.layers import Layers, device_array, host_array
-from mitsplat.scene.spec_image import Composite, ImageShadow, Sensor
+from mitsplat.spec.image import Composite, ImageShadow, Sensor
 
 
 def encode(linear: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from mitsplat.frames.depth_sensor import (
     time_of_flight_depth,
 )
 from mitsplat.scene.scene import load_scene
-from mitsplat.scene.spec_image import StereoSensor, TimeOfFlightSensor
+from mitsplat.spec.image import StereoSensor, TimeOfFlightSensor
 from tests.conftest import WriteScene
 
 FOCAL = 400.0

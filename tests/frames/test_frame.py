@@ -24,7 +24,7 @@ from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.quality import PRESETS
 from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
 from mitsplat.scene.scene import FramePlan
-from mitsplat.scene.spec_lights import LightSpec
+from mitsplat.spec.lights import LightSpec
 from tests.conftest import WriteScene
 from tests.render.test_render import make_splats
 

@@ -13,7 +13,7 @@ from mitsplat.frames.frame import Renderer
 from mitsplat.render.layers import render_layers, render_silhouettes
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.scene.spec_lights import AreaLight, EnvironmentLight, LightDraw
+from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightDraw
 
 WORKCELL = Path(__file__).parents[2] / "scenes/workcell.yaml"
 

@@ -20,7 +20,7 @@ from mitsplat.frames.mitsuba_xml import export_xml
 from mitsplat.render.places import draw_place
 from mitsplat.scene.contents import draw_regions
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.scene.spec import FORMATS
+from mitsplat.spec.spec import FORMATS
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]

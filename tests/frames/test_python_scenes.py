@@ -18,9 +18,9 @@ import mitsplat as ms
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.flow import UNKNOWN_FLOW, motions_of, optical_flow
 from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.scene.spec_camera import CameraOrbit
-from mitsplat.scene.spec_lights import AreaLight
-from mitsplat.scene.spec_shapes import Shape
+from mitsplat.spec.camera import CameraOrbit
+from mitsplat.spec.lights import AreaLight
+from mitsplat.spec.shapes import Shape
 from mitsplat.splats import Splats
 from tests.conftest import WriteScene, box_asset
 from tests.drawn import render_boxes, scatter_boxes

@@ -155,14 +155,14 @@ def test_code_that_decides_layouts_is_hashed():
         *("arrays.BoolArray", "arrays.Float32Array", "arrays.Float64Array", "arrays.Int64Array", "progress.Note"),
         *("asset.Asset", "errors.InputError", "scene.scene.Scene"),
         *(f"scene.layout.{name}" for name in ("Instance", "Layout", "RestCertificate")),
-        *(f"scene.spec_objects.{name}" for name in ("Arrangement", "ObjectPose")),
-        *(f"scene.spec_shapes.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
-        *("scene.spec.SceneSpec", "spec_types.Vec3"),
+        *(f"spec.objects.{name}" for name in ("Arrangement", "ObjectPose")),
+        *(f"spec.shapes.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
+        *("spec.spec.SceneSpec", "spec_types.Vec3"),
     }
     given = types | {"cache.cache_folder", "cache.keep_file", "scene.layout.NOTHING_TO_REST", "warp_start.quiet_warp"}
     given |= {"content_hash.ContentHash"}  # names what is kept
     given |= {"files.SPLITS"}  # names of tallies; which layout is of which split is decided in scene.contents
-    given |= {"scene.spec.BACKDROP"}  # begins the names of shapes, which are hashed
+    given |= {"spec.spec.BACKDROP"}  # begins the names of shapes, which are hashed
     for module in settle.MODULES:
         for node in ast.walk(ast.parse((settle.PACKAGE / f"{module.replace('.', '/')}.py").read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mitsplat."):

@@ -26,8 +26,8 @@ from mitsplat.render.textures import (
     texture_image,
     with_gain,
 )
-from mitsplat.scene.spec_shapes import Box, Shape
 from mitsplat.scene.walls import stated_pose
+from mitsplat.spec.shapes import Box, Shape
 
 COLOURS = ((0.8, 0.6, 0.4), (0.4, 0.3, 0.2))
 

@@ -16,8 +16,8 @@ import pytest
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, load_scene, plan_frame, scene_json_schema
-from mitsplat.scene.spec import SCHEMA_VERSION
 from mitsplat.scene.streams import random_stream
+from mitsplat.spec.spec import SCHEMA_VERSION
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]

@@ -19,8 +19,8 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, layout_of, load_scene, plan_frame
-from mitsplat.scene.spec_camera import Occlusion, Truncation
 from mitsplat.sight import Sight
+from mitsplat.spec.camera import Occlusion, Truncation
 from mitsplat.spec_types import StrictModel
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes

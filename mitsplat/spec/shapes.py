@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, model_validator
 
-from mitsplat.scene.spec_materials import ColourMaterial, Material, NoiseMaterial
-from mitsplat.scene.spec_objects import Arrangement
+from mitsplat.spec.materials import ColourMaterial, Material, NoiseMaterial
+from mitsplat.spec.objects import Arrangement
 from mitsplat.spec_types import Positive, StrictModel, Unit, Vec3
 from mitsplat.yaml_input import FieldError
 

@@ -10,12 +10,12 @@ from typing import Literal, get_args
 from pydantic import Field, model_validator
 
 from mitsplat.quality import PresetName
-from mitsplat.scene.spec_camera import CameraSpec
-from mitsplat.scene.spec_image import Composite, DepthSensor, Randomise, Rendering, StereoSensor
-from mitsplat.scene.spec_lights import EnvironmentLight, LightEntry, RoomLight
-from mitsplat.scene.spec_materials import Background
-from mitsplat.scene.spec_objects import MAIN, Arrangement, ObjectSpec, Settle
-from mitsplat.scene.spec_shapes import Backdrop, Enclosure, NamedRegion, Region, Shape
+from mitsplat.spec.camera import CameraSpec
+from mitsplat.spec.image import Composite, DepthSensor, Randomise, Rendering, StereoSensor
+from mitsplat.spec.lights import EnvironmentLight, LightEntry, RoomLight
+from mitsplat.spec.materials import Background
+from mitsplat.spec.objects import MAIN, Arrangement, ObjectSpec, Settle
+from mitsplat.spec.shapes import Backdrop, Enclosure, NamedRegion, Region, Shape
 from mitsplat.spec_types import Positive, StrictModel, Unit
 from mitsplat.yaml_input import FieldError
 

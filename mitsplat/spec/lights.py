@@ -194,7 +194,7 @@ class EnvironmentLight(DrawnLight):
         None,
         exclude_if=lambda pool: pool is None,
         description="Such files of which each layout has one, also where all else is drawn anew for every frame; or a "
-        "pattern such as ``skies/*`` that takes the images among the files that it matches, by name.",
+        "folder, or a pattern such as ``skies/*``, of which the images are taken, by name.",
     )
     weights: tuple[Positive, ...] = Field(
         (),

@@ -6,9 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from mitsplat.spec_types import PositiveRange, Range, StrictModel, Unit, ordered
+from mitsplat.spec_types import PositiveRange, Range, StrictModel, UnitRange, ordered
 
-UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
 Share = Annotated[float, Field(gt=0, le=1)]
 Turn = Annotated[Range, Field(description="Rotation of the pattern on the surface [degrees], drawn from this range.")]
 

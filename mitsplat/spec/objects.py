@@ -12,14 +12,13 @@ from mitsplat.spec_types import (
     Positive,
     Scale,
     StrictModel,
-    Unit,
+    UnitRange,
     Vec3,
     check_weights,
     ordered,
 )
 from mitsplat.yaml_input import FieldError
 
-UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
 _Hue = Annotated[float, Field(ge=-180, le=180)]
 HueRange = Annotated[tuple[_Hue, _Hue], AfterValidator(ordered)]
 _Saturation = Annotated[float, Field(ge=0, le=2)]

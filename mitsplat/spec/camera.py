@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, NonNegativeFloat, model_validator
+from pydantic import Field, NonNegativeFloat, model_validator
 
 from mitsplat.camera import Lens
-from mitsplat.spec_types import Elevation, Positive, PositiveRange, Range, StrictModel, Unit, Vec3, ordered
+from mitsplat.spec_types import (
+    ElevationRange,
+    Positive,
+    PositiveRange,
+    Range,
+    StrictModel,
+    Unit,
+    UnitRange,
+    Vec3,
+)
 from mitsplat.yaml_input import FieldError
 
 
@@ -117,8 +126,6 @@ class CameraOrbit(Viewpoint):
 
 TRIES = 16
 
-UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
-
 
 class Acceptance(StrictModel):
     """What a view must show and keep off. A camera inside of a visible shape or an object is never accepted."""
@@ -154,9 +161,7 @@ class CameraHemisphere(Viewpoint):
     kind: Literal["hemisphere"] = Field("hemisphere", description="Random views around a target.")
     target: Vec3 = Field(description="Point in the middle of the views [m].")
     radius: PositiveRange = Field(description="Range of distances from the target [m].")
-    elevation: Annotated[tuple[Elevation, Elevation], AfterValidator(ordered)] = Field(
-        (25.0, 80.0), description="Range above the horizon [degrees]."
-    )
+    elevation: ElevationRange = Field((25.0, 80.0), description="Range above the horizon [degrees].")
     azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
     roll: Range = Field((0.0, 0.0), description="Range of rotations about the line of sight [degrees].")
     target_jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the target, 1 sigma [m].")
@@ -217,9 +222,7 @@ class CameraWalk(Viewpoint):
     kind: Literal["walk"] = Field("walk", description="A smooth random path around a target, for videos.")
     target: Vec3 = Field(description="Point in the middle of the views [m].")
     radius: PositiveRange = Field(description="Range of distances from the target [m].")
-    elevation: Annotated[tuple[Elevation, Elevation], AfterValidator(ordered)] = Field(
-        (25.0, 80.0), description="Range above the horizon [degrees]."
-    )
+    elevation: ElevationRange = Field((25.0, 80.0), description="Range above the horizon [degrees].")
     azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
     places: int = Field(4, ge=2, le=1000, description="How many places are drawn, evenly spaced in time.")
 

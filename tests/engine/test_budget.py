@@ -101,7 +101,7 @@ def test_it_grows_with_what_a_scene_holds(scene, room):
     assert need.own - worker_memory(scene).own > budget.COPIES * size
     pixels = 320 * 240
     assert worker_memory(changed(width=640)).own - need.own > budget.PER_RAY * pixels
-    assert worker_memory(finer(2)).own - need.own > 3 * budget.PER_RAY * pixels
+    assert worker_memory(finer(2)).own - need.own == pytest.approx(3 * budget.PER_RAY * pixels)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

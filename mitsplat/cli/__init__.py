@@ -34,6 +34,7 @@ for _command in (
     datasets.audit,
     datasets.report,
     datasets.preview,
+    datasets.view,
     datasets.settle,
     datasets.export,
     assets.bake,

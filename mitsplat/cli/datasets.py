@@ -356,6 +356,43 @@ def preview(
     typer.echo(f"picture: {out}")
 
 
+def view(
+    path: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")],
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; any but localhost asks visitors for a token.")
+    ] = "localhost",
+    port: Annotated[int, typer.Option(help="TCP port to listen on.")] = 8080,
+    gaussians: Annotated[
+        int, typer.Option(help="Most Gaussians of each cloud that the browser is sent; a larger one is thinned.")
+    ] = 300_000,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = False,
+    device: DeviceName = "cpu",
+    allow_outside: AllowOutside = False,
+) -> None:
+    """Look at SCENE in the browser, and steer it.
+
+    Its splats and everything around them to move through; beside them the real render of what is looked at, which
+    sharpens as time allows. The file is read again when it changes. Ctrl-C ends it.
+    """
+    from importlib.util import find_spec
+
+    from mitsplat.errors import MissingResourceError
+
+    if gaussians < 1:
+        raise InputError(f"--gaussians must be at least 1 (got {gaussians})")
+    if find_spec("viser") is None:
+        raise MissingResourceError("the view needs viser: pip install 'mitsplat[view]'")
+    from mitsplat.view import Address, serve
+
+    def tell(url: str) -> None:
+        typer.echo(f"view: {url}  (Ctrl-C ends it)")
+        if browser:
+            typer.launch(url)
+
+    take_device(device)
+    serve(path, Address(host, port), gaussians=gaussians, allow_outside=allow_outside, ready=tell)
+
+
 def settle(
     scene: SceneFile,
     layouts: Annotated[int | None, typer.Option("--layouts", "-n", help="Only the first so many layouts.")] = None,

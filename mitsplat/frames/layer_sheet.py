@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -12,27 +12,19 @@ from mitsplat.arrays import ByteImage
 from mitsplat.frames.frame import Frame
 from mitsplat.labels.overlay import class_colour, draw_labels
 
+LayerName = Literal["picture", "labels", "ids", "depth", "light", "highlight"]
+LAYERS: tuple[LayerName, ...] = get_args(LayerName)
+
 _CAPTION = 24
 _GAP = 6
 
 
 def layer_sheet(frame: Frame) -> ByteImage:
     """A frame's picture, labels, ids, depth, light and highlight side by side, each with a caption, RGB."""
-    known = frame.depth[frame.depth > 0]
-    near, far = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    share = np.clip((frame.depth - near) / max(far - near, 1e-9), 0, 1)
-    depth = cv2.applyColorMap(np.rint(255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
-    tiles = {
-        "picture": frame.image,
-        f"labels: {len(frame.labels.instances)} instances": draw_labels(frame.image, frame.labels),
-        "ids by splats": _id_colours(frame.instance),
-        f"depth: {near:.3g} to {far:.3g} m": np.where(frame.depth[..., None] > 0, depth, 0).astype(np.uint8),
-        "light: black 0, grey 1 (as captured), white 2": _grey(frame.light / 2),
-        "highlight: white 1, square root": _grey(np.sqrt(np.maximum(frame.layers.highlight, 0))),
-    }
+    tiles = [draw_layer(frame, name) for name in LAYERS]
     height, width = frame.image.shape[:2]
     sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)
-    for i, (caption, tile) in enumerate(tiles.items()):
+    for i, (caption, tile) in enumerate(tiles):
         top, left = i // 3 * (height + _CAPTION + _GAP), i % 3 * (width + _GAP)
         sheet[top : top + height, left : left + width] = tile
         cv2.putText(
@@ -46,6 +38,25 @@ def layer_sheet(frame: Frame) -> ByteImage:
             cv2.LINE_AA,
         )
     return sheet
+
+
+def draw_layer(frame: Frame, name: LayerName) -> tuple[str, ByteImage]:
+    """A caption, and one of :data:`LAYERS` as an RGB picture (H, W, 3)."""
+    if name == "picture":
+        return name, frame.image
+    if name == "labels":
+        return f"labels: {len(frame.labels.instances)} instances", draw_labels(frame.image, frame.labels)
+    if name == "ids":
+        return "ids by splats", _id_colours(frame.instance)
+    if name == "light":
+        return "light: black 0, grey 1 (as captured), white 2", _grey(frame.light / 2)
+    if name == "highlight":
+        return "highlight: white 1, square root", _grey(np.sqrt(np.maximum(frame.layers.highlight, 0)))
+    known = frame.depth[frame.depth > 0]
+    near, far = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    share = np.clip((frame.depth - near) / max(far - near, 1e-9), 0, 1)
+    depth = cv2.applyColorMap(np.rint(255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    return f"depth: {near:.3g} to {far:.3g} m", np.where(frame.depth[..., None] > 0, depth, 0).astype(np.uint8)
 
 
 def _id_colours(ids: npt.NDArray[np.uint16]) -> ByteImage:

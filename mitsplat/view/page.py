@@ -1,0 +1,273 @@
+"""The page: viser's server, what it shows of parts, and the panels beside it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rich
+import viser
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import ByteImage, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.splats import Splats
+from mitsplat.view.guard import Guard, check_address, guarded
+from mitsplat.view.parts import (
+    HIDDEN_FIRST,
+    Cloud,
+    Frustum,
+    Lines,
+    Part,
+    Points,
+    Surface,
+    base_colours,
+    bounds_of,
+    changes,
+)
+
+_HALF_MAX = 200.0
+"""Longest standard deviation that is sent: viser holds covariances as half floats, of which 65504 is the largest."""
+_START_FOV = 0.9
+"""Vertical field of view of a page that shows no camera's view [rad]."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a page is served.
+
+    Attributes:
+        host: Name or address to listen on.
+        port: TCP port.
+    """
+
+    host: str = "localhost"
+    port: int = 8080
+
+
+class Page:
+    """A page in the browser that shows parts, and a picture beside them.
+
+    Args:
+        title: Above the controls.
+        address: Where it is served.
+        gaussians: Most Gaussians of a cloud that are sent; a larger one is thinned.
+
+    Attributes:
+        gui: viser's controls.
+        port: TCP port that it is served on.
+        url: What to open, with the token where one is needed.
+
+    Raises:
+        InputError: If the address cannot be listened on.
+    """
+
+    def __init__(self, title: str, address: Address, *, gaussians: int) -> None:
+        check_address(address.host, address.port)
+        guard = Guard.of_host(address.host)
+        with _silence(), guarded(guard):
+            self._server = viser.ViserServer(address.host, address.port, label=title, verbose=False)
+        self.port = self._server.get_port()
+        self.url = f"http://{address.host}:{self.port}/" + (f"?token={guard.token}" if guard.token else "")
+        self._forbid_tunnels()
+        self._gaussians = gaussians
+        self._shown: dict[str, Part] = {}
+        self._handles: dict[str, Any] = {}
+        self._clicked: Callable[[int, Any], object] = lambda index, client: None
+        self.gui = self._server.gui
+        self.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, dark_mode=True)
+        self._server.scene.set_up_direction("+z")
+        panel = self.gui.add_panel()
+        with panel.add_tab("Picture"):
+            self._picture = self.gui.add_image(np.full((36, 64, 3), 40, dtype=np.uint8), format="jpeg")
+            self._caption = self.gui.add_markdown("")
+        panel.dock_left()
+        panel.set_width(480)
+        self._alerted: str | None = None
+        self._alert = self.gui.add_html("", visible=False)
+        self._groups = self.gui.add_folder("Show", order=1000)
+        self._boxes: dict[str, Any] = {}
+
+    def _forbid_tunnels(self) -> None:
+        """A browser may not ask for a public address: viser would open a tunnel to a server of its makers."""
+        server = self._server._websock_server
+        for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
+            server.unregister_handler(message)
+
+    def close(self) -> None:
+        """Stop serving."""
+        with _silence():
+            self._server.stop()
+
+    def on_click(self, clicked: Callable[[int, Any], object]) -> None:
+        """Whom to tell the index of a camera that was clicked, and viser's client."""
+        self._clicked = clicked
+
+    def on_move(self, moved: Callable[[Any], object]) -> None:
+        """Whom to tell viser's camera when someone moves theirs."""
+        self._server.on_client_connect(lambda client: client.camera.on_update(moved))
+
+    def add_handle(self, moved: Callable[[Float64Array], object]) -> Any:
+        """Viser's handle to drag something by, hidden until it is needed; ``moved`` is told where to [m]."""
+        handle = self._server.scene.add_transform_controls(
+            "/handle", scale=0.15, disable_rotations=True, visible=False, depth_test=False
+        )
+        handle.on_update(lambda _: moved(np.asarray(handle.position)))
+        return handle
+
+    def set_up(self, axis: str) -> None:
+        """Which axis points up: ``+z``, ``-y`` and so on."""
+        self._server.scene.set_up_direction(axis)
+
+    def show(self, parts: Iterable[Part]) -> None:
+        """Show these and nothing else; only what differs from what is shown is sent."""
+        wanted = {part.name: part for part in parts}
+        removed, added, moved = changes(self._shown, wanted)
+        with self._server.atomic():
+            for name in removed:
+                self._handles.pop(name).remove()
+            for part in added:
+                self._add_group(part.group)
+                self._handles[part.name] = self._add(part)
+            for part in moved:
+                handle = self._handles[part.name]
+                handle.position, handle.wxyz = part.pose[:3, 3], _wxyz(part.pose)
+        self._shown = wanted
+
+    def show_picture(self, image: ByteImage, caption: str) -> None:
+        """Show a picture beside the parts, with a line of Markdown below it."""
+        self._picture.image = image
+        self._caption.content = caption
+
+    def caption(self, text: str) -> None:
+        """A line of Markdown below the picture."""
+        self._caption.content = text
+
+    def alert(self, sentence: str | None) -> None:
+        """Show what is wrong, until it is None."""
+        if sentence == self._alerted:
+            return
+        self._alerted, self._alert.visible = sentence, sentence is not None
+        if sentence is not None:
+            style = "margin:0.5em;padding:0.6em;border-left:4px solid #d33;background:#d332;overflow-wrap:anywhere"
+            self._alert.content = f'<div role="alert" style="{style}">{html.escape(sentence)}</div>'
+
+    def look_through(self, camera: Camera, client: Any = None) -> None:
+        """Move one browser's view to a camera, or that of all and of those to come."""
+        pose, fov = camera.world_from_camera, 2 * float(np.arctan(0.5 * camera.height / camera.fy))
+        ahead = pose[:3, 3] + self._distance(pose) * pose[:3, 2]
+        if client is None:
+            start = self._server.initial_camera
+            start.position, start.look_at, start.up, start.fov = pose[:3, 3], ahead, -pose[:3, 1], fov
+        for one in self._server.get_clients().values() if client is None else [client]:
+            with one.atomic():
+                one.camera.position, one.camera.look_at = pose[:3, 3], ahead
+                one.camera.up_direction, one.camera.fov = -pose[:3, 1], fov
+
+    def look_around(self) -> None:
+        """Look at all that is shown, from above and aside."""
+        low, high = bounds_of(self._shown.values())
+        middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+        eye = middle + size * np.array([0.7, -0.9, 0.6])
+        side = 720
+        self.look_through(
+            Camera.look_at(eye, middle, width=side, height=side, fov_x=float(np.degrees(_START_FOV)), near=1e-3)
+        )
+
+    def _distance(self, pose: Float64Array) -> float:
+        """How far ahead of a camera that is what the view turns around [m]."""
+        middle = bounds_of(self._shown.values()).mean(axis=0)
+        return max(float((middle - pose[:3, 3]) @ pose[:3, 2]), 0.05)
+
+    def _add_group(self, group: str) -> None:
+        if group in self._boxes:
+            return
+        visible = group not in HIDDEN_FIRST
+        root = self._server.scene.add_frame(f"/{group}", show_axes=False, visible=visible)
+        with self._groups:
+            box = self.gui.add_checkbox(group, visible)
+        self._boxes[group] = box
+
+        box.on_update(lambda _: setattr(root, "visible", box.value))
+
+    def _add(self, part: Part) -> Any:
+        scene, thing = self._server.scene, part.thing
+        place = {"position": part.pose[:3, 3], "wxyz": _wxyz(part.pose)}
+        if isinstance(thing, Cloud):
+            return scene.add_gaussian_splats(part.name, **splat_arrays(thing.thinned(self._gaussians)), **place)
+        if isinstance(thing, Surface):
+            opacity = None if thing.opacity == 1.0 else thing.opacity
+            vertices, faces = np.asarray(thing.mesh.vertices, dtype=np.float32), np.asarray(thing.mesh.faces)
+            return scene.add_mesh_simple(
+                part.name,
+                vertices,
+                faces,
+                color=thing.colour,
+                opacity=opacity,
+                flat_shading=True,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+                **place,
+            )
+        if isinstance(thing, Lines):
+            colours = np.array(thing.colour, dtype=np.uint8)
+            return scene.add_line_segments(
+                part.name, thing.segments, colours, thickness=2.0, thickness_units="screen", **place
+            )
+        if isinstance(thing, Points):
+            size = 0.002 * float(np.linalg.norm(np.ptp(thing.points, axis=0)) if len(thing.points) else 1.0)
+            return scene.add_point_cloud(part.name, thing.points, thing.colours, point_size=size, **place)
+        return self._add_frustum(part.name, thing, place)
+
+    def _add_frustum(self, name: str, thing: Frustum, place: dict[str, Any]) -> Any:
+        camera = thing.camera
+        handle = self._server.scene.add_camera_frustum(
+            name,
+            fov=2 * float(np.arctan(0.5 * camera.height / camera.fy)),
+            aspect=camera.width / camera.height,
+            scale=thing.depth,
+            thickness=1.5,
+            thickness_units="screen",
+            color=thing.colour,
+            **place,
+        )
+        handle.on_click(lambda event: self._clicked(thing.index, event.client))
+        return handle
+
+
+def splat_arrays(splats: Splats) -> dict[str, Any]:
+    """Viser's arrays of Gaussians: centres, covariances, colours, opacities and a scale.
+
+    Covariances are sent as half floats, to which those of Gaussians of a millimetre would be lost: everything is sent
+    larger, and shown smaller again.
+    """
+    factor = _HALF_MAX / max(float(splats.scales.max(initial=0.0)), 1e-6)
+    axes = Rotation.from_quat(splats.quats).as_matrix() if len(splats) else np.zeros((0, 3, 3))
+    axes = axes * (factor * splats.scales.astype(np.float64))[:, None, :]
+    return {
+        "centers": (factor * splats.means).astype(np.float32),
+        "covariances": (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
+        "rgbs": base_colours(splats),
+        "opacities": splats.opacities[:, None],
+        "scale": 1.0 / factor,
+    }
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep viser from printing that it starts, and at which address, and that it stops."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def _wxyz(pose: Float64Array) -> Float64Array:
+    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))

@@ -1,0 +1,331 @@
+"""The page of a scene: its frames, drops, lights and camera, beside the real render of what is looked at."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array
+from mitsplat.errors import InputError
+from mitsplat.frames.layer_sheet import LAYERS, LayerName, draw_layer
+from mitsplat.physics.settle import replay_layout
+from mitsplat.quality import PRESETS, PresetName
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import Scene, load_scene, plan_frame
+from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec, PointLight, SpotLight
+from mitsplat.spec.objects import PRIMITIVES
+from mitsplat.view.page import Page
+from mitsplat.view.parts import Part, camera_parts, scene_parts
+from mitsplat.view.previews import PAUSES, NewestFirst, Preview, SceneRenders, ViewRequest, presets_up_to
+from mitsplat.view.yaml_lines import camera_lines, light_line, rounded, seed_line
+
+_INTERVAL = 0.04
+"""Between the moments of a drop that is played [s]."""
+_WIDTHS = ("320", "480", "640", "960", "1280")
+_NO_LIGHT = "none"
+
+
+class ScenePage:
+    """A scene file in the browser, until it is closed. What is moved there is told as lines for the file.
+
+    Args:
+        page: The page, still empty.
+        path: The scene file.
+        allow_outside: As :func:`mitsplat.load_scene` takes it.
+
+    Raises:
+        InputError: If the scene breaks a rule now; later its sentence is shown, and the last good scene stays.
+    """
+
+    def __init__(self, page: Page, path: Path, *, allow_outside: bool = False) -> None:
+        self._page, self._path, self._allow_outside = page, path, allow_outside
+        self._scene = load_scene(path, allow_outside=allow_outside)
+        self._seen = _content(path)
+        self._turn = threading.RLock()
+        self._index = 0
+        self._pose: Float64Array | None = None
+        self._lights: dict[int, LightSpec] = {}
+        self._layout: Layout | None = None
+        self._cameras: tuple[Any, list[Part]] = (None, [])
+        self._playing = False
+        self._fault: str | None = None
+        self._asked: ViewRequest | None = None
+        self._preview: tuple[ViewRequest, Preview] | None = None
+        self._renders = SceneRenders(lambda text: page.caption(f"{text} …"))
+        self._worker: NewestFirst[_Request, Layout | Preview] = NewestFirst(self._work, self._tell, self._refuse)
+        self._make_controls()
+        self._ask()
+        self._show(None)
+        page.look_through(self._plan().camera)
+        page.on_click(self._look_at_frame)
+        page.on_move(self._moved)
+
+    def close(self) -> None:
+        """Stop rendering."""
+        self._worker.close()
+
+    def check(self) -> None:
+        """Read the file again if it has changed; raise what went wrong in the thread that renders."""
+        self._worker.check()
+        content = _content(self._path)
+        if content == self._seen:
+            return
+        self._seen = content
+        try:
+            scene = load_scene(self._path, allow_outside=self._allow_outside)
+        except InputError as error:
+            self._fault = str(error)
+            self._page.alert(self._fault)
+            return
+        with self._turn:
+            self._fault = None
+            self._take(scene)
+
+    def _take(self, scene: Scene) -> None:
+        """Show another scene in place of this one."""
+        self._page.alert(self._fault)
+        self._scene, self._layout, self._lights = scene, None, {}
+        self._index = min(self._index, scene.num_frames - 1)
+        self._frame.max = max(scene.num_frames - 1, 1)
+        self._frame.value = self._index
+        self._seed.value = seed_line(scene.spec.seed)
+        self._light.options = self._light_names()
+        self._ask()
+
+    # What the browser asks for
+
+    def _make_controls(self) -> None:
+        gui, scene = self._page.gui, self._scene
+        with gui.add_folder("Frame"):
+            self._frame = gui.add_slider("frame", 0, max(scene.num_frames - 1, 1), 1, 0)
+            step = gui.add_button_group("layout", ("previous", "next"))
+            again = gui.add_button("Drop again", hint="Take the next seed, which decides everything that is random.")
+            play = gui.add_button("Play the drop")
+            self._seed = gui.add_text("YAML", seed_line(scene.spec.seed), multiline=True)
+        with gui.add_folder("Render"):
+            self._layer = gui.add_dropdown("layer", LAYERS)
+            self._finest = gui.add_dropdown("sharpen to", tuple(PRESETS), initial_value="exact")
+            self._width = gui.add_dropdown("width [px]", _WIDTHS, initial_value="640")
+        with gui.add_folder("Camera", expand_by_default=False):
+            back = gui.add_button("Back to the frame's camera")
+            self._camera_yaml = gui.add_text("YAML", "", multiline=True)
+        with gui.add_folder("Lights", expand_by_default=False):
+            self._light = gui.add_dropdown("light", self._light_names())
+            self._position = gui.add_vector3("position [m]", (0.0, 0.0, 0.0), step=0.01)
+            self._target = gui.add_vector3("target [m]", (0.0, 0.0, 0.0), step=0.01)
+            self._strength = gui.add_number("strength", 1.0, min=1e-6, step=0.1)
+            self._light_yaml = gui.add_text("YAML", "", multiline=True)
+            as_stated = gui.add_button("Lights as in the file")
+        self._handle = self._page.add_handle(lambda position: self._move_light(position=position))
+
+        self._frame.on_update(lambda event: self._look_at_frame(self._frame.value, event.client))
+        step.on_click(lambda event: self._step(1 if step.value == "next" else -1, event.client))
+        again.on_click(lambda _: self._drop_again())
+        play.on_click(lambda _: self._play())
+        self._layer.on_update(lambda _: self._show_preview())
+        self._finest.on_update(lambda _: self._ask())
+        self._width.on_update(lambda _: self._ask())
+        back.on_click(lambda event: self._look_at_frame(self._index, event.client, anew=True))
+        self._light.on_update(lambda _: self._choose_light())
+        self._position.on_update(lambda _: self._move_light(position=self._position.value))
+        self._target.on_update(lambda _: self._move_light(target=self._target.value))
+        self._strength.on_update(lambda _: self._move_light(strength=self._strength.value))
+        as_stated.on_click(lambda _: self._reset_lights())
+
+    def _look_at_frame(self, index: int, client: Any = None, *, anew: bool = False) -> None:
+        """Look through the camera of a frame."""
+        with self._turn:
+            index = min(max(int(index), 0), self._scene.num_frames - 1)
+            if index == self._index and not anew and self._pose is None:
+                return
+            other = index // self._views != self._index // self._views
+            self._index, self._pose = index, None
+            self._layout = None if other else self._layout
+            self._frame.value = index
+            self._page.look_through(self._plan().camera, client)
+            self._ask()
+
+    def _step(self, layouts: int, client: Any) -> None:
+        self._look_at_frame(self._index + layouts * self._views, client)
+
+    def _drop_again(self) -> None:
+        with self._turn:
+            self._take(reseeded(self._scene, self._scene.spec.seed + 1))
+
+    def _play(self) -> None:
+        with self._turn:
+            self._playing = True
+            self._ask()
+
+    def _moved(self, camera: Any) -> None:
+        """A browser's camera was moved, by hand unless it is where the frame's is."""
+        with self._turn:
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
+            pose[:3, 3] = camera.position
+            now = self._plan().camera.world_from_camera if self._pose is None else self._pose
+            if np.allclose(pose, now, atol=1e-4):
+                return
+            self._pose = pose
+            self._camera_yaml.value = camera_lines(pose, camera.look_at, self._scene.spec.camera.intrinsics)
+            if not self._playing:
+                self._ask()
+
+    def _choose_light(self) -> None:
+        with self._turn:
+            number = self._chosen
+            light = None if number is None else self._lights_now()[number]
+            placed = light is not None and not isinstance(light, EnvironmentLight)
+            self._handle.visible = placed
+            self._light_yaml.value = "" if light is None else light_line(light)
+            if light is None:
+                return
+            if not isinstance(light, EnvironmentLight):
+                self._position.value = self._handle.position = light.position
+            if isinstance(light, AreaLight | SpotLight):
+                self._target.value = light.target
+            self._strength.value = getattr(light, _strength_of(light))
+
+    def _move_light(self, **changed: Any) -> None:
+        """Put what was changed of the chosen light in place of what the file says."""
+        with self._turn:
+            number = self._chosen
+            if number is None:
+                return
+            light = self._lights_now()[number]
+            moved = changed_light(light, **changed)
+            if moved == light:
+                return
+            self._lights[number] = moved
+            self._choose_light()
+            self._show(self._layout)
+            self._ask()
+
+    def _reset_lights(self) -> None:
+        with self._turn:
+            self._lights = {}
+            self._choose_light()
+            self._show(self._layout)
+            self._ask()
+
+    # What is shown of it
+
+    @property
+    def _views(self) -> int:
+        return self._scene.spec.output.views
+
+    @property
+    def _chosen(self) -> int | None:
+        name = self._light.value
+        return None if name == _NO_LIGHT else int(name.partition(":")[0])
+
+    def _light_names(self) -> tuple[str, ...]:
+        return (_NO_LIGHT, *(f"{i}: {light.kind}" for i, light in enumerate(self._plan().lights)))
+
+    def _plan(self) -> Any:
+        return plan_frame(self._scene, self._index, self._layout)
+
+    def _lights_now(self) -> tuple[LightSpec, ...]:
+        return tuple(self._lights.get(i, light) for i, light in enumerate(self._plan().lights))
+
+    def _show(self, layout: Layout | None) -> None:
+        around = self._scene, self._index // self._views, layout is None
+        if self._cameras[0] != around:
+            self._cameras = around, list(camera_parts(self._scene, self._index, layout))
+        self._page.show([*scene_parts(self._scene, self._index, layout, self._lights_now()), *self._cameras[1]])
+
+    def _show_preview(self) -> None:
+        if self._preview is not None:
+            preview = self._preview[1]
+            layer: LayerName = self._layer.value if self._layer.value in LAYERS else "picture"
+            title, image = draw_layer(preview.frame, layer)
+            cost = f"**{preview.preset}** {preview.seconds:.2f} s{told_error(preview)}"
+            self._page.show_picture(image, f"{cost} – {title}")
+
+    def _ask(self) -> None:
+        with self._turn:
+            lights = self._lights_now() if self._lights else None
+            finest: PresetName = self._finest.value if self._finest.value in PRESETS else "exact"
+            width = int(self._width.value) if self._width.value in _WIDTHS else 640
+            self._asked = ViewRequest(self._scene, self._index, self._pose, lights, width, finest)
+            self._worker.ask((self._asked, self._playing))
+
+    # In the thread that renders
+
+    def _work(self, request: _Request) -> Iterator[Layout | Preview]:
+        view, playing = request
+        layout = self._renders.layout(view.scene, view.index)
+        if playing:
+            for moment in replay_layout(view.scene, layout, interval=_INTERVAL):
+                yield moment
+                self._worker.wait(_INTERVAL)
+        yield layout
+        for preset in presets_up_to(view.finest):
+            if self._worker.wait(PAUSES[preset]):
+                yield self._renders.render(view, preset)
+
+    def _tell(self, request: _Request, result: Layout | Preview) -> None:
+        with self._turn:
+            if isinstance(result, Layout):
+                if request[0].scene is self._scene and result.index == self._index // self._views:
+                    self._layout = result
+                    self._show(result)
+                return
+            self._preview = request[0], result
+            self._page.alert(self._fault)  # what an earlier view was refused for is over
+            self._show_preview()
+            if self._playing and request[1]:
+                self._playing = False
+                if self._pose is not request[0].pose:
+                    self._ask()
+
+    def _refuse(self, error: InputError) -> None:
+        with self._turn:
+            self._playing = False
+            self._page.alert(str(error))
+
+
+_Request = tuple[ViewRequest, bool]
+"""A view, and whether the drop is played before."""
+
+
+def reseeded(scene: Scene, seed: int) -> Scene:
+    """The scene with another seed; what was read stays the same objects, unless the seed decides that as well."""
+    if any(entry.pool == PRIMITIVES for entry in scene.spec.objects):
+        return load_scene(scene.path, overrides={"seed": seed}, allow_outside=True)
+    return replace(scene, spec=scene.spec.model_copy(update={"seed": seed}))
+
+
+def changed_light(light: LightSpec, *, position: Any = None, target: Any = None, strength: Any = None) -> LightSpec:
+    """A light of a frame elsewhere, or of another strength; what it has not is left out."""
+    update: dict[str, Any] = {}
+    if position is not None and not isinstance(light, EnvironmentLight):
+        update["position"] = rounded(position)
+    if target is not None and isinstance(light, AreaLight | SpotLight):
+        update["target"] = rounded(target)
+    if strength is not None:
+        update[_strength_of(light)] = float(strength)
+    return light.model_copy(update=update)
+
+
+def told_error(preview: Preview) -> str:
+    """What is known of a preview's error, to stand behind its seconds."""
+    error = preview.frame.order_error
+    return "" if error is None else f", error of order ≤ {error['largest']:.2g}, mean {error['mean']:.1g}"
+
+
+def _strength_of(light: LightSpec) -> str:
+    return "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
+
+
+def _content(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None

@@ -1,0 +1,59 @@
+"""Lines of a scene file for what was moved in the view, to be copied into it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ruamel.yaml import YAML
+
+from mitsplat.arrays import Float64Array
+from mitsplat.spec.camera import Intrinsics
+from mitsplat.spec.lights import LightSpec
+
+
+def light_line(light: LightSpec) -> str:
+    """A light as an entry of ``lights:``, with what differs from the defaults."""
+    stated = {"kind": light.kind, **light.model_dump(exclude_defaults=True)}
+    return f"  - {_flow(stated)}\n"
+
+
+def camera_lines(pose: Float64Array, look_at: npt.ArrayLike, intrinsics: Intrinsics) -> str:
+    """A camera that stays at ``world_from_camera`` (4, 4), and looks at a point [m], as the key ``camera:``.
+
+    The point is moved onto the camera's axis, at the depth that it has.
+    """
+    eye = pose[:3, 3]
+    depth = max(float((np.asarray(look_at) - eye) @ pose[:3, 2]), 0.01)
+    key = {"eye": rounded(eye), "target": rounded(eye + depth * pose[:3, 2]), "up": rounded(-pose[:3, 1])}
+    lens = intrinsics.model_dump(exclude_defaults=True)
+    return f"camera:\n  kind: path\n  keys:\n    - {_flow(key)}\n  intrinsics: {_flow(lens)}\n"
+
+
+def seed_line(seed: int) -> str:
+    """The seed, as its key."""
+    return f"seed: {seed}\n"
+
+
+def rounded(vector: npt.ArrayLike) -> tuple[float, ...]:
+    """Coordinates [m] to a tenth of a millimetre."""
+    return tuple(round(float(value), 4) + 0.0 for value in np.asarray(vector))  # no negative zero
+
+
+def _flow(value: Mapping[str, Any]) -> str:
+    """A mapping in one line."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style, yaml.width = True, 10_000
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # in the order given
+    out = io.StringIO()
+    yaml.dump(_plain(value), out)
+    return out.getvalue().strip()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

@@ -1,0 +1,157 @@
+"""What is shown of a scene, and what of it is sent again when something changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsplat.asset import Asset
+from mitsplat.camera import look_at_pose
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import Scene, load_scene, plan_frame
+from mitsplat.spec.lights import AreaLight, EnvironmentLight, PointLight, SpotLight
+from mitsplat.splats import Splats
+from mitsplat.view.parts import (
+    Cloud,
+    Frustum,
+    Lines,
+    Part,
+    Surface,
+    asset_parts,
+    base_colours,
+    bounds_of,
+    camera_parts,
+    changes,
+    light_parts,
+    scene_parts,
+)
+from tests.bodies import pose_at
+from tests.conftest import box_asset
+
+
+@pytest.fixture
+def scene(scene_data, write_scene) -> Scene:
+    return load_scene(write_scene({**scene_data, "enclosure": {"margin": 0.1}}))
+
+
+def layout_at(scene: Scene, *heights: float) -> Layout:
+    return Layout.of_poses(scene, {"nut": [pose_at((0.1 * i, 0, z)) for i, z in enumerate(heights)]})
+
+
+def named(parts) -> dict[str, Part]:
+    return {part.name: part for part in parts}
+
+
+def test_a_scene_shows_everything_once(scene):
+    lights = plan_frame(scene, 0).lights
+    parts = [*scene_parts(scene, 0, layout_at(scene, 0.1, 0.2), lights), *camera_parts(scene, 0, None)]
+    found = named(parts)
+    assert len(found) == len(parts)
+    groups = {part.group for part in parts}
+    assert groups == {"splats", "meshes", "pieces", "shapes", "enclosure", "regions", "lights", "cameras"}
+    assert sum(part.group == "splats" for part in parts) == 2
+    assert sum(part.group == "cameras" for part in parts) == scene.num_frames
+    assert isinstance(found["/cameras/5"].thing, Frustum)
+    assert found["/cameras/5"].thing.index == 5
+    assert sum(part.group == "enclosure" for part in parts) == 5
+    box = found["/regions/main"].thing.segments
+    assert box.min(axis=(0, 1)) == pytest.approx(scene.spec.region.min)
+    assert box.max(axis=(0, 1)) == pytest.approx(scene.spec.region.max)
+    assert len(np.unique(np.sort(box.reshape(12, 6)), axis=0)) > 1
+    assert np.count_nonzero(box[:, 1] - box[:, 0], axis=1).tolist() == [1] * 12  # every edge is along one axis
+
+
+def test_before_a_layout_is_known_all_but_its_objects_is_shown(scene):
+    assert {part.group for part in scene_parts(scene, 0)} == {"shapes", "enclosure", "regions"}
+
+
+def test_a_drop_moves_what_is_there_and_sends_nothing_else(scene):
+    before, after = (named(scene_parts(scene, 0, layout_at(scene, *heights))) for heights in ((0.1, 0.2), (0.0, 0.2)))
+    removed, added, moved = changes(before, after)
+    assert (removed, added) == ([], [])
+    assert {part.name.split("/")[2] for part in moved} == {"0-nut-0"}
+    fewer = named(scene_parts(scene, 0, layout_at(scene, 0.1)))
+    removed, added, moved = changes(before, fewer)
+    assert sorted(removed) == ["/meshes/0-nut-1", "/pieces/0-nut-1/0", "/splats/0-nut-1"]
+    assert (added, moved) == ([], [])
+
+
+def test_a_scene_that_is_read_again_sends_what_differs_alone(scene_data, write_scene):
+    path = write_scene(scene_data)
+    before = load_scene(path)
+    scene_data["shapes"][0]["box"]["size"] = [1, 1, 0.2]
+    after = load_scene(write_scene(scene_data))
+    one, other = (named(scene_parts(scene, 0, layout_at(scene, 0.1))) for scene in (before, after))
+    removed, added, moved = changes(one, other)
+    assert removed == [part.name for part in added] == ["/shapes/table"]
+    assert moved == []
+
+
+def test_lights_are_where_they_shine_from(scene):
+    lights = (
+        AreaLight(position=(0, 0, 1), target=(0, 0, 0), size=(0.4, 0.2)),
+        SpotLight(position=(1, 0, 1), target=(0, 0, 0), cone=20),
+        PointLight(position=(0, 1, 1)),
+        EnvironmentLight(),
+    )
+    found = named(light_parts(lights))
+    assert sorted(found) == ["/lights/0", "/lights/0-aim", "/lights/1", "/lights/1-aim", "/lights/2"]
+    area = found["/lights/0"]
+    corners = area.thing.mesh.vertices @ area.pose[:3, :3].T + area.pose[:3, 3]
+    assert np.ptp(corners, axis=0) == pytest.approx([0.4, 0.2, 0])
+    spot = found["/lights/1"].thing.segments[:24].reshape(-1, 3)
+    assert np.degrees(np.arctan2(np.hypot(spot[:, 0], spot[:, 1]), spot[:, 2])) == pytest.approx(20)
+    assert np.linalg.norm(spot, axis=1) == pytest.approx(0.15)
+    assert found["/lights/2"].pose[:3, 3] == pytest.approx([0, 1, 1])
+
+
+def test_the_path_of_a_light_is_a_line(scene_data, write_scene):
+    scene_data["lights"][0]["path"] = [{"position": [0, 0, 1]}, {"intensity": 3}, {"position": [0, 1, 1]}]
+    found = named(scene_parts(load_scene(write_scene(scene_data)), 0))
+    assert found["/lights/path-0"].thing.segments.tolist() == [[[0, 0, 1], [0.5, 0, 1]], [[0.5, 0, 1], [0, 1, 1]]]
+
+
+def test_a_large_cloud_keeps_what_covers_most():
+    count = 100
+    scales = np.full((count, 3), 0.01, dtype=np.float32)
+    scales[:40] = 0.05
+    splats = Splats(
+        means=np.arange(3 * count).reshape(count, 3),
+        quats=np.tile([0, 0, 0, 1], (count, 1)),
+        scales=scales,
+        opacities=np.where(np.arange(count) < 30, 0.9, 0.01),
+        sh=np.zeros((count, 1, 3)),
+    )
+    kept = Cloud(splats).thinned(30)
+    assert np.array_equal(kept.means, splats.means[:30])
+    assert Cloud(splats).thinned(count) is splats
+
+
+def test_colours_are_those_from_all_sides_on_average():
+    splats = box_asset("nut").splats
+    sh = np.zeros((12, 4, 3), dtype=np.float32)
+    sh[:, 0], sh[:, 1:] = 0.25 / 0.28209479, 7.0
+    assert base_colours(replace(splats, sh=sh)) == pytest.approx(0.75)
+
+
+def test_an_asset_shows_its_splats_mesh_pieces_and_keypoints():
+    asset: Asset = replace(box_asset("nut"), keypoints={"top": (0, 0, 0.005)})
+    found = named(asset_parts(asset))
+    assert sorted(found) == ["/keypoints/all", "/meshes/nut", "/pieces/nut/0", "/splats/nut"]
+    low, high = bounds_of(found.values())
+    assert (high - low <= asset.mesh.extents + 1e-6).all()
+
+
+def test_things_that_look_the_same_are_not_sent_again():
+    pose = look_at_pose((1, 0, 1), (0, 0, 0))
+    line = np.zeros((1, 2, 3))
+    one = {"a": Part("/a/a", Lines(line, (1, 2, 3)), pose), "b": Part("/b/b", Surface(box_asset("x").mesh, (1, 1, 1)))}
+    other = {
+        "a": Part("/a/a", Lines(line.copy(), (1, 2, 3)), pose.copy()),
+        "b": Part("/b/b", Surface(box_asset("x").mesh, (1, 1, 1))),
+    }
+    assert changes(one, other) == ([], [], [])
+    other["b"] = replace(other["b"], thing=Surface(box_asset("x", (0.1, 0.1, 0.1)).mesh, (1, 1, 1)))
+    assert changes(one, other)[0] == ["b"]

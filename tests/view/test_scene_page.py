@@ -1,0 +1,181 @@
+"""The page of a scene without a browser: its controls are set as a browser would set them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import ByteImage
+from mitsplat.camera import look_at_pose
+from mitsplat.view.page import Address, Page
+from mitsplat.view.scene_page import ScenePage
+from tests.conftest import box_asset, small_scene
+
+LONG = 60
+
+
+@dataclass
+class Told:
+    """What the page was told to show."""
+
+    pictures: list[tuple[ByteImage, str]] = field(default_factory=list)
+    alerts: list[str | None] = field(default_factory=list)
+
+
+@dataclass
+class Shown:
+    page: Page
+    scene_page: ScenePage
+    told: Told
+    path: Path
+
+    def wait(self, what: Callable[[], Any]) -> Any:
+        """The first true answer, in good time."""
+        for _ in range(20 * LONG):
+            self.scene_page.check()
+            if answer := what():
+                return answer
+            time.sleep(0.05)
+        raise TimeoutError(what, self.told.alerts, self.page._caption.content)
+
+    def picture(self) -> ByteImage:
+        """The picture of what is looked at now."""
+        self.scene_page._ask()
+        asked = self.scene_page._asked
+        self.wait(lambda: self.scene_page._preview and self.scene_page._preview[0] is asked)
+        return self.told.pictures[-1][0]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
+    folder = tmp_path_factory.mktemp("view")
+    small_scene(
+        folder,
+        [box_asset("nut", (0.08, 0.06, 0.04)), box_asset("bolt", (0.04, 0.04, 0.1))],
+        [{"asset": "assets/nut"}, {"asset": "assets/bolt"}],
+        layouts=2,
+        views=2,
+    )
+    path = folder / "scene.yaml"
+    data = YAML(typ="safe").load(path)
+    data["shapes"] = [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}, "visible": True}]
+    data["lights"] = [{"kind": "area", "position": [0.5, 0, 1]}]
+    data["settle"] = {"stepper": "mujoco"}
+    write(path, data)
+    page = Page("test", Address(port=0), gaussians=100)
+    told = Told()
+    show, alert = page.show_picture, page.alert
+    page.show_picture = lambda image, text: (told.pictures.append((image, text)), show(image, text))
+    page.alert = lambda sentence: (told.alerts.append(sentence), alert(sentence))
+    scene_page = ScenePage(page, path)
+    scene_page._width.value, scene_page._finest.value = "320", "fast"
+    yield Shown(page, scene_page, told, path)
+    scene_page.close()
+    page.close()
+
+
+def write(path: Path, data: dict[str, Any]) -> None:
+    YAML(typ="safe", pure=True).dump(data, path)
+
+
+def look(pose: np.ndarray) -> Any:
+    """What viser tells of a browser's camera."""
+    wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    return SimpleNamespace(wxyz=wxyz, position=pose[:3, 3], look_at=np.zeros(3))
+
+
+def poses(shown: Shown) -> dict[str, np.ndarray]:
+    return {name: part.pose for name, part in shown.page._shown.items() if part.group == "splats"}
+
+
+def test_the_view_is_rendered_in_the_size_that_is_asked_for(shown):
+    first = shown.picture()
+    assert first.shape == (240, 320, 3)
+    assert first.std() > 10
+    assert sorted(poses(shown)) == ["/splats/0-nut-0", "/splats/1-bolt-0"]
+
+
+def test_a_frame_is_looked_through_and_left_by_moving(shown):
+    first = shown.picture()
+    shown.scene_page._frame.value = 1
+    second = shown.picture()
+    assert np.abs(second.astype(int) - first).mean() > 2
+    shown.scene_page._moved(look(shown.scene_page._plan().camera.world_from_camera))
+    assert shown.scene_page._pose is None  # it was moved there by the page
+    shown.scene_page._moved(look(look_at_pose((0, 0.2, 0.9), (0, 0, 0))))
+    assert shown.scene_page._pose is not None
+    above = shown.picture()
+    assert np.abs(above.astype(int) - second).mean() > 2
+    assert YAML(typ="safe").load(shown.scene_page._camera_yaml.value)["camera"]["keys"][0]["eye"] == [0.0, 0.2, 0.9]
+    shown.scene_page._look_at_frame(0)
+    assert np.abs(shown.picture().astype(int) - first).mean() < 1
+
+
+def test_layers_are_of_the_same_picture(shown):
+    shown.picture()
+    for layer in ("labels", "ids", "depth", "light", "highlight", "picture"):
+        shown.scene_page._layer.value = layer
+        assert layer in shown.told.pictures[-1][1]
+
+
+def test_a_light_is_moved_and_told_as_a_line(shown):
+    shown.scene_page._look_at_frame(0)
+    before = shown.picture()
+    shown.scene_page._light.value = "0: area"
+    assert shown.scene_page._position.value == pytest.approx((0.5, 0, 1))
+    shown.scene_page._position.value = (-0.2, 0.1, 0.3)
+    line = YAML(typ="safe").load(shown.scene_page._light_yaml.value)[0]
+    assert line["position"] == [-0.2, 0.1, 0.3]
+    after = shown.picture()
+    assert np.abs(after.astype(int) - before).mean() > 2
+    shown.scene_page._reset_lights()
+    assert np.abs(shown.picture().astype(int) - before).mean() < 1
+
+
+def test_another_drop_moves_objects(shown):
+    shown.picture()
+    before = poses(shown)
+    shown.scene_page._drop_again()
+    assert shown.scene_page._seed.value == "seed: 1\n"
+    shown.wait(lambda: not np.allclose(before["/splats/0-nut-0"], poses(shown)["/splats/0-nut-0"]))
+    assert len(poses(shown)) == 2
+    shown.scene_page._step(1, None)
+    assert shown.scene_page._index == 2
+    shown.wait(lambda: shown.scene_page._layout is not None and shown.scene_page._layout.index == 1)
+
+
+def test_a_drop_is_played(shown):
+    shown.scene_page._look_at_frame(0)
+    shown.picture()
+    seen = []
+    show = shown.scene_page._show
+    shown.scene_page._show = lambda layout: (seen.append(layout), show(layout))
+    shown.scene_page._play()
+    shown.wait(lambda: not shown.scene_page._playing)
+    heights = [max(instance.world_from_object[2, 3] for instance in layout.instances) for layout in seen]
+    assert len(heights) > 5
+    assert max(heights[:3]) > heights[-1] + 0.01
+
+
+def test_the_file_is_read_again_and_a_fault_keeps_the_last_good_scene(shown):
+    data = YAML(typ="safe").load(shown.path)
+    write(shown.path, {**data, "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, -1]}})
+    sentence = shown.wait(lambda: shown.told.alerts and shown.told.alerts[-1])
+    assert sentence.startswith(str(shown.path))
+    assert "must be above min along z (got -1, min is 0.02)" in sentence
+    kept = set(shown.page._shown)
+    data["shapes"].append({"name": "post", "box": {"size": [0.1, 0.1, 0.5]}, "visible": True})
+    write(shown.path, data)
+    shown.wait(lambda: "/shapes/post" in shown.page._shown)
+    assert shown.told.alerts[-1] is None
+    assert "/shapes/table" in kept
+    shown.picture()

@@ -19,7 +19,6 @@ the filtered ratio asks for.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,10 +28,11 @@ import mitsuba as mi
 from mitsplat.plugins.bounce import RadianceGrid, bounced_light
 from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import Beam, Emitters, receiver
+from mitsplat.plugins.footprint import Points
 from mitsplat.plugins.highlight import Lobe, mirrored_tent
 from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter
 from mitsplat.plugins.light_tiles import BLOCK, Tiles, block_order, parity
-from mitsplat.plugins.lit_surface import Surface
+from mitsplat.plugins.lit_surface import Surface, VisibleSurfaces
 from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import stable_order
@@ -70,8 +70,7 @@ class Accuracy:
 def light_factor(
     scene: Any,
     proxies: Proxies,
-    surface: Callable[[Any], Surface],
-    view: View,
+    visible: VisibleSurfaces,
     *,
     accuracy: Accuracy,
     seed: int,
@@ -88,20 +87,19 @@ def light_factor(
     Args:
         scene: Mitsuba scene whose emitters give the light.
         proxies: What can stand in its way.
-        surface: Gives the visible points of pixels (UInt32), which are counted row by row.
-        view: Camera.
+        visible: Where the camera's pixels, which are counted row by row, show something.
         accuracy: How many rays to spend.
         seed: Offset into the low-discrepancy sequence.
         point: Where in the scene rays are shared out among emitters by how much light they send [m].
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
         grid: Captured colours of the surroundings, for the light that they reflect to objects; None leaves it out.
     """
-    emitters = Emitters(scene, point)
-    everything = surface(dr.arange(mi.UInt32, view.width * view.height))
+    emitters, view = Emitters(scene, point), visible.view
+    everything = visible.at(dr.arange(mi.UInt32, view.width * view.height))
     needed, light = everything.valid, mi.Color3f(1)
     if accuracy.error > 0:
         pixel, inside = block_order(view)
-        tiles = _Tracer(emitters, proxies, surface(pixel), pixel, view, seed).search(inside)
+        tiles = _Tracer(emitters, proxies, visible.at(pixel), pixel, view, seed).search(inside)
         anew = everything.relit | (everything.specular > 0)
         needed = everything.valid & (anew | tiles.differs(FAINT * accuracy.error))
         light = dr.select(everything.valid, tiles.light(), 1)
@@ -110,25 +108,28 @@ def light_factor(
     index = dr.compress(needed)
     if not dr.width(index):
         return light, highlight
-    here = surface(index)
+    here = visible.at(index)
     dr.eval(here)
     light_filter = LightFilter(here, view, index)
-    tracer = _Tracer(emitters, proxies, here, index, view, seed)
-    places = _blockwise(light_filter.place, view)
-    rays = min(FIRST_RAYS, accuracy.most) if accuracy.error > 0 else accuracy.most
-    estimate = Estimate.nothing(dr.width(index))
-    estimate = tracer.trace(places, estimate, dr.opaque(mi.UInt32, rays), rays)
-    if rays < accuracy.most:
-        wanted = light_filter.rays_for(estimate, accuracy.error)
-        more = dr.gather(mi.Float, wanted, places) > dr.opaque(mi.Float, rays)
-        places = dr.gather(mi.UInt32, places, dr.compress(more))
-        if dr.width(places):
+    order = _blockwise(light_filter.place, view)
+    points = Points.of(visible, here, index, light_filter.place, order)
+    tracer = _Tracer(emitters, proxies, points.surface, dr.gather(mi.UInt32, index, points.owner), view, seed)
+    first = min(FIRST_RAYS, accuracy.most) if accuracy.error > 0 else accuracy.most
+    rows = points.rows(order)
+    rays = points.shared(dr.opaque(mi.UInt32, first), rows)
+    estimate = tracer.trace(rows, Estimate.nothing(dr.width(points.owner)), rays, first, points.turn(rows))
+    if first < accuracy.most:
+        wanted = light_filter.rays_for(points.summed(estimate), accuracy.error)
+        more = dr.gather(mi.Float, wanted, order) > dr.opaque(mi.Float, first)
+        rows = points.rows(dr.gather(mi.UInt32, order, dr.compress(more)))
+        if dr.width(rows):
             # Doubled until enough; pixels with the same number of rays go together, so that no lane waits for another.
-            level, extra = _doublings(dr.gather(mi.Float, wanted, places), rays, accuracy.most)
-            order = stable_order(level, LEVEL_BITS)
-            places, extra = (dr.gather(mi.UInt32, values, order) for values in (places, extra))
-            estimate = tracer.trace(places, estimate, extra, accuracy.most - rays, first=rays)
-    lit, base, shine, glare = light_filter.smooth(estimate)
+            owner = dr.gather(mi.UInt32, points.owner, rows)
+            level, extra = _doublings(dr.gather(mi.Float, wanted, owner), first, accuracy.most)
+            lane = stable_order(level, LEVEL_BITS)
+            rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.shared(extra, rows)))
+            estimate = tracer.trace(rows, estimate, extra, accuracy.most - first, points.turn(rows))
+    lit, base, shine, glare = light_filter.smooth(points.summed(estimate))
     share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
     light = mi.Color3f(*[v + dr.zeros(mi.Float, dr.width(needed)) for v in light])
     dr.eval(light, share, shine, glare)
@@ -138,12 +139,12 @@ def light_factor(
         own, pixels = gathered(here, special), dr.gather(mi.UInt32, index, special)
         part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
         dr.eval(own, part, shine, glare)
-        open_light, mirrored = emitters.open_light(receiver(own.position, own.normal), Lobe.of(own), own.valid)
+        open_light, mirrored, tent = _open_light(emitters, points, special)
         # Where no ray came from where the lobe is, as much of it arrives as of all light. (dr.mean would write the
         # width of the array into the kernel.)
         mirrored *= dr.select(glare > 0, shine / glare, dr.sum(part) / 3) * (dr.pi / reference)
         relit = part * open_light / reference
-        mirrored -= dr.select(own.relit, relit * mirrored_tent(own), 0)
+        mirrored -= dr.select(own.relit, relit * tent, 0)
         dr.eval(relit, mirrored)
         if grid is not None and proxies.static is not None:
             # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
@@ -153,6 +154,26 @@ def light_factor(
         highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
         dr.scatter(highlight, mirrored, pixels)
     return light, highlight
+
+
+def _open_light(emitters: Emitters, points: Points, special: Any) -> tuple[Any, Any, Any]:
+    """Means over the points of pixels, without occluders: irradiance, mirrored light, and what the tent's takes."""
+    rows = points.rows(special)
+    own = gathered(points.surface, rows)
+    dr.eval(own)
+    found = emitters.open_light(receiver(own.position, own.normal), Lobe.of(own), own.valid)
+    columns = *found, mirrored_tent(own), dr.select(own.valid, mi.Float(1), 0)
+    dr.eval(columns)
+    means = []
+    for column in columns:
+        by_row = dr.zeros(type(column), dr.width(points.owner))
+        dr.scatter(by_row, dr.select(own.valid, column, 0), rows)
+        dr.eval(by_row)
+        means.append(dr.gather(type(column), points.total(by_row), special))
+    *sums, count = means
+    light, mirrored, tent = (total / dr.maximum(count, 1) for total in sums)
+    dr.eval(light, mirrored, tent)
+    return light, mirrored, tent
 
 
 def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
@@ -180,7 +201,7 @@ class _Tracer:
 
     Attributes:
         surface: The points.
-        pixel: Where in the image each of them is.
+        pixel: Which of the image's each of them is in.
     """
 
     emitters: Emitters
@@ -214,17 +235,22 @@ class _Tracer:
         dr.eval(arriving, lost)
         return Tiles.of(arriving, lost, self.view)
 
-    def trace(self, places: Any, before: Estimate, rays: Any, most: int, *, first: int = 0) -> Estimate:
-        """What ``rays`` more rays, ``most`` at the most, add to an estimate at ``places``, which have had ``first``."""
+    def trace(self, places: Any, before: Estimate, rays: Any, most: int, turn: tuple[Any, Any]) -> Estimate:
+        """What ``rays`` more rays, ``most`` at the most, add to an estimate at ``places``.
+
+        ``turn`` says which number of its pixel's sequence a place takes first, and how many come until its next one.
+        """
         apart = self.proxies.apart
         if apart and most > WORD:
             for begin in range(0, most, WORD):
                 part = dr.minimum(dr.maximum(rays, begin) - begin, WORD)
-                before = self.trace(places, before, part, min(WORD, most - begin), first=first + begin)
+                before = self.trace(places, before, part, min(WORD, most - begin), turn)
             return before
         surface = gathered(self.surface, places)
         pixel = dr.gather(mi.UInt32, self.pixel, places)
-        start = self._start(pixel) + dr.opaque(mi.UInt32, first * BLOCK * BLOCK)
+        begin, step = turn
+        done = mi.UInt32(dr.gather(mi.Float, before.rays, places))
+        start, step = self._start(pixel) + (begin + done * step) * (BLOCK * BLOCK), step * (BLOCK * BLOCK)
         si = receiver(surface.position, surface.normal)
         origin = _origin(surface)
         lobe = Lobe.of(surface)
@@ -233,7 +259,7 @@ class _Tracer:
 
         def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:
             """Ray ``i`` of every point: where to, whether it counts, its number, and what is known to stop it."""
-            number = start + i * (BLOCK * BLOCK)
+            number = start + i * step
             beam = self.emitters.sample(si, _sequence(number), surface.valid)
             active = surface.valid & (dr.sum(beam.irradiance) > 0)
             return beam, active, number, [(word >> i & 1) != 0 for word in known]

@@ -93,44 +93,53 @@ class LightFilter:
 
     def rays_for(self, estimate: Estimate, error: float) -> Any:
         """Rays per pixel of ``index`` after which the filtered share of light has a standard error of ``error``."""
-        _, variance = self._share(estimate)
-        return estimate.rays * variance / (GAIN * error * error)
+        _, variance, shared = self._share(estimate)
+        gain = dr.fma((GAIN - 1) / (SMALL - 1), shared - 1, 1)
+        return estimate.rays * variance / (gain * error * error)
 
     def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any, Any]:
         """The first four sums of the estimate per ray, averaged over neighbours, at the pixels of ``index``."""
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.shine, estimate.glare)]
-        values = self.average(values, estimate.rays, RADIUS, self._share(estimate))
+        values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
         return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7]
 
-    def _share(self, estimate: Estimate) -> tuple[Any, Any]:
-        """Share of light that arrives, over 3 x 3 pixels, and its variance."""
+    def _share(self, estimate: Estimate) -> tuple[Any, Any, Any]:
+        """Share of light that arrives, over 3 x 3 pixels, its variance, and of how many pixels' rays that is."""
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [dr.sum(estimate.lit) * weight, dr.sum(estimate.base) * weight, estimate.squares * weight]
-        lit, base, squares = self.average(values, estimate.rays, 1)
+        (lit, base, squares), shared = self._average(values, estimate.rays, 1)
         share = dr.select(base > 0, lit / base, 1)
-        draws = dr.maximum(SMALL * estimate.rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
+        draws = dr.maximum(shared * estimate.rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
         likely = (share * draws + 0.5) / (draws + 1)
         variance = likely * (1 - likely) / draws
         dr.eval(share, variance)
-        return share, variance
+        return share, variance, shared
 
-    def average(self, values: list[Any], rays: Any, radius: int, share: tuple[Any, Any] | None = None) -> list[Any]:
-        """Averages at the pixels of ``index`` of values there, weighted by rays.
+    def average(self, values: list[Any], rays: Any, radius: int) -> list[Any]:
+        """Averages at the pixels of ``index`` of values there, weighted by rays."""
+        return self._average(values, rays, radius)[0]
+
+    def _average(
+        self, values: list[Any], rays: Any, radius: int, share: tuple[Any, Any] | None = None
+    ) -> tuple[list[Any], Any]:
+        """The same, and of how many pixels of equal weight and as many rays an average has the noise.
 
         Given a ``share`` of light and its variance, only those neighbours count whose share noise explains.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
         traits = _packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])
+        alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
-            values = self._average_along(values, traits, direction, radius, share)
-            dr.eval(values)
-        return values
+            values, along = self._average_along(values, traits, direction, radius, share)
+            alike *= along
+            dr.eval(values, alike)
+        return values, alike
 
     def _average_along(
         self, values: list[Any], traits: Any, direction: tuple[int, int], radius: int, share: tuple[Any, Any] | None
-    ) -> list[Any]:
+    ) -> tuple[list[Any], Any]:
         """Averages over the pixels up to ``radius`` away along a direction (x, y), of which the last ones count half.
 
         A loop that is traced once, because a step takes the host as long as the device.
@@ -142,7 +151,7 @@ class LightFilter:
         own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_TRAITS, width))[8]
         last = dr.opaque(mi.UInt32, radius)
 
-        def add(step: Any, weights: Any, *sums: Any) -> tuple[Any, ...]:
+        def add(step: Any, weights: Any, squares: Any, *sums: Any) -> tuple[Any, ...]:
             distance = (step >> 1) + 1
             signed = dr.select((step & 1) == 0, -mi.Int32(distance), mi.Int32(distance))
             nx, ny = x + signed * along_x, y + signed * along_y
@@ -160,6 +169,7 @@ class LightFilter:
             same &= (near & (known == here.known)) | (known & ~here.known)
             # Halves at the ends: the filter spans one period of the dither, not one pixel more.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
+            squares += dr.select(same, weight * weight * rays, 0)
             weight = dr.select(same, weight * rays, 0)
             theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))
             # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
@@ -167,12 +177,15 @@ class LightFilter:
                 dr.fma(weight, their - own, total)
                 for their, own, total in zip(theirs[: len(values)], values, sums, strict=True)
             ]
-            return step + 1, weights + weight, *changed
+            return step + 1, weights + weight, squares, *changed
 
-        state = dr.zeros(mi.UInt32, width), own_rays * dr.select(here.known, 1, GUESS_WEIGHT)
+        own_weight = dr.select(here.known, mi.Float(1), GUESS_WEIGHT)
+        state = dr.zeros(mi.UInt32, width), own_rays * own_weight, own_rays * own_weight * own_weight
         sums = [dr.zeros(mi.Float, width) for _ in values]
-        _, weights, *sums = dr.while_loop((*state, *sums), lambda step, *_: step < 2 * last, add, label="light filter")
-        return [own + total / weights for own, total in zip(values, sums, strict=True)]
+        state = *state, *sums
+        _, weights, squares, *sums = dr.while_loop(state, lambda step, *_: step < 2 * last, add, label="light filter")
+        averages = [own + total / weights for own, total in zip(values, sums, strict=True)]
+        return averages, weights * weights / (squares * own_rays)
 
 
 _TRAITS = 12

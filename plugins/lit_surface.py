@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mitsplat.plugins.device import gathered
-from mitsplat.plugins.proxies import Hit
+from mitsplat.plugins.proxies import Hit, Proxies
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.traits import Traits
 
@@ -69,47 +69,73 @@ class Seen:
     mesh: Any
 
 
-def lit_surface(traits: Traits, view: View, eye: Any, pixel: Any, seen: Seen, hit: Hit, static: Hit) -> Surface:
-    """Points that light is traced at: on the proxy where it agrees with what is seen, else at the seen depth.
+@dataclass(frozen=True, eq=False)
+class VisibleSurfaces:
+    """Where the pixels of a view show something that light falls on.
 
-    Args:
+    Attributes:
         traits: How shapes are lit.
         view: The camera.
-        eye: Where its rays start.
-        pixel: Which pixels.
+        proxies: The surfaces that splats stand for.
+        eye: Where the camera's rays start.
         seen: What all pixels show.
         hit: What their rays meet first of the proxies.
         static: What they meet first of those that do not move.
     """
-    seen, hit, static = gathered(seen, pixel), gathered(hit, pixel), gathered(static, pixel)
-    ray, depth, instance = mi.Ray3f(eye, seen.direction), seen.depth, seen.instance
-    cosine = view.cosine(ray)
-    met = hit.distance < dr.inf
-    known = ~met | (hit.instance == instance)
-    # What shows through or beside a dynamic object's proxy lies on a static one.
-    behind = instance == 0
-    same = dr.select(behind, static.distance < dr.inf, met & known)
-    proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
-    shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
-    towards = mi.Normal3f(-ray.d)
-    # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
-    on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
-    z = dr.select(on_proxy, proxy_depth, depth)
-    position = ray(z / cosine)
-    valid = (seen.alpha > 1 / 255) & (z > 0)
-    reach = dr.max(dr.abs(position))
-    return Surface(
-        position=position,
-        normal=mi.Vector3f(dr.select(same, shown[0], towards)),
-        face=mi.Vector3f(dr.select(same, shown[1], towards)),
-        lift=dr.select(on_proxy, shown[2], 0),
-        to_camera=-ray.d,
-        offset=dr.fma(z, 0.25 / view.fx, reach * 4e-6),
-        instance=mi.Float(instance),
-        trait=mi.Float(seen.trait),
-        relit=dr.gather(mi.Bool, traits.relit, seen.trait) | seen.mesh,
-        roughness=dr.gather(mi.Float, traits.roughness, seen.trait),
-        specular=dr.select(seen.mesh, 0, dr.gather(mi.Float, traits.specular, seen.trait)),
-        known=known,
-        valid=valid,
-    )
+
+    traits: Traits
+    view: View
+    proxies: Proxies
+    eye: Any
+    seen: Seen
+    hit: Hit
+    static: Hit
+
+    def at(self, pixel: Any) -> Surface:
+        """Points in the middle of pixels: on the proxy where it agrees with what is seen, else at the seen depth."""
+        return self._surface(*(gathered(columns, pixel) for columns in (self.seen, self.hit, self.static)))
+
+    def beside(self, pixel: Any, offset: Any) -> Surface:
+        """Points ``offset`` [px] (Point2f) off the middles of pixels, valid where a proxy of the same instance is."""
+        row = pixel // self.view.width
+        x, y = mi.Float(pixel - row * self.view.width) + 0.5, mi.Float(row) + 0.5
+        rays = self.view.rays_through(x + offset.x, y + offset.y)
+        hit, static = self.proxies.nearest(rays)
+        dr.eval(hit, static)
+        surface = self._surface(replace(gathered(self.seen, pixel), direction=rays.d), hit, static)
+        surface.valid &= mi.Float(hit.instance) == surface.instance
+        dr.eval(surface)
+        return surface
+
+    def _surface(self, seen: Seen, hit: Hit, static: Hit) -> Surface:
+        ray, depth, instance = mi.Ray3f(self.eye, seen.direction), seen.depth, seen.instance
+        cosine = self.view.cosine(ray)
+        met = hit.distance < dr.inf
+        known = ~met | (hit.instance == instance)
+        # What shows through or beside a dynamic object's proxy lies on a static one.
+        behind = instance == 0
+        same = dr.select(behind, static.distance < dr.inf, met & known)
+        proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
+        shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
+        towards = mi.Normal3f(-ray.d)
+        # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
+        on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
+        z = dr.select(on_proxy, proxy_depth, depth)
+        position = ray(z / cosine)
+        valid = (seen.alpha > 1 / 255) & (z > 0)
+        reach = dr.max(dr.abs(position))
+        return Surface(
+            position=position,
+            normal=mi.Vector3f(dr.select(same, shown[0], towards)),
+            face=mi.Vector3f(dr.select(same, shown[1], towards)),
+            lift=dr.select(on_proxy, shown[2], 0),
+            to_camera=-ray.d,
+            offset=dr.fma(z, 0.25 / self.view.fx, reach * 4e-6),
+            instance=mi.Float(instance),
+            trait=mi.Float(seen.trait),
+            relit=dr.gather(mi.Bool, self.traits.relit, seen.trait) | seen.mesh,
+            roughness=dr.gather(mi.Float, self.traits.roughness, seen.trait),
+            specular=dr.select(seen.mesh, 0, dr.gather(mi.Float, self.traits.specular, seen.trait)),
+            known=known,
+            valid=valid,
+        )

@@ -19,7 +19,7 @@ from mitsplat.plugins.edges import Edges
 from mitsplat.plugins.emitters import reference_irradiance
 from mitsplat.plugins.gaussian import Cloud, upload_cloud
 from mitsplat.plugins.light import Accuracy, light_factor
-from mitsplat.plugins.lit_surface import Seen, lit_surface
+from mitsplat.plugins.lit_surface import Seen, VisibleSurfaces
 from mitsplat.plugins.march import Image, largest_and_mean, trace
 from mitsplat.plugins.mirrored import SplatMirror
 from mitsplat.plugins.occlusion import Caster
@@ -282,8 +282,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             light, highlight = light_factor(
                 scene,
                 contents.proxies,
-                lambda pixel: lit_surface(contents.traits, view, rays.o, pixel, seen, hit, ground),
-                view,
+                VisibleSurfaces(contents.traits, view, contents.proxies, rays.o, seen, hit, ground),
                 accuracy=accuracy,
                 seed=seed,
                 point=self.reference,

@@ -1,0 +1,92 @@
+"""Light of pixels across which surfaces bend, against that of its points, and what is known of the noise there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.plugins import footprint
+from mitsplat.plugins.footprint import OFFSETS
+from mitsplat.plugins.light_filter import GAIN, SMALL, Estimate, LightFilter
+from mitsplat.plugins.lit_surface import Surface
+from mitsplat.plugins.rays import View
+from mitsplat.render.layers import make_integrator, make_splats_shape
+from tests.plugins.test_light import down_camera, floor, render
+
+SIZE, FINER = 24, 4
+
+
+def ridges(period: float, slope: float, extent: float = 0.5) -> trimesh.Trimesh:
+    """A roof of many ridges along y, whose tops lie at z = 0."""
+    count = int(2 * extent / period)
+    x = np.linspace(-extent, extent, 2 * count + 1)
+    z = np.where(np.arange(len(x)) % 2, 0.0, -slope * period / 2)
+    vertices = np.concatenate([np.stack([x, np.full_like(x, y), z], axis=1) for y in (-extent, extent)])
+    left = np.arange(2 * count)
+    far = left + len(x)
+    faces = np.concatenate([np.stack([left, left + 1, far], 1), np.stack([left + 1, far + 1, far], 1)])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_integrator()
+    pixel = 2 * np.tan(np.radians(10)) / SIZE
+    lamp = mi.ScalarTransform4f().look_at(origin=[1.2, 0, 2], target=[0, 0, 0], up=[0, 1, 0]).scale(0.1)
+    shapes = {
+        "ridges": make_splats_shape(
+            floor(0.5),
+            proxy=ridges(0.7 * pixel, 0.3),
+            instance=1,
+            capture_light="uniform",
+            roughness=0.4,
+            specular=0.5,
+        ),
+        "lamp": {
+            "type": "rectangle",
+            "to_world": lamp,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 100.0}},
+        },
+    }
+    own = render(shapes, down_camera(size=SIZE), samples=4)
+    monkeypatch.setattr(footprint, "_bends", lambda here, *_: here.instance < 0)
+    middles = render(shapes, down_camera(size=SIZE), samples=4)
+    large = render(shapes, down_camera(size=SIZE * FINER), samples=4)
+    inner = slice(2, -2)  # the picture's border has no neighbours beyond it
+    for name in ("light", "highlight"):
+        fine = getattr(large, name).reshape(SIZE, FINER, SIZE, FINER, 3)
+        at = [tuple(int(FINER * (0.5 + v)) for v in offset) for offset in OFFSETS]
+        twin = np.mean([fine[:, y, :, x] for x, y in at], axis=0)[inner, inner]
+        np.testing.assert_allclose(getattr(own, name)[inner, inner], twin, rtol=2e-3, atol=2e-3, err_msg=name)
+        assert np.abs(getattr(middles, name)[inner, inner] - twin).max() > 0.05
+
+
+def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
+    make_integrator()
+    camera = down_camera(size=9)
+    view = View(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    count, up = 81, mi.Vector3f(0, 0, 1)
+    pixel = dr.arange(mi.UInt32, count)
+    estimate = Estimate(
+        *[mi.Color3f(v * dr.ones(mi.Float, count)) for v in (2.0, 4.0)],
+        *[dr.full(mi.Float, v, count) for v in (0.0, 0.0, 36.0, 4.0)],
+    )
+
+    def wanted(trait: Any) -> float:
+        fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+        fields |= {"position": dr.zeros(mi.Point3f, count), "normal": up, "trait": mi.Float(trait)}
+        fields |= {"offset": mi.Float(1), "known": dr.full(mi.Bool, True, count)}
+        rays = LightFilter(Surface(**fields), view, pixel).rays_for(estimate, 0.03)
+        return float(np.array(rays)[40])
+
+    def twin(like: float, gain: float) -> float:
+        draws = 4 * like
+        share = (0.5 * draws + 0.5) / (draws + 1)
+        return 4 * share * (1 - share) / draws / (gain * 0.03**2)
+
+    assert wanted(dr.zeros(mi.Float, count)) == pytest.approx(twin(SMALL, GAIN), rel=1e-4)
+    assert wanted(pixel) == pytest.approx(twin(1, 1), rel=1e-4)

@@ -81,6 +81,8 @@ class CloudSet:
         counts = [self.counts[cloud] for cloud in chosen]
         total = int(sum(counts))
         number = dr.arange(mi.UInt32, total)
+        if total == 0:
+            return number, number
         if len(chosen) == 1:
             return dr.zeros(mi.UInt32, total), number + dr.opaque(mi.UInt32, self.first[chosen[0]])
         begins = np.cumsum(counts) - counts
@@ -91,7 +93,7 @@ class CloudSet:
             repeats, starts = (wrapped(mi.UInt32, values.astype(np.uint32)) for values in (repeats, starts))
             dr.scatter(owner, repeats, starts)
             owner = dr.cumsum(owner)
-        if total and not counts[0]:  # those without Gaussians before the first that has some
+        if not counts[0]:  # those without Gaussians before the first that has some
             owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
         shift = wrapped(mi.Int32, (np.array([self.first[cloud] for cloud in chosen]) - begins).astype(np.int32))
         local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, shift, owner))

@@ -16,7 +16,7 @@ from mitsplat.camera import Camera
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
 from mitsplat.plugins.tiles import PAIRS_MAX
-from mitsplat.quality import resolve_quality
+from mitsplat.quality import KERNELS, Quality, resolve_quality
 from mitsplat.scene.scene import Scene, plan_frame
 from mitsplat.splats import Splats
 
@@ -45,8 +45,6 @@ _VIEWS = 5
 _TILE = np.array([TILE_WIDTH, TILE_HEIGHT])
 _SAMPLE = 50_000
 """Gaussians of an asset that are looked at, of which the others are taken to be alike."""
-_REACH = 3.33
-"""Standard deviations to where an opaque Gaussian falls below 1/255."""
 
 
 def worker_memory(scene: Scene) -> WorkerMemory:
@@ -65,12 +63,12 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     splats = {id(one): one for one in (*around, *(one for pool in pools for one in pool))}.values()
     stored = sum(getattr(one, f.name).nbytes for one in splats for f in fields(one))
     count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
-    samples = replace(resolve_quality(spec.quality), **spec.rendering.model_dump()).grid
+    quality = replace(resolve_quality(spec.quality), **spec.rendering.model_dump())
     pixels = spec.output.width * spec.output.height
     cameras = [plan_frame(scene, int(i)).camera for i in np.linspace(0, scene.num_frames - 1, _VIEWS)]
     pairs = max(
-        sum(_pairs(one, camera, samples) for one in static)
-        + sum(number * _pairs(one, camera, samples, at=middle) for one, number in placed)
+        sum(_pairs(one, camera, quality) for one in static)
+        + sum(number * _pairs(one, camera, quality, at=middle) for one, number in placed)
         for camera in cameras
     )
     own = (
@@ -78,23 +76,27 @@ def worker_memory(scene: Scene) -> WorkerMemory:
         + COPIES * stored
         + PER_PLACED * count
         + PER_PAIR * min(pairs, PAIRS_MAX)
-        + PER_RAY * pixels * samples**2
+        + PER_RAY * pixels * quality.grid**2
         + (PER_OBJECT + PER_SEEN * pixels) * sum(most)
     )
     return WorkerMemory(own, shared=stored, gpu=max(own, WorkerMemory.gpu))
 
 
-def _pairs(splats: Splats, camera: Camera, samples: int, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:
-    """About how many tiles of 8 x 4 rays Gaussians cover together, no fewer, of an asset that stands at a place [m]."""
+def _pairs(splats: Splats, camera: Camera, quality: Quality, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:
+    """About how many tiles of 8 x 4 pixels Gaussians cover together, no fewer, of an asset that stands at a place [m].
+
+    Each reaches to where its opacity falls below the quality's cut, and as much wider as the kernel makes it.
+    """
     step = 1 + len(splats) // _SAMPLE
     means = splats.means[::step] + np.asarray(tuple(at), dtype=np.float32)
     pixel, depth = camera.project(means)
-    seen = depth > camera.near
-    slope = samples * max(camera.fx, camera.fy) / np.maximum(depth[seen], 1e-6)
-    axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:]  # of the widest outline that it can show
-    tiles = np.prod(2 * _REACH * axes * slope[:, None] / _TILE + 1, axis=1)
-    across = samples * np.array([camera.width, camera.height]) / _TILE
-    reach = _REACH * axes[:, 1] * slope / samples
-    x, y = pixel[seen].T
-    inside = (x > -reach) & (x < camera.width + reach) & (y > -reach) & (y < camera.height + reach)
+    above = splats.opacities[::step] / quality.alpha_min
+    seen = (depth > camera.near) & (above > 1)
+    slope = max(camera.fx, camera.fy) / np.maximum(depth[seen], 1e-6)
+    axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:] * slope[:, None]  # of the widest outline it can show
+    reach = np.sqrt(2 * np.log(above[seen]))[:, None] * np.sqrt(axes**2 + KERNELS[quality.kernel].variance)  # [px]
+    tiles = np.prod(2 * reach / _TILE + 1, axis=1)
+    image = np.array([camera.width, camera.height])
+    across, widest = image / _TILE, reach[:, 1:]
+    inside = ((pixel[seen] > -widest) & (pixel[seen] < image + widest)).all(axis=1)
     return step * float(np.minimum(tiles, np.prod(across + 1))[inside].sum())

@@ -17,7 +17,7 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.mesh_distance import Surface
@@ -26,11 +26,16 @@ from mitsplat.splats import Splats, split_similarity
 
 _OPAQUE = 0.9
 """Alpha of a pixel that shows a surface and no edge of it."""
-_COARSE_POINTS, _COARSE_STEPS = 400, 12
+_SAMPLES = 4000
+_COARSE_POINTS, _COARSE_STEPS = 400, 16
 _FINE_STEPS = 40
 _FINALISTS = 3
-_TRIM = 0.9
-"""Share of the points, the nearest ones, that a registration listens to."""
+_WIDE, _NARROW = 0.1, 0.01
+"""Distance at which a registration begins to doubt a point, as a share of the mesh's diagonal: at first, at last."""
+_MISSED = 0.05
+"""Distance beyond which a point counts as missed, however far it is, as a share of the diagonal."""
+_NEAREST = 0.9
+"""Share of the points, the nearest ones, that an offset is measured by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +113,9 @@ def invert_transform(path: Path) -> Float64Array:
 def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
     """Register a mesh of any frame and scale to points (N, 3) of the object's surface, of which parts may be missing.
 
-    Iterative closest points (Besl and McKay 1992) with scale, started from the 24 ways in which principal axes can be
-    matched, and finished by Gauss-Newton steps on the distances from the nearest planes (Chen and Medioni 1992).
+    Iterative closest points with scale, by Gauss-Newton steps on the distances from the nearest planes (Chen and
+    Medioni 1992), from the 24 ways in which principal axes can be matched: with few points from all, and with all
+    points from the best of them.
 
     Raises:
         InputError: If there are fewer than 100 points.
@@ -119,15 +125,17 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
     surface = Surface(mesh)
     rng = np.random.default_rng(0)
     few = points[rng.choice(len(points), min(_COARSE_POINTS, len(points)), replace=False)]
-    samples, _ = trimesh.sample.sample_surface(mesh, _COARSE_POINTS, seed=0)
+    samples = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0])
+    missed = _MISSED * mesh.scale
+    widths = mesh.scale * np.geomspace(_WIDE, _NARROW, _COARSE_STEPS)
     starts: list[tuple[float, int, Float64Array]] = []
-    for start in _starts(few, samples):
-        found = _procrustes_steps(surface, few, start, _COARSE_STEPS)
-        starts.append((_two_sided(surface, samples, few, found), len(starts), found))
+    for start in _starts(points, samples):
+        found = _plane_steps(surface, few, start, widths)
+        starts.append((_misfit(surface, samples[:_COARSE_POINTS], few, found, missed), len(starts), found))
     finals: list[tuple[float, int, Float64Array]] = []
     for _, _, start in sorted(starts)[:_FINALISTS]:
-        found = _plane_steps(surface, points, start, _FINE_STEPS)
-        finals.append((_two_sided(surface, samples, points, found), len(finals), found))
+        found = _plane_steps(surface, points, start, np.repeat(widths[-1], _FINE_STEPS))
+        finals.append((_misfit(surface, samples, points, found, missed), len(finals), found))
     _, _, mesh_from_splats = min(finals)
     distance = surface.nearest(_moved(points, mesh_from_splats))[2]
     splats_from_mesh = np.asarray(np.linalg.inv(mesh_from_splats), dtype=np.float64)
@@ -138,7 +146,7 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
 def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
     """How far a mesh is from surface points (N, 3) in the same frame."""
     nearest, normal, distance = Surface(mesh).nearest(points)
-    near = distance <= np.quantile(distance, _TRIM)
+    near = distance <= np.quantile(distance, _NEAREST)
     gap = np.einsum("nd,nd->n", normal, nearest - points)
     # Directions in which the surface can slide along itself stay at zero: the least-squares solution of least norm.
     shift, *_ = np.linalg.lstsq(normal[near], gap[near], rcond=1e-3)
@@ -171,47 +179,43 @@ def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
     return starts
 
 
-def _matched(
-    surface: Surface, points: Float64Array, matrix: Float64Array
-) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray]:
-    """Moved points, what is nearest to them on the surface and its normals, and which are near enough to count."""
-    moved = _moved(points, matrix)
-    nearest, normal, distance = surface.nearest(moved)
-    return moved, nearest, normal, distance <= np.quantile(distance, _TRIM)
+def _plane_steps(surface: Surface, points: Float64Array, matrix: Float64Array, widths: Float64Array) -> Float64Array:
+    """Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t.
 
-
-def _procrustes_steps(surface: Surface, points: Float64Array, matrix: Float64Array, steps: int) -> Float64Array:
-    for _ in range(steps):
-        moved, nearest, _, near = _matched(surface, points, matrix)
-        step, *_ = trimesh.registration.procrustes(moved[near], nearest[near], reflection=False)
-        matrix = step @ matrix
-    return matrix
-
-
-def _plane_steps(surface: Surface, points: Float64Array, matrix: Float64Array, steps: int) -> Float64Array:
-    """Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t."""
-    for _ in range(steps):
-        moved, nearest, normal, near = _matched(surface, points, matrix)
+    Points are weighted by Geman and McClure's kernel, of one width a step; they shrink (graduated non-convexity, Blake
+    and Zisserman 1987). As long as a nearly round part is turned wrongly, the few points that say so are the farthest
+    ones: without them, it would stay as it is.
+    """
+    for width in widths:
+        moved = _moved(points, matrix)
+        nearest, normal, distance = surface.nearest(moved)
+        weight = (1 + (distance / width) ** 2) ** -2
         middle = moved.mean(axis=0)
-        arm, normal, gap = (moved - middle)[near], normal[near], (nearest - moved)[near]
+        arm, gap = moved - middle, nearest - moved
         size = float(np.linalg.norm(arm, axis=1).mean())
         arm, gap = arm / size, gap / size
         rows = np.concatenate([np.cross(arm, normal), np.einsum("nd,nd->n", arm, normal)[:, None], normal], axis=1)
         wanted = np.einsum("nd,nd->n", gap, normal)
         # Directions in which the surface slides along itself, as around the axis of a turned part, stay as they are.
-        update = np.linalg.pinv(rows.T @ rows, rcond=1e-5, hermitian=True) @ (rows.T @ wanted)
+        weighted = rows.T * weight
+        update = np.linalg.pinv(weighted @ rows, rcond=1e-5, hermitian=True) @ (weighted @ wanted)
         turn = Rotation.from_rotvec(update[:3]).as_matrix() * (1 + float(np.clip(update[3], -0.1, 0.1)))
         step = np.eye(4)
         step[:3, :3], step[:3, 3] = turn, middle - turn @ middle + size * update[4:]
         matrix = step @ matrix
-        if np.abs(update).max() < 1e-6:
+        if width == widths[-1] and np.abs(update).max() < 1e-6:
             break
     return matrix
 
 
-def _two_sided(surface: Surface, samples: Float64Array, points: Float64Array, matrix: Float64Array) -> float:
-    """Mean distance both ways: a cloud that shrank into a corner is near the mesh, but the mesh not near the cloud."""
+def _misfit(
+    surface: Surface, samples: Float64Array, points: Float64Array, matrix: Float64Array, missed: float
+) -> float:
+    """Mean distance both ways: a cloud that shrank into a corner is near the mesh, but the mesh not near the cloud.
+
+    No point is left out, because the few that are far decide between two ways to lay a nearly symmetric part, and none
+    counts for more than ``missed``, because parts of the surface may be unseen.
+    """
     moved = _moved(points, matrix)
     there, back = surface.nearest(moved)[2], KDTree(moved).query(samples)[0]
-    trimmed = [float(np.sort(d)[: int(0.8 * len(d))].mean()) for d in (there, back)]
-    return sum(trimmed)
+    return float(np.minimum(there, missed).mean() + np.minimum(back, missed).mean())

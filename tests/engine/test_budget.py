@@ -1,8 +1,9 @@
 """The memory that workers are counted on to take: above real peaks, and following the scene."""
 
+import itertools
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,12 @@ from mitsplat.engine import pool as engine
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.frames import budget
 from mitsplat.frames.budget import worker_memory
-from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
+from mitsplat.plugins.gaussian import upload_cloud
+from mitsplat.plugins.project import Placement, merge_clouds
+from mitsplat.plugins.sensors import view_of
+from mitsplat.plugins.tiles import bin_gaussians
+from mitsplat.quality import PRESETS
+from mitsplat.render.layers import make_sensor
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
 from tests.conftest import BOTH, nut_and_bolt, small_scene
@@ -23,6 +29,7 @@ CHILD = """
 import sys, numpy as np
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
+from mitsplat.render.layers import make_sensor
 from mitsplat.scene.scene import load_scene
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 scene = load_scene(sys.argv[1])
@@ -94,18 +101,27 @@ def test_it_grows_with_what_a_scene_holds(scene, room):
     assert need.own - worker_memory(scene).own > budget.COPIES * size
     pixels = 320 * 240
     assert worker_memory(changed(width=640)).own - need.own > budget.PER_RAY * pixels
-    assert worker_memory(finer(2)).own - need.own > 3 * budget.PER_RAY * pixels
+    assert worker_memory(finer(2)).own - need.own == pytest.approx(3 * budget.PER_RAY * pixels)
 
 
-def test_pairs_of_gaussians_and_tiles_are_no_fewer_than_there_are():
-    """A disc that faces the camera covers the tiles that its outline's box meets at most, and some of them."""
-    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=64, height=48, fov_x=50)
-    for radius in (0.001, 0.02, 0.1):
-        one = Splats([[0.01, 0.02, 0]], [[0, 0, 0, 1]], [[radius, radius, 1e-4]], [0.9], np.zeros((1, 1, 3)))
-        across, down = 2 * budget._REACH * radius * camera.fx / 2 / np.array([TILE_WIDTH, TILE_HEIGHT])
-        assert across * down <= budget._pairs(one, camera, 1) <= (across + 1) * (down + 1) * 1.001
-    behind = Splats([[0, 0, -3.0]], [[0, 0, 0, 1]], [[0.1] * 3], [0.9], np.zeros((1, 1, 3)))
-    assert budget._pairs(behind, camera, 1) == 0
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("rendering", [{}, {"samples": 2}, {"kernel": "3dgs"}])
+def test_pairs_of_gaussians_and_tiles_are_no_fewer_than_there_are(preset, rendering):
+    """Of discs that face the camera: as many as the renderer lists, and not many more where they are wide."""
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=256, height=192, fov_x=50)
+    quality = replace(PRESETS[preset], **rendering)
+    view = view_of(make_sensor(camera)).sampled(quality.grid)
+    count, rng = 300, np.random.default_rng(0)
+    means = np.concatenate([rng.uniform(-0.3, 0.3, (count, 2)), np.zeros((count, 1))], axis=1)
+    for radius, opacity in itertools.product((0.001, 0.01, 0.05), (0.05, 0.99)):
+        scales = np.tile([radius, radius, 1e-4], (count, 1))
+        discs = Splats(means, np.tile([0, 0, 0, 1], (count, 1)), scales, [opacity] * count, np.zeros((count, 1, 3)))
+        clouds = merge_clouds([upload_cloud(*(getattr(discs, field.name) for field in fields(discs)))])
+        real = bin_gaussians(clouds, [Placement(0, np.eye(4), 1)], view, quality).pairs
+        need = budget._pairs(discs, camera, quality)
+        assert real <= need
+        assert radius == 0.001 or need < 1.5 * real
+    assert budget._pairs(discs, camera, quality, at=(0, 0, -3)) == 0
 
 
 @pytest.mark.parametrize(("own", "shared", "expected"), [(1, 0, 8), (2, 0, 5), (2, 5, 2), (20, 0, 1)])

@@ -281,6 +281,17 @@ def test_a_camera_that_stands_still_before_surroundings_without_splats() -> None
     assert pictures[0] == pictures[1] == pictures[2]
 
 
+def test_a_camera_that_stands_still_before_an_object_without_splats() -> None:
+    """Its proxy is all that there is of it; the same picture comes from a camera that just arrived."""
+    around = make_splats_shape(make_splats(20, 3))
+    bare = make_splats_shape(NOTHING, instance=1, proxy=trimesh.creation.box((0.2, 0.2, 0.1)))
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
+    scene, still = mi.load_dict({"type": "scene", "around": around, "bare": bare}), make_integrator(shadow="none")
+    pictures = [render_layers(still, scene, camera).rgb.tobytes() for _ in range(3)]
+    assert still._still is not None and still._still[1] is not None
+    assert set(pictures) == {render_layers(make_integrator(shadow="none"), scene, camera).rgb.tobytes()}
+
+
 def test_views_of_a_layout_share_what_was_uploaded(
     write_scene: WriteScene,
     scene_data: dict[str, Any],

@@ -10,12 +10,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mitsplat.gpu_memory import hide_full_gpus
 from mitsplat.llvm import use_bundled_llvm
 from mitsplat.version import __version__ as __version__
 
 use_bundled_llvm()
+hide_full_gpus()
 
-import mitsuba as _mi  # noqa: E402 - after Dr.Jit was told which LLVM to load
+import mitsuba as _mi  # noqa: E402 - after Dr.Jit was told which LLVM to load, and which GPUs not
 
 from mitsplat.variant import register_plugins as _register_plugins  # noqa: E402 - imports Mitsuba
 

@@ -15,7 +15,7 @@ import ctypes
 import os
 import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -24,11 +24,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.gpu_memory import NEEDED, VISIBLE, unused_gpu_memory
 from mitsplat.variant import VARIANTS, choose_variant
 
 Kind = Literal["cpu", "cuda"]
 
-VISIBLE = "CUDA_VISIBLE_DEVICES"
 NUMBER = "MITSPLAT_GPU"
 """Environment variable: the N of the ``cuda:N`` that alone is visible to this process."""
 
@@ -41,7 +41,7 @@ class Gpu:
 
     Attributes:
         name: As its maker calls it.
-        memory: All of it [bytes].
+        memory: What of it no program has taken [bytes], or all of it where that is unknown.
         ordinal: Its number as CUDA counts in this process; Dr.Jit computes on 0.
         bus: Its place on the PCI bus.
         id: What makes it alone visible to another process by ``CUDA_VISIBLE_DEVICES``; empty if it is alone already.
@@ -209,6 +209,10 @@ def visible_gpus() -> tuple[Gpu, ...] | Lack:
         return Lack("NVIDIA's driver is absent (libcuda.so.1)", "install it")
     count = ctypes.c_int(0)
     status = driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count))
+    unused = unused_gpu_memory()
+    if (status or not count.value) and any(memory < NEEDED for memory in unused.values()):
+        most = max(unused.values()) / 2**30
+        return Lack(f"programs have taken all but {most:.1f} GiB of the GPU's memory", "end one (`nvidia-smi` tells)")
     if status or not count.value:
         return Lack(f"NVIDIA's driver finds no GPU (status {status})", f"see what `nvidia-smi` and {VISIBLE} say")
     if _library("libnvoptix.so.1") is None:
@@ -216,11 +220,11 @@ def visible_gpus() -> tuple[Gpu, ...] | Lack:
             "NVIDIA's driver lacks OptiX, which traces rays (libnvoptix.so.1)",
             "install all of the driver (of a container: run it with NVIDIA_DRIVER_CAPABILITIES=all)",
         )
-    found = [_gpu(driver, ordinal, alone=count.value == 1) for ordinal in range(count.value)]
+    found = [_gpu(driver, ordinal, unused, alone=count.value == 1) for ordinal in range(count.value)]
     return tuple(found if os.environ.get(VISIBLE) else sorted(found, key=lambda gpu: gpu.bus))
 
 
-def _gpu(driver: Any, ordinal: int, *, alone: bool) -> Gpu:
+def _gpu(driver: Any, ordinal: int, unused: Mapping[str, int], *, alone: bool) -> Gpu:
     name, bus, number = (ctypes.create_string_buffer(size) for size in (256, 64, 16))
     handle, memory = ctypes.c_int(0), ctypes.c_size_t(0)
     driver.cuDeviceGet(ctypes.byref(handle), ordinal)
@@ -228,12 +232,13 @@ def _gpu(driver: Any, ordinal: int, *, alone: bool) -> Gpu:
     driver.cuDeviceGetPCIBusId(bus, len(bus), handle)
     driver.cuDeviceGetUuid(number, handle)
     driver.cuDeviceTotalMem_v2(ctypes.byref(memory), handle)
+    own = f"GPU-{uuid.UUID(bytes=number.raw)}"
     return Gpu(
         name.value.decode(errors="replace"),
-        memory.value,
+        unused.get(own, memory.value),
         ordinal,
         bus.value.decode(errors="replace"),
-        "" if alone else f"GPU-{uuid.UUID(bytes=number.raw)}",  # that of a part of a GPU would be another name
+        "" if alone else own,  # that of a part of a GPU would be another name
     )
 
 

@@ -14,19 +14,23 @@ IMAGES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 _SECONDS = 120
 _MEMORY = 6 << 30
 _TRIAL = """
-import resource, sys
+import os, resource, sys
 import mitsplat, mitsuba as mi
 mi.set_variant("scalar_rgb")
 files = list(zip(sys.argv[1::2], map(int, sys.argv[2::2])))
-most = max(memory for _, memory in files)
+with open("/proc/self/statm") as pages:  # a driver of a GPU may have set aside any amount of addresses
+    held = int(pages.read().split()[0]) * resource.getpagesize()
+most = held + max(memory for _, memory in files)
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 for path, memory in files:
-    resource.setrlimit(resource.RLIMIT_AS, (memory, most))
+    resource.setrlimit(resource.RLIMIT_AS, (held + memory, most))
     try:
         mi.Bitmap(path)
     except RuntimeError as error:
-        sys.exit(str(error).strip().splitlines()[-1])
+        print(str(error).strip().splitlines()[-1], file=sys.stderr, flush=True)
+        os._exit(1)
     print(flush=True)
+os._exit(0)  # within this limit, what ends a driver may never end
 """
 
 _Stamp = tuple[Path, int, int]

@@ -1,5 +1,6 @@
 """Devices by their names: what is refused, what ``auto`` chooses, and which GPU a process takes."""
 
+import os
 import uuid
 
 import mitsuba as mi
@@ -7,6 +8,7 @@ import pytest
 
 import mitsplat as ms
 from mitsplat import device as devices
+from mitsplat import gpu_memory
 from mitsplat.device import CPU, Device, LateDeviceError, current_device, find_device, gpu_environment, use_device
 from mitsplat.errors import InputError, MissingResourceError
 
@@ -40,6 +42,35 @@ class FakeDriver:
         memory._obj.value = int(self.gpus[handle.value][1] * 2**30)
 
 
+class FakeManagement:
+    """As much of NVML as tells of unused memory, given in GiB; it counts in the order of buses."""
+
+    def __init__(self, *unused):
+        self.unused, self.users = unused, 0
+
+    def nvmlInit_v2(self):
+        self.users += 1
+        return 0
+
+    def nvmlShutdown(self):
+        self.users -= 1
+
+    def nvmlDeviceGetCount_v2(self, count):
+        count._obj.value = len(self.unused)
+
+    def nvmlDeviceGetHandleByIndex_v2(self, index, handle):
+        handle._obj.value = 1 + index
+        return 0
+
+    def nvmlDeviceGetUUID(self, handle, name, size):
+        name.value = id_of(len(self.unused) - handle.value).encode()
+        return 0
+
+    def nvmlDeviceGetMemoryInfo(self, handle, memory):
+        memory._obj.total, memory._obj.unused = 99 * 2**30, int(self.unused[handle.value - 1] * 2**30)
+        return 0
+
+
 def id_of(ordinal):
     return f"GPU-{uuid.UUID(int=ordinal)}"
 
@@ -50,8 +81,9 @@ def machine(monkeypatch):
     monkeypatch.delenv(devices.VISIBLE, raising=False)
     monkeypatch.delenv(devices.NUMBER, raising=False)
 
-    def have(*gpus, optix=True, status=0):
+    def have(*gpus, optix=True, status=0, unused=None):
         libraries = {"libcuda.so.1": FakeDriver(*gpus, status=status)} if gpus or status else {}
+        libraries |= {} if unused is None else {"libnvidia-ml.so.1": FakeManagement(*unused)}
         libraries |= {"libnvoptix.so.1": object()} if optix else {}
 
         def load(name):
@@ -84,6 +116,10 @@ def test_a_device_that_is_none(text):
             r"lacks OptiX, which traces rays \(libnvoptix.so.1\): install all of the driver",
         ),
         ({"status": 100}, r"finds no GPU \(status 100\): see what `nvidia-smi` and CUDA_VISIBLE_DEVICES say"),
+        (
+            {"status": 100, "unused": [0.25]},
+            r"programs have taken all but 0.2 GiB of the GPU's memory: end one \(`nvidia-smi` tells\)",
+        ),
     ],
 )
 def test_without_a_gpu(machine, parts, words):
@@ -98,6 +134,38 @@ def test_without_a_gpu(machine, parts, words):
     assert (found.kind, found.gpus) == ("cpu", ())
     assert found.reason and "install" not in found.reason
     assert find_device("cpu") == CPU
+
+
+@pytest.mark.parametrize(
+    ("visible", "unused", "left"),
+    [
+        (None, (0.5, 20), id_of(0)),
+        (None, (20, 0.5), id_of(1)),
+        (None, (0.5,), ""),
+        ("1,0", (0.5, 20), "1"),
+        (id_of(1), (0.5, 20), ""),
+        (f"{id_of(1)},{id_of(0)}", (0.5, 20), id_of(0)),
+        ("0", (3, 20), "0"),
+        (None, (3, 20), None),
+        (None, (), None),
+        ("", (0.5,), ""),
+    ],
+)
+def test_a_full_gpu_is_hidden(machine, monkeypatch, visible, unused, left):
+    """Dr.Jit, which starts CUDA on all that it sees, would end the process there."""
+    machine(unused=unused)
+    if visible is not None:
+        monkeypatch.setenv(devices.VISIBLE, visible)
+    else:
+        monkeypatch.setenv(devices.VISIBLE, "to be put back")
+        monkeypatch.delenv(devices.VISIBLE)
+    gpu_memory.hide_full_gpus()
+    assert os.environ.get(devices.VISIBLE) == left
+
+
+def test_what_others_have_taken_is_not_for_workers(machine):
+    machine(ONE, TWO, unused=(60, 5))
+    assert [gpu.memory / 2**30 for gpu in find_device("cuda:all").gpus] == [60, 5]
 
 
 def test_gpus_by_name(machine):

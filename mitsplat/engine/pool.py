@@ -16,7 +16,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -521,7 +521,14 @@ def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> Non
             index = pipe.recv()
             try:
                 if device is not None:
-                    use_share(device)
+                    try:
+                        use_share(device)
+                    except (ImportError, RuntimeError, MissingResourceError) as error:
+                        if device == "cpu":
+                            raise
+                        # Others have taken its memory since the run began, or one has brought it down for all.
+                        pipe.send(replace(Failure.of(error), exhausted=True))
+                        continue
                     device = None
                 pipe.send(Finished(make(index, lambda text: pipe.send(Status(text)))))
             except Exception as error:  # noqa: BLE001 - the parent raises it

@@ -5,9 +5,10 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -233,8 +234,29 @@ def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
     """What a worker finds when it takes its device is told as what its frame found."""
     lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
     if isinstance(visible_gpus(), Lack):
-        with pytest.raises(MissingResourceError, match=r"^cuda cannot be used, as .*, or use the device cpu$"):
+        words = r"^frame 0 cannot be made: cuda cannot be used, as .*, or use the device cpu; finished frames are kept$"
+        with pytest.raises(MissingResourceError, match=words):
             list(run_frames(Variant(), {0: [0]}, note=print, device=lost))
+
+
+@pytest.mark.parametrize(("kind", "exhausted"), [("cuda", True), ("cpu", False)])
+def test_a_gpu_that_does_not_start_costs_a_worker(monkeypatch, kind, exhausted):
+    """As where one process has just brought it down for all; not so a CPU, for which waiting changes nothing."""
+
+    def fail(device):
+        raise ImportError("cuInit() failed")
+
+    frames, said = iter([7, 8]), []
+
+    def receive():
+        with suppress(StopIteration):
+            return next(frames)
+        raise EOFError
+
+    monkeypatch.setattr(engine, "use_share", fail)
+    monkeypatch.setattr(engine, "_end_with_parent", lambda: None)
+    engine._work(SimpleNamespace(recv=receive, send=said.append), kind, Variant())
+    assert [(answer.exhausted, answer.message) for answer in said] == [(exhausted, "cuInit() failed")] * 2
 
 
 @pytest.mark.parametrize(("own", "seen"), [("", "0"), ("GPU-a", "GPU-a")])

@@ -78,7 +78,7 @@ def id_of(ordinal):
 @pytest.fixture
 def machine(monkeypatch):
     """Gives this machine a driver, with or without OptiX."""
-    monkeypatch.delenv(devices.VISIBLE, raising=False)
+    monkeypatch.delenv(gpu_memory.VISIBLE, raising=False)
     monkeypatch.delenv(devices.NUMBER, raising=False)
 
     def have(*gpus, optix=True, status=0, unused=None):
@@ -155,12 +155,12 @@ def test_a_full_gpu_is_hidden(machine, monkeypatch, visible, unused, left):
     """Dr.Jit, which starts CUDA on all that it sees, would end the process there."""
     machine(unused=unused)
     if visible is not None:
-        monkeypatch.setenv(devices.VISIBLE, visible)
+        monkeypatch.setenv(gpu_memory.VISIBLE, visible)
     else:
-        monkeypatch.setenv(devices.VISIBLE, "to be put back")
-        monkeypatch.delenv(devices.VISIBLE)
+        monkeypatch.setenv(gpu_memory.VISIBLE, "to be put back")
+        monkeypatch.delenv(gpu_memory.VISIBLE)
     gpu_memory.hide_full_gpus()
-    assert os.environ.get(devices.VISIBLE) == left
+    assert os.environ.get(gpu_memory.VISIBLE) == left
 
 
 def test_what_others_have_taken_is_not_for_workers(machine):
@@ -182,7 +182,7 @@ def test_gpus_by_name(machine):
 
 def test_gpus_count_as_they_were_made_visible(machine, monkeypatch):
     machine(ONE, TWO)
-    monkeypatch.setenv(devices.VISIBLE, "3,1")
+    monkeypatch.setenv(gpu_memory.VISIBLE, "3,1")
     assert [find_device(f"cuda:{i}").gpus[0].name for i in range(2)] == ["One", "Two"]
 
 

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from contextlib import suppress
 
-from mitsplat.device import VISIBLE
+from mitsplat.gpu_memory import VISIBLE
 
 CONTROL = "nvidia-cuda-mps-control"
 """The program that starts the service and ends it."""

@@ -114,7 +114,12 @@ def test_it_ends_with_the_process_that_started_it(log: Path, monkeypatch: pytest
         "print(shared.environment[mps.PIPES], flush=True); time.sleep(300)"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        # As in a terminal: jobs in the background of a shell ignore Ctrl-C, and would sleep to their end.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     with process:
         assert process.stdout is not None

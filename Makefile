@@ -11,8 +11,9 @@ SPHINX := --builder html --fresh-env --fail-on-warning --keep-going --nitpicky -
 render: $(STAMPS)/package
 	$(VENV)/bin/mitsplat render scenes/workcell.yaml -o out/workcell --resume
 
+# In the order of the files: left to itself, the plugin ends with those of few tests, of which some take minutes.
 test: $(STAMPS)/tools
-	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile
+	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # What renders, on the GPU; tests/gpu also compares it with the CPU. The tests share the GPU.
 GPU_TESTS := tests/gpu tests/plugins tests/render tests/frames tests/fit tests/bake

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -176,13 +177,30 @@ def dataset(clean: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(clean, tmp_path / "out"))
 
 
+def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that one of the session's processes makes, and all read: it takes too long to be made by each."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    folder, whole = root / name, root / f"{name}.whole"
+    with (root / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not whole.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            whole.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
     """Rendered photos, and their true cameras."""
     from tests import rendered
 
-    folder = tmp_path_factory.mktemp("rendered")
-    return folder, rendered.render_capture(folder)
+    folder = made_once(tmp_path_factory, "rendered", rendered.render_capture)
+    names = sorted(path.name for path in folder.iterdir())
+    return folder, dict(zip(names, rendered.cameras(len(names)), strict=True))
 
 
 @pytest.fixture(scope="session")
@@ -193,10 +211,16 @@ def captured(
     from mitsplat.capture.pipeline import CaptureSettings, capture_photos
     from tests import rendered
 
-    given, out = tmp_path_factory.mktemp("given"), tmp_path_factory.mktemp("capture")
-    shutil.copytree(photos[0], given, dirs_exist_ok=True)
-    (given / "torn.png").write_bytes((given / "photo00.png").read_bytes()[:5000])
-    return given, out, capture_photos(given, out, CaptureSettings(board=rendered.BOARD))
+    def make(folder: Path) -> None:
+        given = Path(shutil.copytree(photos[0], folder / "given"))
+        (given / "torn.png").write_bytes((given / "photo00.png").read_bytes()[:5000])
+        found.append(capture_photos(given, folder / "out", settings))
+
+    settings = CaptureSettings(board=rendered.BOARD)
+    found: list[CaptureResult] = []
+    folder = made_once(tmp_path_factory, "captured", make)
+    given, out = folder / "given", folder / "out"
+    return given, out, found[0] if found else capture_photos(given, out, settings)
 
 
 @dataclass(frozen=True, eq=False)

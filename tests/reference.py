@@ -32,11 +32,11 @@ def render_reference(splats: Splats, camera: Camera, quality: Quality = PRESETS[
     rgb, alpha, depth = [], [], []
     colours = reference_colours(splats, camera)
     plain = (quality.response, quality.kernel) == ("perspective", "exact")
-    for u, v in slopes:
-        if plain:
-            opacity, z = responses(splats, camera, u, v)
-        else:
-            opacity, z = widened_responses(splats, camera, u, v, quality)
+    if plain:
+        along_rays = [responses(splats, camera, u, v) for u, v in slopes]
+    else:
+        along_rays = list(zip(*widened_responses(splats, camera, slopes, quality), strict=True))
+    for opacity, z in along_rays:
         order = np.argsort(z, kind="stable")
         opacity, z = opacity[order], z[order]
         transmittance = np.concatenate([[1.0], np.cumprod(1.0 - opacity)])
@@ -82,8 +82,8 @@ def responses(splats: Splats, camera: Camera, u: float, v: float) -> tuple[Array
     return np.where(z > camera.near, opacity, 0.0), z
 
 
-def widened_responses(splats: Splats, camera: Camera, u: float, v: float, quality: Quality) -> tuple[Array, Array]:
-    """The same under a kernel or along parallel rays, from the covariance that EWA projects (Zwicker et al. 2002).
+def widened_responses(splats: Splats, camera: Camera, slopes: Array, quality: Quality) -> tuple[Array, Array]:
+    """The same, (M, N), along rays (M, 2), under a kernel or as if parallel, by EWA (Zwicker et al. 2002).
 
     Depth and length of the ray are those of a joint Gaussian whose position on the image is known less well by K.
     """
@@ -100,17 +100,17 @@ def widened_responses(splats: Splats, camera: Camera, u: float, v: float, qualit
         widened = footprint + added
         if kernel.keeps_light:
             opacity = opacity * np.sqrt(np.linalg.det(footprint) / np.linalg.det(widened))
-        offset = np.array([u, v]) - np.array([x, y]) / depth
+        offset = slopes - np.array([x, y]) / depth
         whiten = np.diag(1 / scales) @ rotation.T
-        centre, step = whiten @ np.array([x / depth, y / depth, 1.0]), np.zeros(3)
+        centre, step = whiten @ np.array([x / depth, y / depth, 1.0]), np.zeros((len(slopes), 3))
         if quality.response == "perspective":
-            step = whiten[:, :2] @ np.linalg.solve(widened, footprint).T @ offset
-        length2 = np.sum((centre + step) ** 2) / np.sum(centre**2)
-        exponent = offset @ np.linalg.solve(widened, offset) / length2
-        opacities.append(min(opacity * np.exp(-0.5 * exponent), kernel.alpha_max))
-        depths.append(depth * (1 + centre @ step / np.sum(centre**2)) / length2)
-    z = np.array(depths)
-    return np.where(z > camera.near, opacities, 0.0), z
+            step = offset @ (whiten[:, :2] @ np.linalg.solve(widened, footprint).T).T
+        length2 = np.sum((centre + step) ** 2, axis=1) / np.sum(centre**2)
+        exponent = np.sum(offset * np.linalg.solve(widened, offset.T).T, axis=1) / length2
+        opacities.append(np.minimum(opacity * np.exp(-0.5 * exponent), kernel.alpha_max))
+        depths.append(depth * (1 + step @ centre / np.sum(centre**2)) / length2)
+    z = np.transpose(depths)
+    return np.where(z > camera.near, np.transpose(opacities), 0.0), z
 
 
 def reference_colours(splats: Splats, camera: Camera) -> Array:

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,6 +22,7 @@ from ruamel.yaml import YAML
 
 from mitsplat import device as devices
 from mitsplat.asset import Asset
+from mitsplat.bake.bake import BakeSettings
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.cli import app, main
@@ -393,8 +395,12 @@ def test_fit_wants_a_budget_with_a_unit(
     assert "--budget must be a time such as 90s" in capsys.readouterr().err
 
 
-def test_bake_takes_every_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What each does is read from the asset; processes of their own bake in test_shell.py and test_fresh.py."""
+def test_bake_takes_every_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What each does is read from the asset; processes of their own bake in full in test_shell.py."""
+    few = partial(BakeSettings, directions=4, samples=2, fit_views=2, fit_steps=2, verify_views=1)
+    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", few)
     box_asset("gear", (20.0, 30.0, 10.0)).mesh.export(tmp_path / "gear.glb")
     options = (
         "--class", "wheel", "--light", "studio", "--gaussians", 60, "--sh-degree", 1, "--units", 0.001, "--up", "y",

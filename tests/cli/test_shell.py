@@ -23,6 +23,7 @@ from ruamel.yaml import YAML
 
 from mitsplat.checks.preflight import check_scene
 from mitsplat.cli import app
+from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.scene import load_scene
 from tests.conftest import box_asset
 
@@ -94,7 +95,10 @@ def smaller(words: list[str]) -> list[str]:
 
 @pytest.fixture(scope="session")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what documented commands name: a scene with two kinds of parts, a mesh in mm, splats."""
+    """A folder with what documented commands name: a scene with two kinds of parts, a mesh in mm, splats.
+
+    The first commands settle layouts from nothing. Those that later ones take are there already: it is the same code.
+    """
     folder = tmp_path_factory.mktemp("desk")
     shipped = YAML(typ="safe", pure=True).load(ROOT / "scenes/workcell.yaml")
     parts = ("assets/hex_nut_m16", "assets/washer")
@@ -105,6 +109,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shipped["output"] |= {"width": 128, "height": 72, "layouts": 12, "views": 1}
     for name in ("workcell", "tray"):
         YAML(typ="safe", pure=True).dump(shipped, folder / f"scenes/{name}.yaml")
+    scene = load_scene(folder / "scenes/workcell.yaml")
+    for index in (3, 7):
+        settle_layout(scene, index)
     gear = trimesh.creation.box((30, 20, 10))
     gear.visual.vertex_colors = [200, 60, 40, 255]
     gear.export(folder / "gear.glb")

@@ -24,7 +24,7 @@ from sphinx.domains.python import PyObject
 
 ROOT = Path(__file__).parents[2]
 WINGS = (
-    *("scene", "physics", "render", "labels", "frames", "formats", "dataset", "engine", "audit", "report"),
+    *("spec", "scene", "physics", "render", "labels", "frames", "formats", "dataset", "engine", "audit", "report"),
     *("capture", "fit", "reconstruct", "bake", "checks"),
 )
 

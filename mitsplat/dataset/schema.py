@@ -146,12 +146,21 @@ class _Predicted(_Stored):
     cut: Count
 
 
+class _Motion(_Stored):
+    exposure: Annotated[float, Field(gt=0)]
+    velocity: Point
+    rotation: Point
+
+
 class _Viewpoint(_Stored):
     """How a camera was drawn: see :class:`mitsplat.scene.viewpoints.View`, whose units these are."""
 
     camera: Count = 0
     side: Literal["left", "right"] | None = None
     zoom: Annotated[float, Field(gt=0)] | None = None
+    aperture: Annotated[float, Field(ge=0)] | None = None
+    focus: Annotated[float, Field(gt=0)] | None = None
+    motion: _Motion | None = None
     handheld: tuple[float, float, float, float, float, float] | None = None
     target: Point | None = None
     object: Annotated[int, Field(ge=1, le=65535)] | None = None

@@ -30,6 +30,9 @@ SENSOR = Sensor()
 CURVE_STEPS = 1 << 14
 """Entries of the tone curve's table, evenly spaced in the square root of the input."""
 
+_LONGEST = 256.0
+"""Motion [px] from which on its steps are wider than a pixel."""
+
 CURVE_WHITE = 16.0
 """Linear input at the end of the table."""
 
@@ -81,29 +84,46 @@ def develop(
     tone: Tone = "neutral",
     sensor: Sensor = SENSOR,
     seed: int = 0,
+    swept: tuple[Float32Array, Float32Array] | None = None,
 ) -> ByteImage:
     """Linear picture (H, W, 3) to display-encoded bytes, as a camera would develop it.
 
     Args:
         linear: Linear sRGB, 1 = display white.
-        draws: ``exposure`` [stops], ``vignetting`` [stops in the corners], ``motion_blur`` [px] along ``motion_angle``
+        draws: ``exposure`` [stops], ``vignetting`` [stops in the corners], ``chromatic_aberration`` [px in the
+            corners, red outwards and blue inwards], ``motion_blur`` [px] along ``motion_angle``
             [degrees], ``iso``, ``white_balance`` [K], ``hue`` [degrees], ``saturation``, ``jpeg`` [quality]; what is
             missing changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
         sensor: What turns ``iso`` into noise.
         seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
+        swept: How far every pixel moves to the right and down while the shutter is open [px], each (H, W); none if
+            absent.
     """
     height, width = linear.shape[:2]
-    return develop_layers(device_array(linear), (height, width), draws, tone=tone, sensor=sensor, seed=seed).image()
+    how: dict[str, Any] = {"tone": tone, "sensor": sensor, "seed": seed, "swept": swept}
+    return develop_layers(device_array(linear), (height, width), draws, **how).image()
 
 
 def develop_layers(
-    linear: Any, shape: tuple[int, int], draws: Mapping[str, float], *, tone: Tone, sensor: Sensor, seed: int
+    linear: Any,
+    shape: tuple[int, int],
+    draws: Mapping[str, float],
+    *,
+    tone: Tone,
+    sensor: Sensor,
+    seed: int,
+    swept: tuple[Float32Array, Float32Array] | None = None,
 ) -> Development:
     """Begin to :func:`develop` a picture of the device (Color3f, flat and row-major over ``shape``)."""
     height, width = shape
     pixel = dr.arange(mi.UInt32, height * width)
     linear = _through_lens(linear, pixel, shape, draws)
+    if swept is not None:
+        linear = _smeared(linear, pixel, shape, swept)
+    if draws.get("motion_blur", 0.0):
+        kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
+        linear = blurred(linear, pixel, shape, kernel)
     if "iso" in draws:
         linear = sensed(linear, pixel, draws["iso"], sensor, seed)
     matrix = colour_matrix(
@@ -149,8 +169,10 @@ def _opaque(value: float) -> Any:
 
 
 def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mapping[str, float]) -> Any:
-    """Exposed, darker towards the corners, and blurred along a straight line by the camera's motion."""
+    """Exposed, with colours drawn apart and darker towards the corners."""
     height, width = shape
+    if draws.get("chromatic_aberration", 0.0):
+        linear = _drawn_apart(linear, pixel, shape, draws["chromatic_aberration"])
     if draws.get("exposure", 0.0):
         linear = linear * _opaque(2.0 ** draws["exposure"])
     if draws.get("vignetting", 0.0):
@@ -158,10 +180,57 @@ def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mappin
         x, y = mi.Float(pixel - row * width) + (0.5 - width / 2), mi.Float(row) + (0.5 - height / 2)
         share = (x * x + y * y) / (0.25 * (height**2 + width**2))
         linear = linear * dr.exp2(_opaque(-draws["vignetting"]) * share)
-    if draws.get("motion_blur", 0.0):
-        kernel = motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0))
-        return blurred(linear, pixel, shape, kernel)
     return linear
+
+
+def _drawn_apart(linear: Any, pixel: Any, shape: tuple[int, int], corner: float) -> Any:
+    """With red magnified about the middle so that it moves outwards by ``corner`` [px] there, and blue inwards."""
+    height, width = shape
+    picture = dr.ravel(mi.Vector4f(*linear, 0.0))
+    dr.eval(picture)
+    row = pixel // width
+    x, y = mi.Float(pixel - row * width), mi.Float(row)
+    along = _opaque(corner / float(np.hypot(width, height) / 2))
+    x_out, y_out = along * (x + (0.5 - width / 2)), along * (y + (0.5 - height / 2))
+    red, blue = (_between(picture, shape, x + sign * x_out, y + sign * y_out) for sign in (-1.0, 1.0))
+    return mi.Color3f(red.x, linear[1], blue.z)
+
+
+def _between(picture: Any, shape: tuple[int, int], x: Any, y: Any) -> Any:
+    """Bilinear interpolation of a picture at columns and rows [px]; beyond its border it goes on as it ends there."""
+    height, width = shape
+    x, y = dr.clip(x, 0.0, width - 1.0), dr.clip(y, 0.0, height - 1.0)
+    left, top = dr.minimum(mi.UInt32(x), max(0, width - 2)), dr.minimum(mi.UInt32(y), max(0, height - 2))
+    right, down = x - mi.Float(left), y - mi.Float(top)
+    one, line = min(1, width - 1), min(1, height - 1) * width
+    corner = top * width + left
+
+    def at(offset: int) -> Any:
+        return dr.gather(mi.Vector4f, picture, corner + offset)
+
+    upper = at(0) * (1 - right) + at(one) * right
+    lower = at(line) * (1 - right) + at(line + one) * right
+    return upper * (1 - down) + lower * down
+
+
+def _smeared(linear: Any, pixel: Any, shape: tuple[int, int], swept: tuple[Float32Array, Float32Array]) -> Any:
+    """The mean over the exposure of what moves through each pixel, as fast and in the direction as it itself does."""
+    width = shape[1]
+    picture = dr.ravel(mi.Vector4f(*linear, 0.0))
+    right, down = (wrapped(mi.Float, np.ascontiguousarray(way.ravel(), dtype=np.float32)) for way in swept)
+    longest = min(float(np.hypot(*swept).max()), _LONGEST)
+    count = dr.opaque(mi.UInt32, 1 + 2 * int(np.ceil(longest / 2)))
+    row = pixel // width
+    x, y = mi.Float(pixel - row * width), mi.Float(row)
+    dr.eval(picture, right, down)
+
+    def add(number: Any, total: Any) -> tuple[Any, Any]:
+        time = (mi.Float(number) + 0.5) / mi.Float(count) - 0.5
+        seen = _between(picture, shape, x + time * right, y + time * down)
+        return number + 1, total + mi.Color3f(seen.x, seen.y, seen.z)
+
+    state = mi.UInt32(0), mi.Color3f(0)
+    return dr.while_loop(state, lambda number, _: number < count, add, label="motion")[1] / mi.Float(count)
 
 
 def blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,13 @@ import numpy.typing as npt
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.scene.layout import Layout
+from mitsplat.scene.viewpoints import moved_by
 
 UNKNOWN_FLOW = 1e10
 """Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
+
+_FAR = 1e6
+"""Depth of what has none [m]: it moves by the camera's rotation alone."""
 
 
 def optical_flow(
@@ -53,6 +58,26 @@ def optical_flow(
     known &= ahead > following.near
     flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
     return flow.reshape(height, width, 2).astype(np.float32)
+
+
+def swept_by(
+    depth: npt.NDArray[np.floating[Any]], camera: Camera, motion: Mapping[str, Any]
+) -> tuple[Float32Array, Float32Array]:
+    """How far every pixel moves to the right and down [px] while the shutter is open, each (H, W).
+
+    What has no depth is infinitely far away.
+
+    Args:
+        depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
+        camera: Where it is in the middle of the exposure.
+        motion: As :class:`mitsplat.scene.viewpoints.View` has it.
+    """
+    far = np.where(depth > 0, depth, _FAR)
+    half = 0.5 * motion["exposure"] * np.concatenate([motion["velocity"], motion["rotation"]])
+    ends = (replace(camera, world_from_camera=camera.world_from_camera @ moved_by(way)) for way in (-half, half))
+    before, after = (optical_flow(far, camera, end) for end in ends)
+    swept = np.where((before == UNKNOWN_FLOW) | (after == UNKNOWN_FLOW), np.float32(0), after - before)
+    return swept[..., 0], swept[..., 1]
 
 
 def motions_of(before: Layout, after: Layout) -> dict[int, Float64Array | None]:

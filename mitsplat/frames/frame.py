@@ -22,7 +22,7 @@ from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND, develop_layers, light_layers
-from mitsplat.frames.flow import motions_of, optical_flow
+from mitsplat.frames.flow import motions_of, optical_flow, swept_by
 from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.masks import Silhouette
@@ -286,8 +286,15 @@ class Renderer:
             composite, shape = self.scene.spec.composite, layers.shape
             behind = self._background(draw_place(self.scene.spec, index).background, plan.camera)
             linear = light_layers(layers, composite, behind)
+            motion = plan.viewpoint.get("motion")
             development = develop_layers(
-                linear, shape, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed
+                linear,
+                shape,
+                plan.draws,
+                tone=composite.tone,
+                sensor=composite.sensor,
+                seed=plan.seed,
+                swept=None if motion is None else swept_by(layers.depth, plan.camera, motion),
             )
         with _timed(seconds, "silhouettes"):
             source = self.scene.spec.labels.source

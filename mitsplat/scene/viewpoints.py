@@ -20,7 +20,7 @@ from mitsplat.camera import Camera, direction, interpolate_poses, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.scene.streams import random_stream
 from mitsplat.sight import Prospect, Sight
-from mitsplat.spec.camera import CameraHemisphere, CameraOrbit, CameraSpec, CameraWalk, Handheld, Intrinsics
+from mitsplat.spec.camera import CameraHemisphere, CameraOrbit, CameraSpec, CameraWalk, Handheld, Intrinsics, Motion
 from mitsplat.spec.spec import Output
 
 if TYPE_CHECKING:
@@ -45,9 +45,11 @@ class View:
     Attributes:
         camera: The camera.
         drawn: What it was drawn or chosen by, as JSON values: the position of the ``camera`` among several, the
-            ``side`` of a stereo pair, ``zoom``, the motion of the hand (``handheld``, see :func:`moved_by`), the
-            ``target`` [m], the ``object`` that it is the middle of, which ``attempt`` it was, and what was
-            ``predicted`` of the labelled objects. Empty for a scene that has none of these.
+            ``side`` of a stereo pair, ``zoom``, ``aperture`` and ``focus`` of a thin lens [m], the ``motion`` while the
+            shutter is open (``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s] in the camera's frame),
+            the motion of the hand (``handheld``, see :func:`moved_by`), the ``target`` [m], the ``object`` that it is
+            the middle of, which ``attempt`` it was, and what was ``predicted`` of the labelled objects. Empty for a
+            scene that has none of these.
     """
 
     camera: Camera
@@ -90,7 +92,23 @@ class _Turn:
         if camera.handheld is not None:
             drawn["handheld"] = self._sway(camera.handheld).tolist()
             pose = pose @ moved_by(drawn["handheld"])
-        return camera_at(pose, camera.intrinsics, self.output, drawn.get("zoom", camera.zoom[0])), drawn
+        taken = camera_at(pose, camera.intrinsics, self.output, drawn.get("zoom", camera.zoom[0]))
+        if camera.defocus is not None:
+            rng = random_stream(self.seed, "camera defocus", self.index)
+            drawn["aperture"], drawn["focus"] = (
+                float(rng.uniform(*bounds)) for bounds in (camera.defocus.aperture, camera.defocus.focus)
+            )
+            taken = replace(taken, aperture_radius=drawn["aperture"], focus_distance=drawn["focus"])
+        if camera.motion is not None:
+            drawn["motion"] = self._motion(camera.motion)
+        return taken, drawn
+
+    def _motion(self, motion: Motion) -> dict[str, Any]:
+        """Exposure [s], velocity [m/s] and rate of rotation [degrees/s], in the camera's frame."""
+        rng = random_stream(self.seed, "camera motion", self.index)
+        exposure, *rates = (float(rng.uniform(*bounds)) for bounds in (motion.exposure, motion.speed, motion.rotation))
+        velocity, rotation = (rate * direction(2 * np.pi * rng.uniform(), rng.uniform(-1, 1)) for rate in rates)
+        return {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
 
     def _sway(self, hand: Handheld) -> Float64Array:
         """Displacement [m] and rotation vector [degrees] of a hand at a turn, shape (6,).

@@ -9,6 +9,7 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from mitsplat.camera import Lens
 from mitsplat.spec_types import (
     ElevationRange,
+    NonNegativeRange,
     Positive,
     PositiveRange,
     Range,
@@ -69,6 +70,31 @@ class Handheld(StrictModel):
     rotation: NonNegativeFloat = Field(0.0, description="Rotation about each axis, 1 sigma [degrees].")
 
 
+class Defocus(StrictModel):
+    """A thin lens that is drawn anew for every view, in place of the intrinsics' own."""
+
+    aperture: NonNegativeRange = Field(description="Radius of the aperture [m]; 0 for a pinhole.")
+    focus: PositiveRange = Field(description="Depth that is sharp [m].")
+
+
+class Motion(StrictModel):
+    """Steady motion of the camera while its shutter is open, drawn anew for every view in its own frame."""
+
+    exposure: PositiveRange = Field(description="How long the shutter is open [s].")
+    speed: NonNegativeRange = Field(
+        (0.0, 0.0), description="Speed [m/s], in a direction that is uniform on the sphere."
+    )
+    rotation: NonNegativeRange = Field(
+        (0.0, 0.0), description="Rate of rotation [degrees/s], about an axis that is uniform on the sphere."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Motion:
+        if not self.speed[1] and not self.rotation[1]:
+            raise FieldError((), "must have a speed or a rotation")
+        return self
+
+
 class Viewpoint(StrictModel):
     """What every kind of camera has."""
 
@@ -81,11 +107,32 @@ class Viewpoint(StrictModel):
     handheld: Handheld | None = Field(
         None, exclude_if=lambda handheld: handheld is None, description="Smooth random motion on top of the pose."
     )
+    defocus: Defocus | None = Field(
+        None,
+        exclude_if=lambda defocus: defocus is None,
+        description="Aperture and focus, drawn anew for every view.",
+    )
+    motion: Motion | None = Field(
+        None,
+        exclude_if=lambda motion: motion is None,
+        description="Motion that blurs the picture, near things more than far ones. Pose and labels are those of the "
+        "exposure's middle.",
+    )
     stereo: Stereo | None = Field(
         None,
         exclude_if=lambda stereo: stereo is None,
         description="Takes every view twice, from the left and then from the right; these are two of output.views.",
     )
+
+    @model_validator(mode="after")
+    def _check_defocus(self) -> Viewpoint:
+        if self.defocus is not None:
+            if self.intrinsics.aperture:
+                raise FieldError("defocus", "must not be given together with an aperture of the intrinsics")
+            if self.defocus.focus[0] <= self.intrinsics.near:
+                text = f"must be beyond near, {self.intrinsics.near:g} (got {self.defocus.focus[0]:g})"
+                raise FieldError(("defocus", "focus"), text)
+        return self
 
 
 class PoseKey(StrictModel):

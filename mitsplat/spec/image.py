@@ -31,6 +31,12 @@ class Randomise(StrictModel):
     )
     iso: PositiveRange | None = Field(None, description="Sensitivity of the sensor, hence its noise; none if absent.")
     vignetting: NonNegativeRange = Field((0.0, 0.0), description="Loss of light in the image's corners [stops].")
+    chromatic_aberration: Range = Field(
+        (0.0, 0.0),
+        exclude_if=lambda aberration: aberration == (0.0, 0.0),
+        description="How far the lens shifts red outwards, and blue inwards, in the image's corners [px]; green stays, "
+        "and so do labels.",
+    )
     motion_blur: NonNegativeRange = Field(
         (0.0, 0.0), description="Length of the camera's motion in the image, in a direction drawn anew [px]."
     )

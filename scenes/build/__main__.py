@@ -38,9 +38,9 @@ def bake_part(name: str, seed: int) -> BakeResult:
 
 
 def bake_environment(seed: int) -> BakeResult:
-    """The workcell under the lights of ``workcell.yaml``, which is the one place that states them."""
+    """The workcell under the lights of ``stacks.yaml``, which is the one place that states them."""
     scene = build_workcell(seed)
-    lights = load_yaml(SCENES / "workcell.yaml", SceneSpec).lights
+    lights = load_yaml(SCENES / "stacks.yaml", SceneSpec).lights
     target = (0.0, -0.08, 0.01)
     views = [
         Camera.look_at(eye, target, width=640, height=360, fov_x=50.0)

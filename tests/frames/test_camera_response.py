@@ -184,13 +184,15 @@ def test_motion_blur_is_a_correlation_beyond_replicated_borders(length: float, a
 def test_other_draws_compile_nothing() -> None:
     linear = np.random.default_rng(2).random((30, 40, 3)).astype(np.float32)
     names = ("exposure", "vignetting", "motion_blur", "motion_angle", "iso", "white_balance", "hue", "saturation")
-    drawn = [(0.3, 0.5, 3.0, 20.0, 200.0, 5000.0, 3.0, 1.1), (-0.2, 0.9, 11.0, 80.0, 900.0, 7000.0, -5.0, 0.9)]
+    names += ("chromatic_aberration",)
+    drawn = [(0.3, 0.5, 3.0, 20.0, 200.0, 5000.0, 3.0, 1.1, 0.7), (-0.2, 0.9, 11.0, 80.0, 900.0, 7e3, -5.0, 0.9, -2.0)]
 
     def kernels(draws: tuple[float, ...], seed: int) -> set[Any]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             sensor = Sensor(full_well=5000 + seed, read_noise=seed)
-            develop(linear, dict(zip(names, draws, strict=True)), sensor=sensor, seed=seed)
+            swept = np.full((30, 40), 3.0 * seed, np.float32), np.full((30, 40), 1.0, np.float32)
+            develop(linear, dict(zip(names, draws, strict=True)), sensor=sensor, seed=seed, swept=swept)
             return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
 
     first, second = kernels(drawn[0], 1), kernels(drawn[1], 2)

@@ -387,6 +387,8 @@ def test_rigs_are_audited(scene: Scene, tmp_path: Path) -> None:
         "stereo": {"baseline": 0.05},
         "handheld": {"position": 0.01, "rotation": 3},
         "zoom": [0.8, 1.2],
+        "defocus": {"aperture": [0, 0.004], "focus": [0.3, 0.9]},
+        "motion": {"exposure": [0.002, 0.01], "speed": [0, 0.5], "rotation": [10, 30]},
     }
     walk = {"kind": "walk", **{name: HEMISPHERE[name] for name in ("target", "radius", "elevation", "intrinsics")}}
     drawn = moving(scene, hand, ABOVE, walk, views=8, layouts=2, formats=["poses", "flow"])
@@ -409,3 +411,52 @@ def test_rigs_are_audited(scene: Scene, tmp_path: Path) -> None:
     assert any("whose turn it is" in text for text in wrong({"side": "left"}))
     assert any("its intrinsics are not" in text for text in wrong({"zoom": 1.0}))
     assert any("looks past" in text for text in wrong({"handheld": [0.0] * 6}))
+
+
+def test_lenses_and_motions_are_drawn_within_their_ranges(scene: Scene) -> None:
+    ranges = {"aperture": [0.001, 0.004], "focus": [0.3, 0.9]}
+    moved = {"exposure": [0.002, 0.01], "speed": [0.1, 0.5], "rotation": [10, 30]}
+    drawn = moving(scene, HEMISPHERE | {"defocus": ranges, "motion": moved}, layouts=40, views=2)
+    plans = [plan_frame(drawn, index) for index in range(80)]
+    lenses = np.array([(plan.camera.aperture_radius, plan.camera.focus_distance) for plan in plans])
+    assert [(plan.viewpoint["aperture"], plan.viewpoint["focus"]) for plan in plans] == list(map(tuple, lenses))
+    motions = [plan.viewpoint["motion"] for plan in plans]
+    rates = np.array([[np.linalg.norm(one[key]) for key in ("velocity", "rotation")] for one in motions])
+    found = np.column_stack([lenses, [one["exposure"] for one in motions], rates])
+    low, high = np.array([*ranges.values(), *moved.values()]).T
+    assert (found >= low).all() and (found <= high).all()
+    assert (np.ptp(found, axis=0) > 0.8 * (high - low)).all()
+    directions = np.array([one["velocity"] for one in motions]) / rates[:, :1]
+    assert np.abs(directions.mean(axis=0)).max() < 0.3  # 1 / sqrt(3 * 80) = 0.065 is one sigma
+    same = moving(scene, HEMISPHERE, layouts=40, views=2)
+    assert all(
+        (plan_frame(same, i).camera.world_from_camera == plans[i].camera.world_from_camera).all() for i in (0, 9)
+    )
+    assert not plan_frame(same, 0).viewpoint
+    assert not same.spec.camera.model_dump(mode="json").keys() & {"defocus", "motion"}
+
+
+@pytest.mark.parametrize(
+    ("camera", "text"),
+    [
+        (
+            {"defocus": {"aperture": [0, 0.01], "focus": [0.01, 1]}},
+            "defocus.focus: must be beyond near, 0.01 (got 0.01)",
+        ),
+        (
+            {"defocus": {"aperture": [0.1, 0], "focus": [1, 1]}},
+            "defocus.aperture: must be [low, high] with low <= high",
+        ),
+        ({"defocus": {"focus": [1, 1]}}, "defocus.aperture: is required"),
+        ({"motion": {"exposure": [0.01, 0.02]}}, "motion: must have a speed or a rotation"),
+        ({"motion": {"exposure": [0, 0.02], "speed": [1, 1]}}, "motion.exposure[0]: must be > 0 (got 0)"),
+        (
+            {"defocus": {"aperture": [0, 0.01], "focus": [1, 1]}, "intrinsics": {"fov_x": 50, "aperture": 0.01}},
+            "defocus: must not be given together with an aperture of the intrinsics",
+        ),
+    ],
+)
+def test_wrong_lenses_and_motions_are_one_sentence(scene: Scene, camera: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError) as error:
+        moving(scene, HEMISPHERE | camera)
+    assert f"camera.{text}" in str(error.value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,9 @@ import numpy.typing as npt
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.viewpoints import moved_by
 
 UNKNOWN_FLOW = 1e10
 """Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
-
-_FAR = 1e6
-"""Depth of what has none [m]: it moves by the camera's rotation alone."""
 
 
 def optical_flow(
@@ -65,19 +60,33 @@ def swept_by(
 ) -> tuple[Float32Array, Float32Array]:
     """How far every pixel moves to the right and down [px] while the shutter is open, each (H, W).
 
-    What has no depth is infinitely far away.
+    By the motion field in the middle of the exposure (Longuet-Higgins and Prazdny 1980, "The interpretation of a moving
+    retinal image"). What has no depth is infinitely far away.
 
     Args:
         depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
         camera: Where it is in the middle of the exposure.
         motion: As :class:`mitsplat.scene.viewpoints.View` has it.
     """
-    far = np.where(depth > 0, depth, _FAR)
-    half = 0.5 * motion["exposure"] * np.concatenate([motion["velocity"], motion["rotation"]])
-    ends = (replace(camera, world_from_camera=camera.world_from_camera @ moved_by(way)) for way in (-half, half))
-    before, after = (optical_flow(far, camera, end) for end in ends)
-    swept = np.where((before == UNKNOWN_FLOW) | (after == UNKNOWN_FLOW), np.float32(0), after - before)
-    return swept[..., 0], swept[..., 1]
+    height, width = depth.shape
+    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
+    distorted = camera.lens == "fisheye" or any(camera.distortion)
+    if distorted:
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        x, y = np.float32(camera.ray_slopes(pixels)).T.reshape(2, height, width)
+    else:
+        x = np.float32((columns - camera.cx) / camera.fx)[None, :]
+        y = np.float32((rows - camera.cy) / camera.fy)[:, None]
+    near = np.divide(1, depth, where=depth > 0, out=np.zeros(depth.shape, dtype=np.float32))
+    vx, vy, vz = np.float32(np.multiply(motion["exposure"], motion["velocity"]))
+    wx, wy, wz = np.float32(np.radians(np.multiply(motion["exposure"], motion["rotation"])))
+    u = near * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
+    v = near * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)
+    if not distorted:
+        return u * np.float32(camera.fx), v * np.float32(camera.fy)
+    (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
+    whole = x_right * y_down - x_down * y_right
+    return (u * y_down - v * x_down) / whole, (v * x_right - u * y_right) / whole
 
 
 def motions_of(before: Layout, after: Layout) -> dict[int, Float64Array | None]:

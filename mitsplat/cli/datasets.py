@@ -357,7 +357,10 @@ def preview(
 
 
 def view(
-    path: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")],
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="PATH", help="Scene file (.yaml), asset, capture or dataset folder, or a splat file."),
+    ],
     host: Annotated[
         str, typer.Option(help="Address to listen on; any but localhost asks visitors for a token.")
     ] = "localhost",
@@ -369,10 +372,10 @@ def view(
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Look at SCENE in the browser, and steer it.
+    """Look at a scene, an asset, a capture, a dataset or a file of splats in the browser.
 
-    Its splats and everything around them to move through; beside them the real render of what is looked at, which
-    sharpens as time allows. The file is read again when it changes. Ctrl-C ends it.
+    A scene can be steered: beside its splats is the real render of what is looked at, which sharpens as time allows,
+    and the file is read again when it changes. Ctrl-C ends it.
     """
     from importlib.util import find_spec
 

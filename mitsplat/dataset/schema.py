@@ -257,7 +257,7 @@ def read_content(root: Path) -> dict[str, Any]:
 
 
 class Records:
-    """The frames' records that can be read, by ascending index; where the lines are takes 16 bytes of memory a frame.
+    """The frames' records that can be read, by ascending index; where the lines are takes 24 bytes of memory a frame.
 
     Attributes:
         violations: What is wrong with the other lines, once they were read.
@@ -274,7 +274,8 @@ class Records:
                 places.append(place)
                 place += len(line)
         self._places = np.array(places, dtype=np.int64)
-        self._order = np.argsort(np.array(indices, dtype=np.int64), kind="stable")
+        self._indices = np.array(indices, dtype=np.int64)
+        self._order = np.argsort(self._indices, kind="stable")
 
     def __len__(self) -> int:
         return len(self._places)
@@ -287,6 +288,10 @@ class Records:
         """Up to ``count`` of them, evenly spread; fewer, if lines among those cannot be read."""
         places = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
         yield from self._read(self._order[places])
+
+    def of_frame(self, index: int) -> Iterator[Record]:
+        """The records of a frame: one, if its line can be read."""
+        yield from self._read(self._order[self._indices[self._order] == index])
 
     def _read(self, numbers: npt.NDArray[np.intp]) -> Iterator[Record]:
         with self._path.open("rb") as file:

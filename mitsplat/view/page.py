@@ -83,7 +83,7 @@ class Page:
         self._server.scene.set_up_direction("+z")
         panel = self.gui.add_panel()
         with panel.add_tab("Picture"):
-            self._picture = self.gui.add_image(np.full((36, 64, 3), 40, dtype=np.uint8), format="jpeg")
+            self._picture = self.gui.add_image(np.zeros((9, 16, 3), dtype=np.uint8), format="jpeg", visible=False)
             self._caption = self.gui.add_markdown("")
         panel.dock_left()
         panel.set_width(480)
@@ -140,7 +140,7 @@ class Page:
 
     def show_picture(self, image: ByteImage, caption: str) -> None:
         """Show a picture beside the parts, with a line of Markdown below it."""
-        self._picture.image = image
+        self._picture.image, self._picture.visible = image, True
         self._caption.content = caption
 
     def caption(self, text: str) -> None:

@@ -5,10 +5,25 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
+from mitsplat.asset import ASSET_FILE
+from mitsplat.capture.capture import CAPTURE_FILE
 from mitsplat.errors import InputError
 from mitsplat.view.page import Address, Page
 from mitsplat.view.scene_page import ScenePage
+from mitsplat.view.still_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, StillPage
+
+Kind = Literal["scene", "asset", "capture", "dataset", "splats"]
+
+_STILL: dict[Kind, Callable[[Page, Path], StillPage]] = {
+    "asset": AssetPage,
+    "capture": CapturePage,
+    "dataset": DatasetPage,
+    "splats": SplatsPage,
+}
+_BY_CONTENT: dict[str, Kind] = {ASSET_FILE: "asset", CAPTURE_FILE: "capture", "dataset.json": "dataset"}
+SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog")
 
 _LOOK = 0.3
 """How often a file is looked at for changes [s]."""
@@ -25,7 +40,7 @@ def serve(
     """Serve the page of a path until Ctrl-C.
 
     Args:
-        path: A scene file.
+        path: A scene file, a file of splats, or the folder of an asset, a capture or a dataset.
         address: Where it is served.
         gaussians: Most Gaussians of a cloud that a browser is sent.
         allow_outside: Whether a scene may name files outside of its folder.
@@ -35,11 +50,12 @@ def serve(
         InputError: If it is nothing that can be shown, or the address cannot be listened on.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
+    kind = kind_of(path)
     page = Page(path.name, address or Address(), gaussians=gaussians)
     try:
-        shown = ScenePage(page, path, allow_outside=allow_outside)
+        shown: ScenePage | StillPage = (
+            ScenePage(page, path, allow_outside=allow_outside) if kind == "scene" else _STILL[kind](page, path)
+        )
         try:
             ready(page.url)
             while True:
@@ -51,3 +67,27 @@ def serve(
             shown.close()
     finally:
         page.close()
+
+
+def kind_of(path: Path) -> Kind:
+    """What a path is, by its name or what its folder holds.
+
+    Raises:
+        InputError: If it is missing, or nothing that can be shown.
+    """
+    if path.is_dir():
+        for name, kind in _BY_CONTENT.items():
+            if (path / name).is_file():
+                return kind
+        raise InputError(f"{path}: must be a folder with {', '.join(_BY_CONTENT)} (got none of these)")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file or folder")
+    suffix = path.suffix.lower()
+    if suffix in (".yaml", ".yml") and path.name != ASSET_FILE:
+        return "scene"
+    if suffix in SPLAT_SUFFIXES:
+        return "splats"
+    raise InputError(
+        f"{path}: must be a scene (.yaml), splats ({', '.join(SPLAT_SUFFIXES)}), or the folder of an asset, a capture "
+        f"or a dataset (got {path.name})"
+    )

@@ -1,0 +1,134 @@
+"""Which images of a dataset have what: found by class, visibility and size of their labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import ByteImage
+from mitsplat.dataset.schema import Records, read_content
+from mitsplat.errors import InputError
+from mitsplat.files import Record, file_inside
+from mitsplat.labels.labels import Labels
+from mitsplat.labels.overlay import class_colour, draw_labels
+
+OverlayName = Literal["labels", "silhouettes", "none"]
+OVERLAYS: tuple[OverlayName, ...] = get_args(OverlayName)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """What at least one label of an image must have, all of it at once.
+
+    Attributes:
+        class_name: Its class; None for any, also for images without labels.
+        visible: Range of its visible fraction.
+        size: Range of its box's longer side [px].
+    """
+
+    class_name: str | None = None
+    visible: tuple[float, float] = (0.0, 1.0)
+    size: tuple[float, float] = (0.0, np.inf)
+
+
+class DatasetIndex:
+    """The labels of a dataset as arrays; records and images are read when they are looked at.
+
+    Args:
+        root: The dataset's folder.
+
+    Attributes:
+        classes: Names of its classes.
+        unreadable: Lines of the manifest that cannot be read, which are left out.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        content = read_content(root)
+        self._records = Records(root, content)
+        self.classes: tuple[str, ...] = tuple(content["classes"])
+        numbers, rows = list[int](), list[tuple[int, int, float, int]]()
+        for record in self._records:
+            index = record["index"]
+            numbers.append(index)
+            for label in record["labels"]["instances"]:
+                x0, y0, x1, y1 = label["box"]
+                rows.append((index, label["class_index"], label["visible_fraction"], max(x1 - x0, y1 - y0)))
+        self.unreadable = len(self._records.violations)
+        self._frames = np.array(numbers, dtype=np.int64)
+        self._labels = np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def largest(self) -> int:
+        """Longer side of the largest label's box [px], 1 if there are none."""
+        return int(self._labels[:, 3].max(initial=1))
+
+    def find(self, wanted: Filter) -> list[int]:
+        """Indices of the frames that pass a filter, ascending."""
+        if wanted == Filter():
+            return [int(index) for index in self._frames]
+        if wanted.class_name is not None and wanted.class_name not in self.classes:
+            return []
+        frame, class_index, visible, size = self._labels.T
+        passed = (visible >= wanted.visible[0]) & (visible <= wanted.visible[1])
+        passed &= (size >= wanted.size[0]) & (size <= wanted.size[1])
+        if wanted.class_name is not None:
+            passed &= class_index == self.classes.index(wanted.class_name)
+        return [int(index) for index in np.unique(frame[passed])]
+
+    def record(self, index: int) -> Record:
+        """The record of a frame.
+
+        Raises:
+            InputError: If it cannot be read any more.
+        """
+        for record in self._records.of_frame(index):
+            return record
+        raise InputError(f"{self._root}: the record of frame {index} cannot be read")
+
+    def picture(self, index: int, overlay: OverlayName = "labels") -> tuple[str, ByteImage]:
+        """A caption, and the image of a frame with its labels drawn over it, RGB.
+
+        Raises:
+            InputError: If the image is missing, unreadable, or no file of the dataset.
+        """
+        record = self.record(index)
+        name = next(file for file in record["files"] if file.startswith("images/"))
+        try:
+            path = file_inside(self._root, name)
+        except InputError as error:
+            raise InputError(f"{self._root}: frame {index}: {error}") from error
+        stored = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        height, width = record["labels"]["size"][::-1]
+        if stored is None or stored.shape[:2] != (height, width):
+            raise InputError(f"{path}: must be a readable image of {width}x{height} px")
+        image = np.ascontiguousarray(stored[..., ::-1], dtype=np.uint8)
+        labels = Labels.from_json(record["labels"])
+        told = ", ".join(
+            f"{label.class_name} {label.visible_fraction:.0%}{''.join(f' {mark}' for mark in label.marks)}"
+            for label in labels.instances
+        )
+        caption = f"frame {index}, {record['split']}: {told or 'no labels'}"
+        if overlay == "labels":
+            return caption, draw_labels(image, labels)
+        return caption, _draw_silhouettes(image, labels) if overlay == "silhouettes" else image
+
+
+def _draw_silhouettes(image: ByteImage, labels: Labels) -> ByteImage:
+    """The outlines of what each instance would cover alone."""
+    drawn = image.copy()
+    for label in labels.instances:
+        contours, _ = cv2.findContours(label.amodal.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        x0, y0 = label.amodal.box[:2]
+        cv2.drawContours(drawn, contours, -1, class_colour(label.class_index), 2, offset=(x0, y0))
+    return drawn

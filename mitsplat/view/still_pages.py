@@ -1,0 +1,196 @@
+"""The pages of what does not move: an asset, a file of splats, a capture, a dataset."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsplat.arrays import ByteImage
+from mitsplat.asset import Asset
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.errors import InputError
+from mitsplat.splats import Splats
+from mitsplat.view.dataset_index import OVERLAYS, DatasetIndex, Filter, OverlayName
+from mitsplat.view.page import Page
+from mitsplat.view.parts import Cloud, Part, asset_parts, capture_parts
+
+_ANY = "any"
+_AXES = ("+z", "-z", "+y", "-y", "+x", "-x")
+_EDGE = 960
+"""Longest edge of a photo that is shown [px]."""
+_MASKS = ("outside darkened", "none")
+
+
+class StillPage:
+    """A page that shows what it was made with until it is closed; nothing of it has to be stopped or watched."""
+
+    def close(self) -> None:
+        """Nothing is left to be done."""
+
+    def check(self) -> None:
+        """Nothing can go wrong meanwhile."""
+
+
+class AssetPage(StillPage):
+    """An asset: its splats, mesh, pieces and named points."""
+
+    def __init__(self, page: Page, folder: Path) -> None:
+        asset = Asset.load(folder)
+        page.show(asset_parts(asset))
+        page.look_around()
+        extent = asset.splats.bounds if asset.mesh is None else asset.mesh.bounds
+        size = " × ".join(f"{side:.3g}" for side in np.ptp(extent, axis=0))
+        facts = [
+            f"**{asset.kind}**, class {asset.class_name}",
+            f"{len(asset.splats)} Gaussians, spherical harmonics of degree {asset.splats.sh_degree}",
+            f"{size} m" if asset.units == "metre" else f"{size}, of unknown units",
+            "no mesh" if asset.mesh is None else f"mesh of {len(asset.mesh.faces)} faces",
+            f"{len(asset.pieces)} convex pieces",
+            *(f"look: {finding}" for finding in asset.check()),
+        ]
+        page.caption("\n\n".join(facts))
+
+
+class SplatsPage(StillPage):
+    """A file of splats, as it is: files say neither which axis points up nor their units."""
+
+    def __init__(self, page: Page, path: Path) -> None:
+        splats = Splats.load(path)
+        page.show([Part("/splats/file", Cloud(splats))])
+        up = page.gui.add_dropdown("up axis", _AXES)
+        up.on_update(lambda _: page.set_up(up.value) if up.value in _AXES else None)
+        page.look_around()
+        size = " × ".join(f"{side:.3g}" for side in np.ptp(splats.bounds, axis=0)) if len(splats) else "nothing"
+        page.caption(
+            f"{len(splats)} Gaussians, spherical harmonics of degree {splats.sh_degree}\n\n{size} in units of the file"
+        )
+
+
+class CapturePage(StillPage):
+    """A capture: points, cameras, and the photo of the one that is chosen, with its mask."""
+
+    def __init__(self, page: Page, folder: Path) -> None:
+        self._page, self._capture = page, Capture.load(folder)
+        photos = self._capture.photos
+        if not photos:
+            raise InputError(f"{folder}: must have a photo to be shown (got none)")
+        page.show(capture_parts(self._capture))
+        self._photo = page.gui.add_slider("photo", 0, max(len(photos) - 1, 1), 1, 0)
+        self._mask = page.gui.add_dropdown("mask", _MASKS)
+        through = page.gui.add_button("Look through this camera")
+        rejected = self._capture.rejected
+        page.gui.add_markdown(
+            f"{len(photos)} photos, {len(rejected)} rejected; {len(self._capture.points)} points; "
+            f"units: {self._capture.units}"
+        )
+        self._photo.on_update(lambda _: self._show())
+        self._mask.on_update(lambda _: self._show())
+        through.on_click(lambda event: page.look_through(self._chosen.camera, event.client))
+        page.on_click(self._clicked)
+        page.look_around()
+        self._show()
+
+    @property
+    def _chosen(self) -> Photo:
+        return self._capture.photos[min(max(int(self._photo.value), 0), len(self._capture.photos) - 1)]
+
+    def _clicked(self, index: int, client: Any) -> None:
+        self._photo.value = index
+        self._page.look_through(self._chosen.camera, client)
+
+    def _show(self) -> None:
+        photo = self._chosen
+        try:
+            image = photo_picture(photo, masked=self._mask.value == _MASKS[0])
+        except InputError as error:
+            self._page.alert(str(error))
+            return
+        self._page.alert(None)
+        masked = "" if photo.mask is None else ", with a mask"
+        self._page.show_picture(image, f"{_literal(photo.name)}: sees {len(photo.seen)} points{masked}")
+
+
+class DatasetPage(StillPage):
+    """The images of a dataset with their labels, and a filter for them."""
+
+    def __init__(self, page: Page, folder: Path) -> None:
+        self._page, self._index = page, DatasetIndex(folder)
+        if not len(self._index):
+            raise InputError(f"{folder}: must have an image to be shown (got none)")
+        self._turn = threading.RLock()
+        gui, largest = page.gui, self._index.largest
+        self._number = gui.add_slider("image", 0, 1, 1, 0)
+        step = gui.add_button_group("step", ("previous", "next"))
+        self._overlay = gui.add_dropdown("overlay", OVERLAYS)
+        with gui.add_folder("Images with a label that is"):
+            self._class = gui.add_dropdown("of class", (_ANY, *self._index.classes))
+            self._visible = gui.add_multi_slider("visible [%]", 0, 100, 1, (0, 100))
+            self._size = gui.add_multi_slider("as long as [px]", 0, largest, 1, (0, largest))
+        self._told = gui.add_markdown("")
+        self._found: list[int] = []
+        self._number.on_update(lambda _: self._show())
+        self._overlay.on_update(lambda _: self._show())
+        step.on_click(lambda _: self._step(1 if step.value == "next" else -1))
+        for control in (self._class, self._visible, self._size):
+            control.on_update(lambda _: self._filter())
+        self._filter()
+
+    @property
+    def found(self) -> tuple[int, ...]:
+        """Indices of the frames that pass the filter."""
+        return tuple(self._found)
+
+    def _filter(self) -> None:
+        with self._turn:
+            low, high = self._visible.value
+            name = None if self._class.value == _ANY else str(self._class.value)
+            short, long = self._size.value
+            whole = (low, high) == (0, 100) and (short, long) == (0, self._index.largest)
+            wanted = Filter(name) if whole else Filter(name, (low / 100, high / 100), (short, long))
+            self._found = self._index.find(wanted)
+            unreadable = self._index.unreadable
+            self._told.content = f"{len(self._found)} of {len(self._index)} images" + (
+                f"; {unreadable} lines of the manifest cannot be read" if unreadable else ""
+            )
+            self._number.max = max(len(self._found) - 1, 1)
+            self._number.value = 0
+            self._show()
+
+    def _step(self, by: int) -> None:
+        with self._turn:
+            self._number.value = min(max(int(self._number.value) + by, 0), max(len(self._found) - 1, 0))
+
+    def _show(self) -> None:
+        with self._turn:
+            if not self._found:
+                self._page.caption("no image has such a label")
+                return
+            index = self._found[min(max(int(self._number.value), 0), len(self._found) - 1)]
+            overlay: OverlayName = self._overlay.value if self._overlay.value in OVERLAYS else "none"
+            try:
+                caption, image = self._index.picture(index, overlay)
+            except InputError as error:
+                self._page.alert(str(error))
+                return
+            self._page.alert(None)
+            self._page.show_picture(image, _literal(caption))
+
+
+def photo_picture(photo: Photo, *, masked: bool) -> ByteImage:
+    """A photo in the size of the page, what its mask leaves out darkened if that is asked for.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    rgb, alpha = photo.picture(min(1.0, _EDGE / max(photo.camera.width, photo.camera.height)))
+    if masked and alpha is not None:
+        rgb = rgb * (0.25 + 0.75 * alpha[..., None])
+    return np.asarray(np.rint(255 * rgb), dtype=np.uint8)
+
+
+def _literal(text: str) -> str:
+    """Text that Markdown shows as it is."""
+    return "".join(f"\\{sign}" if sign in "\\`*_{}[]<>()#+-.!|~$" else sign for sign in text)

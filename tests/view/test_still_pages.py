@@ -1,0 +1,155 @@
+"""The pages of assets, captures, datasets and files of splats, and what of a dataset a filter finds."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mitsplat.dataset.manifest import Manifest
+from mitsplat.errors import InputError
+from mitsplat.view.dataset_index import DatasetIndex, Filter
+from mitsplat.view.page import Address, Page, splat_arrays
+from mitsplat.view.serve import kind_of
+from mitsplat.view.still_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, photo_picture
+from tests.conftest import KnownObject, box_asset
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    page = Page("test", Address(port=0), gaussians=100)
+    yield page
+    page.close()
+
+
+def labels_of(dataset: Path) -> dict[int, list[dict]]:
+    return {record["index"]: record["labels"]["instances"] for record in Manifest(dataset / "manifest.jsonl")}
+
+
+def longest(label: dict) -> int:
+    x0, y0, x1, y1 = label["box"]
+    return max(x1 - x0, y1 - y0)
+
+
+def test_a_filter_finds_images_with_one_label_that_has_it_all(clean):
+    index, labels = DatasetIndex(clean), labels_of(clean)
+    assert len(index) == len(labels) == 6
+    assert index.find(Filter()) == sorted(labels)
+    every = [label for found in labels.values() for label in found]
+    middle = float(np.median([label["visible_fraction"] for label in every]))
+    size = int(np.median([longest(label) for label in every]))
+    for wanted in (
+        Filter("nut"),
+        Filter(None, (0, middle)),
+        Filter(None, (0, 1), (size, np.inf)),
+        Filter("bolt", (middle, 1), (0, size)),
+    ):
+        passed = [
+            number
+            for number, found in labels.items()
+            if any(
+                wanted.class_name in (None, label["class"])
+                and wanted.visible[0] <= label["visible_fraction"] <= wanted.visible[1]
+                and wanted.size[0] <= longest(label) <= wanted.size[1]
+                for label in found
+            )
+        ]
+        assert index.find(wanted) == passed
+    assert index.find(Filter("no such class")) == []
+    assert index.largest == max(map(longest, every))
+
+
+def test_a_picture_shows_the_labels_of_its_own_frame(clean):
+    index = DatasetIndex(clean)
+    number = next(number for number, found in labels_of(clean).items() if found)
+    caption, plain = index.picture(number, "none")
+    stored = cv2.imread(str(next((clean / "images").glob(f"*/{number:06d}.*"))))[..., ::-1]
+    assert np.array_equal(plain, stored)
+    assert caption.startswith(f"frame {number}, ")
+    _, drawn = index.picture(number, "labels")
+    label = labels_of(clean)[number][0]
+    x0, y0, x1, y1 = label["box"]
+    assert (drawn[y0:y1, x0:x1] != plain[y0:y1, x0:x1]).any()
+    assert (index.picture(number, "silhouettes")[1] != plain).any()
+
+
+def test_a_dataset_that_names_a_file_outside_of_it_is_not_followed(dataset):
+    manifest = Manifest(dataset / "manifest.jsonl")
+    records = list(manifest)
+    (dataset / "manifest.jsonl").unlink()
+    shutil.copy(dataset / next(name for name in records[0]["files"] if name.startswith("images/")), dataset.parent)
+    changed = Manifest(dataset / "manifest.jsonl")
+    for record in records:
+        name = next(name for name in record["files"] if name.startswith("images/"))
+        changed.append({**record, "files": {f"images/../../{Path(name).name}": "0"}})
+    with pytest.raises(InputError, match="must be a file inside"):
+        DatasetIndex(dataset).picture(records[0]["index"])
+
+
+def test_the_page_of_a_dataset_steps_and_filters(page, clean):
+    shown = DatasetPage(page, clean)
+    assert len(shown.found) == 6
+    shown._step(1)
+    assert page._caption.content.startswith(f"frame {shown.found[1]}, ")
+    shown._class.value = "nut"
+    assert shown.found == tuple(DatasetIndex(clean).find(Filter("nut")))
+    shown._visible.value = (0, 0)
+    assert shown.found == ()
+    assert page._caption.content == "no image has such a label"
+    shown._class.value = "../../etc/passwd"  # as a browser might answer
+    assert shown.found == ()
+
+
+def test_the_page_of_an_asset_tells_of_it(page, tmp_path):
+    box_asset("nut").save(tmp_path / "nut")
+    AssetPage(page, tmp_path / "nut")
+    assert sorted(page._shown) == ["/meshes/nut", "/pieces/nut/0", "/splats/nut"]
+    assert "12 Gaussians" in page._caption.content
+    assert "0.02 × 0.03 × 0.01 m" in page._caption.content
+
+
+def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object: KnownObject, tmp_path):
+    capture = known_object.capture
+    folder = capture.photos[0].file.parents[1]
+    shown = CapturePage(page, folder)
+    assert sum(part.group == "cameras" for part in page._shown.values()) == len(capture.photos)
+    shown._clicked(3, None)
+    assert page._caption.content.startswith("03\\.png")
+    darkened, whole = (photo_picture(capture.photos[3], masked=masked).astype(int) for masked in (True, False))
+    outside = capture.photos[3].picture()[1] == 0
+    assert np.array_equal(darkened[~outside], whole[~outside])
+    assert darkened[outside] == pytest.approx(0.25 * whole[outside], abs=1)
+
+
+def test_the_page_of_a_file_of_splats(page, tmp_path):
+    box_asset("nut").splats.save(tmp_path / "nut.ply")
+    SplatsPage(page, tmp_path / "nut.ply")
+    assert list(page._shown) == ["/splats/file"]
+
+
+def test_viser_gets_covariances_that_half_floats_can_hold():
+    splats = box_asset("nut").splats
+    arrays = splat_arrays(splats)
+    halves = arrays["covariances"].astype(np.float16).astype(np.float64) * arrays["scale"] ** 2
+    assert halves == pytest.approx(np.eye(3) * (splats.scales[:, :, None] ** 2), rel=2e-3, abs=1e-9)
+    assert arrays["centers"] * arrays["scale"] == pytest.approx(splats.means, rel=1e-5)
+    assert splat_arrays(splats.select(slice(0, 0)))["centers"].shape == (0, 3)
+
+
+def test_a_path_is_told_by_what_it_holds(tmp_path):
+    for name, kind in (("asset.yaml", "asset"), ("capture.json", "capture"), ("dataset.json", "dataset")):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / name).write_text(json.dumps({}))
+        assert kind_of(tmp_path / kind) == kind
+    for name, kind in (("a.yaml", "scene"), ("a.ply", "splats"), ("a.compressed.ply", "splats"), ("a.SPZ", "splats")):
+        (tmp_path / name).touch()
+        assert kind_of(tmp_path / name) == kind
+    (tmp_path / "a.txt").touch()
+    for path, rule in ((tmp_path / "a.txt", "must be a scene"), (tmp_path, "must be a folder with"), ("no", "no such")):
+        with pytest.raises(InputError, match=rule):
+            kind_of(Path(path))

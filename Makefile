@@ -6,7 +6,7 @@ PIP_INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-c
 INPUTS := pyproject.toml constraints.txt
 SPHINX := --builder html --fresh-env --fail-on-warning --keep-going --nitpicky --quiet
 
-.PHONY: render test test-gpu lint docs clean
+.PHONY: render test test-gpu lint browser docs clean
 
 render: $(STAMPS)/package
 	$(VENV)/bin/mitsplat render scenes/workcell.yaml -o out/workcell --resume
@@ -25,6 +25,10 @@ lint: $(STAMPS)/tools
 	$(VENV)/bin/ruff format --check
 	$(VENV)/bin/mypy
 	$(VENV)/bin/python -m pytest -q tests/test_house.py
+
+# What the tests of the live view look at it with; they are skipped where it is missing. On Debian, as root.
+browser:
+	@command -v chromium chromedriver > /dev/null || apt-get install --yes --quiet chromium chromium-driver
 
 # docs/_build/html/index.html; NOTEBOOKS=1 also runs the notebooks, so that the pages show what they print.
 docs: $(STAMPS)/docs

@@ -81,15 +81,16 @@ class Page:
         self.gui = self._server.gui
         self.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, dark_mode=True)
         self._server.scene.set_up_direction("+z")
-        panel = self.gui.add_panel()
-        with panel.add_tab("Picture"):
+        self._panel = self.gui.add_panel()
+        with self._panel.add_tab("Picture"):
             self._picture = self.gui.add_image(np.zeros((9, 16, 3), dtype=np.uint8), format="jpeg", visible=False)
             self._caption = self.gui.add_markdown("")
-        panel.dock_left()
-        panel.set_width(480)
+        self._panel.dock_left()
+        self._panel.set_width(480)
+        self.gui.main_panel.dock_right()
         self._alerted: str | None = None
         self._alert = self.gui.add_html("", visible=False)
-        self._groups = self.gui.add_folder("Show", order=1000)
+        self._groups = self.gui.add_folder("Show", order=1000, visible=False)
         self._boxes: dict[str, Any] = {}
 
     def _forbid_tunnels(self) -> None:
@@ -143,6 +144,10 @@ class Page:
         self._picture.image, self._picture.visible = image, True
         self._caption.content = caption
 
+    def widen(self, width: int) -> None:
+        """Give the picture a panel of this width [px]."""
+        self._panel.set_width(width)
+
     def caption(self, text: str) -> None:
         """A line of Markdown below the picture."""
         self._caption.content = text
@@ -186,7 +191,7 @@ class Page:
     def _add_group(self, group: str) -> None:
         if group in self._boxes:
             return
-        visible = group not in HIDDEN_FIRST
+        visible, self._groups.visible = group not in HIDDEN_FIRST, True
         root = self._server.scene.add_frame(f"/{group}", show_axes=False, visible=visible)
         with self._groups:
             box = self.gui.add_checkbox(group, visible)

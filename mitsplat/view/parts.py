@@ -31,7 +31,7 @@ from mitsplat.splats import Splats
 
 Colour = tuple[int, int, int]
 
-HIDDEN_FIRST = frozenset({"meshes", "pieces", "colliders", "enclosure"})
+HIDDEN_FIRST = frozenset({"meshes", "pieces", "colliders", "enclosure", "other cameras"})
 """Groups that are not shown until they are asked for."""
 
 MOST_CAMERAS = 200
@@ -245,8 +245,8 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Pa
     size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
     for frame in sorted({*own[:MOST_CAMERAS], *spread.tolist()}):
         camera = view_of(scene, frame, layout if frame in own else None).camera
-        colour = _CAMERA if frame in own else _OTHER
-        yield Part(f"/cameras/{frame}", Frustum(camera, 0.1 * size, colour, frame), camera.world_from_camera)
+        group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
+        yield Part(f"/{group}/{frame}", Frustum(camera, 0.08 * size, colour, frame), camera.world_from_camera)
 
 
 def bounds_of(parts: Iterable[Part]) -> Float64Array:

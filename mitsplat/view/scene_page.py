@@ -149,6 +149,7 @@ class ScenePage:
             self._layout = None if other else self._layout
             self._frame.value = index
             self._page.look_through(self._plan().camera, client)
+            self._show(self._layout)
             self._ask()
 
     def _step(self, layouts: int, client: Any) -> None:
@@ -172,7 +173,9 @@ class ScenePage:
             now = self._plan().camera.world_from_camera if self._pose is None else self._pose
             if np.allclose(pose, now, atol=1e-4):
                 return
-            self._pose = pose
+            left, self._pose = self._pose is None, pose
+            if left:
+                self._show(self._layout)
             self._camera_yaml.value = camera_lines(pose, camera.look_at, self._scene.spec.camera.intrinsics)
             if not self._playing:
                 self._ask()
@@ -235,10 +238,15 @@ class ScenePage:
         return tuple(self._lights.get(i, light) for i, light in enumerate(self._plan().lights))
 
     def _show(self, layout: Layout | None) -> None:
+        """Show the scene with a layout; as long as the next one is not known, objects stay where they are shown."""
+        if layout is None and self._preview is not None:
+            return
         around = self._scene, self._index // self._views, layout is None
         if self._cameras[0] != around:
             self._cameras = around, list(camera_parts(self._scene, self._index, layout))
-        self._page.show([*scene_parts(self._scene, self._index, layout, self._lights_now()), *self._cameras[1]])
+        own = f"/cameras/{self._index}"  # whoever looks through it would see it all around
+        cameras = [part for part in self._cameras[1] if self._pose is not None or part.name != own]
+        self._page.show([*scene_parts(self._scene, self._index, layout, self._lights_now()), *cameras])
 
     def _show_preview(self) -> None:
         if self._preview is not None:
@@ -317,7 +325,9 @@ def changed_light(light: LightSpec, *, position: Any = None, target: Any = None,
 def told_error(preview: Preview) -> str:
     """What is known of a preview's error, to stand behind its seconds."""
     error = preview.frame.order_error
-    return "" if error is None else f", error of order ≤ {error['largest']:.2g}, mean {error['mean']:.1g}"
+    if error is None:
+        return ", error of the order of blending unknown"
+    return f", error of the order of blending at most {error['largest']:.2g}, on average {error['mean']:.1g}"
 
 
 def _strength_of(light: LightSpec) -> str:

@@ -21,6 +21,8 @@ _ANY = "any"
 _AXES = ("+z", "-z", "+y", "-y", "+x", "-x")
 _EDGE = 960
 """Longest edge of a photo that is shown [px]."""
+_WIDE = 860
+"""Of the panel with images of a dataset [px]."""
 _MASKS = ("outside darkened", "none")
 
 
@@ -121,6 +123,7 @@ class DatasetPage(StillPage):
         if not len(self._index):
             raise InputError(f"{folder}: must have an image to be shown (got none)")
         self._turn = threading.RLock()
+        page.widen(_WIDE)  # there is nothing beside it
         gui, largest = page.gui, self._index.largest
         self._number = gui.add_slider("image", 0, 1, 1, 0)
         step = gui.add_button_group("step", ("previous", "next"))

@@ -50,11 +50,14 @@ def test_a_scene_shows_everything_once(scene):
     found = named(parts)
     assert len(found) == len(parts)
     groups = {part.group for part in parts}
-    assert groups == {"splats", "meshes", "pieces", "shapes", "enclosure", "regions", "lights", "cameras"}
+    assert groups == {
+        *("splats", "meshes", "pieces", "shapes", "enclosure", "regions", "lights", "cameras", "other cameras"),
+    }
     assert sum(part.group == "splats" for part in parts) == 2
-    assert sum(part.group == "cameras" for part in parts) == scene.num_frames
-    assert isinstance(found["/cameras/5"].thing, Frustum)
-    assert found["/cameras/5"].thing.index == 5
+    frusta = [part.thing for part in parts if isinstance(part.thing, Frustum)]
+    assert sorted(frustum.index for frustum in frusta) == list(range(scene.num_frames))
+    assert found["/cameras/3"].thing.index == 3
+    assert found["/other cameras/4"].thing.index == 4
     assert sum(part.group == "enclosure" for part in parts) == 5
     box = found["/regions/main"].thing.segments
     assert box.min(axis=(0, 1)) == pytest.approx(scene.spec.region.min)

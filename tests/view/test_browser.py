@@ -1,0 +1,139 @@
+"""The page of a scene in headless Chromium: it loads, shows splats, and does what its controls say."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from ruamel.yaml import YAML
+
+from mitsplat.splats import Splats
+from tests.conftest import box_asset, small_scene
+
+pytestmark = pytest.mark.slow
+
+LONG = 90.0  # seconds, for what takes one on an idle machine
+OPTIONS = (
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"),
+    *("--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--window-size=1100,560"),
+)
+BEGIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from mitsplat.cli import main; main()"
+"""The command, which Ctrl-C ends even where whoever runs the tests lets it be ignored."""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("chromium and chromedriver are not installed: `make browser` does that on Debian")
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for option in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('browser')}"):
+        options.add_argument(option)
+    started = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    yield started
+    started.quit()
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of one red box."""
+    folder = tmp_path_factory.mktemp("scene")
+    box = box_asset("nut", (0.09, 0.09, 0.09))
+    sh = np.tile(np.float32([1.7, -1.7, -1.7]), (12, 1, 1))
+    scales = np.full((12, 3), 0.02, dtype=np.float32)
+    red = Splats(box.splats.means, box.splats.quats, scales, np.full(12, 0.99), sh)
+    small_scene(folder, [replace(box, splats=red)], [{"asset": "assets/nut"}], layouts=1, views=2)
+    path = folder / "scene.yaml"
+    data = YAML(typ="safe").load(path)
+    data["shapes"] = [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}]
+    data["settle"] = {"stepper": "mujoco"}
+    data["quality"] = "fast"
+    YAML(typ="safe", pure=True).dump(data, path)
+    return path
+
+
+def until(what: Callable[[], Any]) -> Any:
+    """The first true answer."""
+    end = time.monotonic() + LONG
+    while time.monotonic() < end:
+        if answer := what():
+            return answer
+        time.sleep(0.2)
+    raise TimeoutError(what)
+
+
+def screen(browser: Any) -> np.ndarray:
+    """What the browser shows, (H, W, 3): the render on the left, splats in the middle, controls on the right."""
+    image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+    return np.asarray(image).astype(int)
+
+
+def render(browser: Any) -> np.ndarray:
+    return screen(browser)[:, :450]
+
+
+def redness(pixels: np.ndarray) -> float:
+    """Share of pixels that are about red."""
+    return float(((pixels[..., 0] > 90) & (pixels[..., 1:] < 70).all(axis=-1)).mean())
+
+
+def test_the_page_of_a_scene(browser, scene_file):
+    command = [sys.executable, "-c", BEGIN, "view", str(scene_file), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
+        try:
+            browser.get(serving.stdout.readline().split()[1])
+            use_page(browser, scene_file)
+        except TimeoutError:
+            browser.save_screenshot(str(scene_file.with_name("browser.png")))
+            raise
+        finally:
+            serving.send_signal(signal.SIGINT)
+            assert serving.wait(LONG) == 0
+
+
+def use_page(browser: Any, scene_file: Path) -> None:
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    def text() -> str:
+        return str(browser.find_element(By.TAG_NAME, "body").text)
+
+    def changed(before: np.ndarray) -> bool:
+        return "exact" in text() and bool(np.abs(render(browser) - before).mean() > 1)
+
+    until(lambda: "exact" in text() and "order of blending" in text())
+    until(lambda: redness(screen(browser)[:, 490:770]) > 0.005)  # of the splats
+    first = render(browser)
+    assert redness(first) > 0.005
+
+    browser.find_element(By.CSS_SELECTOR, "[role=slider]").send_keys(Keys.ARROW_RIGHT)  # the next frame
+    until(lambda: changed(first))
+    second = render(browser)
+
+    good = scene_file.read_text()
+    data = YAML(typ="safe").load(good)
+    data["camera"]["height"] = 0.8
+    YAML(typ="safe", pure=True).dump(data, scene_file)
+    until(lambda: changed(second))
+
+    data["region"]["max"][2] = -1
+    YAML(typ="safe", pure=True).dump(data, scene_file)
+    until(lambda: "must be above min along z (got -1, min is 0.02)" in text())
+    assert redness(screen(browser)[:, 490:770]) > 0.005  # the last good scene stays
+    scene_file.write_text(good)
+    until(lambda: "must be above" not in text())

@@ -73,13 +73,13 @@ def swept_by(
     distorted = camera.lens == "fisheye" or any(camera.distortion)
     if distorted:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        x, y = np.float32(camera.ray_slopes(pixels)).T.reshape(2, height, width)
+        x, y = camera.ray_slopes(pixels).astype(np.float32).T.reshape(2, height, width)
     else:
-        x = np.float32((columns - camera.cx) / camera.fx)[None, :]
-        y = np.float32((rows - camera.cy) / camera.fy)[:, None]
+        x = ((columns - camera.cx) / camera.fx).astype(np.float32)[None, :]
+        y = ((rows - camera.cy) / camera.fy).astype(np.float32)[:, None]
     near = np.divide(1, depth, where=depth > 0, out=np.zeros(depth.shape, dtype=np.float32))
-    vx, vy, vz = np.float32(np.multiply(motion["exposure"], motion["velocity"]))
-    wx, wy, wz = np.float32(np.radians(np.multiply(motion["exposure"], motion["rotation"])))
+    vx, vy, vz = np.multiply(motion["exposure"], motion["velocity"]).astype(np.float32)
+    wx, wy, wz = np.radians(np.multiply(motion["exposure"], motion["rotation"])).astype(np.float32)
     u = near * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
     v = near * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)
     if not distorted:

@@ -77,7 +77,7 @@ class Page:
         self._gaussians = gaussians
         self._shown: dict[str, Part] = {}
         self._handles: dict[str, Any] = {}
-        self._clicked: Callable[[int, Any], object] = lambda index, client: None
+        self._clicked: Callable[[int], object] = lambda index: None
         self.gui = self._server.gui
         self.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, dark_mode=True)
         self._server.scene.set_up_direction("+z")
@@ -104,8 +104,8 @@ class Page:
         with _silence():
             self._server.stop()
 
-    def on_click(self, clicked: Callable[[int, Any], object]) -> None:
-        """Whom to tell the index of a camera that was clicked, and viser's client."""
+    def on_click(self, clicked: Callable[[int], object]) -> None:
+        """Whom to tell the index of a camera that was clicked."""
         self._clicked = clicked
 
     def on_move(self, moved: Callable[[Any], object]) -> None:
@@ -161,17 +161,16 @@ class Page:
             style = "margin:0.5em;padding:0.6em;border-left:4px solid #d33;background:#d332;overflow-wrap:anywhere"
             self._alert.content = f'<div role="alert" style="{style}">{html.escape(sentence)}</div>'
 
-    def look_through(self, camera: Camera, client: Any = None) -> None:
-        """Move one browser's view to a camera, or that of all and of those to come."""
+    def look_through(self, camera: Camera) -> None:
+        """Move the view of all browsers, and of those to come, to a camera."""
         pose, fov = camera.world_from_camera, 2 * float(np.arctan(0.5 * camera.height / camera.fy))
         ahead = pose[:3, 3] + self._distance(pose) * pose[:3, 2]
-        if client is None:
-            start = self._server.initial_camera
-            start.position, start.look_at, start.up, start.fov = pose[:3, 3], ahead, -pose[:3, 1], fov
-        for one in self._server.get_clients().values() if client is None else [client]:
-            with one.atomic():
-                one.camera.position, one.camera.look_at = pose[:3, 3], ahead
-                one.camera.up_direction, one.camera.fov = -pose[:3, 1], fov
+        start = self._server.initial_camera
+        start.position, start.look_at, start.up, start.fov = pose[:3, 3], ahead, -pose[:3, 1], fov
+        for client in self._server.get_clients().values():
+            with client.atomic():
+                client.camera.position, client.camera.look_at = pose[:3, 3], ahead
+                client.camera.up_direction, client.camera.fov = -pose[:3, 1], fov
 
     def look_around(self) -> None:
         """Look at all that is shown, from above and aside."""
@@ -241,7 +240,7 @@ class Page:
             color=thing.colour,
             **place,
         )
-        handle.on_click(lambda event: self._clicked(thing.index, event.client))
+        handle.on_click(lambda _: self._clicked(thing.index))
         return handle
 
 

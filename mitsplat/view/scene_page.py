@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
+from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.frames.layer_sheet import LAYERS, LayerName, draw_layer
 from mitsplat.physics.settle import replay_layout
@@ -50,6 +51,7 @@ class ScenePage:
         self._turn = threading.RLock()
         self._index = 0
         self._pose: Float64Array | None = None
+        self._looked: list[Float64Array] = []
         self._lights: dict[int, LightSpec] = {}
         self._layout: Layout | None = None
         self._cameras: tuple[Any, list[Part]] = (None, [])
@@ -62,7 +64,7 @@ class ScenePage:
         self._make_controls()
         self._ask()
         self._show(None)
-        page.look_through(self._plan().camera)
+        self._look(plan_frame(self._scene, 0).camera)
         page.on_click(self._look_at_frame)
         page.on_move(self._moved)
 
@@ -91,6 +93,7 @@ class ScenePage:
         """Show another scene in place of this one."""
         self._page.alert(self._fault)
         self._scene, self._layout, self._lights = scene, None, {}
+        self._looked.clear()
         self._index = min(self._index, scene.num_frames - 1)
         self._frame.max = max(scene.num_frames - 1, 1)
         self._frame.value = self._index
@@ -124,36 +127,35 @@ class ScenePage:
             as_stated = gui.add_button("Lights as in the file")
         self._handle = self._page.add_handle(lambda position: self._move_light(position=position))
 
-        self._frame.on_update(lambda event: self._look_at_frame(self._frame.value, event.client))
-        step.on_click(lambda event: self._step(1 if step.value == "next" else -1, event.client))
+        self._frame.on_update(lambda _: self._look_at_frame(self._frame.value))
+        step.on_click(lambda _: self._step(1 if step.value == "next" else -1))
         again.on_click(lambda _: self._drop_again())
         play.on_click(lambda _: self._play())
         self._layer.on_update(lambda _: self._show_preview())
         self._finest.on_update(lambda _: self._ask())
         self._width.on_update(lambda _: self._ask())
-        back.on_click(lambda event: self._look_at_frame(self._index, event.client, anew=True))
+        back.on_click(lambda _: self._look_at_frame(self._index, anew=True))
         self._light.on_update(lambda _: self._choose_light())
         self._position.on_update(lambda _: self._move_light(position=self._position.value))
         self._target.on_update(lambda _: self._move_light(target=self._target.value))
         self._strength.on_update(lambda _: self._move_light(strength=self._strength.value))
         as_stated.on_click(lambda _: self._reset_lights())
 
-    def _look_at_frame(self, index: int, client: Any = None, *, anew: bool = False) -> None:
-        """Look through the camera of a frame."""
+    def _look_at_frame(self, index: int, *, anew: bool = False) -> None:
+        """Look through the camera of a frame, which its layout may decide: as soon as that is known."""
         with self._turn:
             index = min(max(int(index), 0), self._scene.num_frames - 1)
             if index == self._index and not anew and self._pose is None:
                 return
-            other = index // self._views != self._index // self._views
+            if index // self._views != self._index // self._views:
+                self._layout = None
             self._index, self._pose = index, None
-            self._layout = None if other else self._layout
+            self._looked.clear()
             self._frame.value = index
-            self._page.look_through(self._plan().camera, client)
-            self._show(self._layout)
             self._ask()
 
-    def _step(self, layouts: int, client: Any) -> None:
-        self._look_at_frame(self._index + layouts * self._views, client)
+    def _step(self, layouts: int) -> None:
+        self._look_at_frame(self._index + layouts * self._views)
 
     def _drop_again(self) -> None:
         with self._turn:
@@ -170,8 +172,7 @@ class ScenePage:
             pose = np.eye(4)
             pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
             pose[:3, 3] = camera.position
-            now = self._plan().camera.world_from_camera if self._pose is None else self._pose
-            if np.allclose(pose, now, atol=1e-4):
+            if any(np.allclose(pose, own, atol=1e-4) for own in self._looked):
                 return
             left, self._pose = self._pose is None, pose
             if left:
@@ -229,13 +230,18 @@ class ScenePage:
         return None if name == _NO_LIGHT else int(name.partition(":")[0])
 
     def _light_names(self) -> tuple[str, ...]:
-        return (_NO_LIGHT, *(f"{i}: {light.kind}" for i, light in enumerate(self._plan().lights)))
-
-    def _plan(self) -> Any:
-        return plan_frame(self._scene, self._index, self._layout)
+        return (_NO_LIGHT, *(f"{i}: {light.kind}" for i, light in enumerate(self._lights_now())))
 
     def _lights_now(self) -> tuple[LightSpec, ...]:
-        return tuple(self._lights.get(i, light) for i, light in enumerate(self._plan().lights))
+        lights = plan_frame(self._scene, self._index).lights
+        return tuple(self._lights.get(i, light) for i, light in enumerate(lights))
+
+    def _look(self, camera: Camera) -> None:
+        """Move all browsers' views to a camera, unless they are there."""
+        pose = camera.world_from_camera
+        if not any(np.allclose(pose, own, atol=1e-9) for own in self._looked):
+            self._looked.append(pose)
+            self._page.look_through(camera)
 
     def _show(self, layout: Layout | None) -> None:
         """Show the scene with a layout; as long as the next one is not known, objects stay where they are shown."""
@@ -284,6 +290,8 @@ class ScenePage:
                 if request[0].scene is self._scene and result.index == self._index // self._views:
                     self._layout = result
                     self._show(result)
+                    if self._pose is None:
+                        self._look(plan_frame(self._scene, self._index, result).camera)
                 return
             self._preview = request[0], result
             self._page.alert(self._fault)  # what an earlier view was refused for is over

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -90,7 +89,7 @@ class CapturePage(StillPage):
         )
         self._photo.on_update(lambda _: self._show())
         self._mask.on_update(lambda _: self._show())
-        through.on_click(lambda event: page.look_through(self._chosen.camera, event.client))
+        through.on_click(lambda _: page.look_through(self._chosen.camera))
         page.on_click(self._clicked)
         page.look_around()
         self._show()
@@ -99,9 +98,9 @@ class CapturePage(StillPage):
     def _chosen(self) -> Photo:
         return self._capture.photos[min(max(int(self._photo.value), 0), len(self._capture.photos) - 1)]
 
-    def _clicked(self, index: int, client: Any) -> None:
+    def _clicked(self, index: int) -> None:
         self._photo.value = index
-        self._page.look_through(self._chosen.camera, client)
+        self._page.look_through(self._chosen.camera)
 
     def _show(self) -> None:
         photo = self._chosen

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import ByteImage
 from mitsplat.camera import look_at_pose
+from mitsplat.scene.viewpoints import view_of
 from mitsplat.view.page import Address, Page
 from mitsplat.view.scene_page import ScenePage
 from tests.conftest import box_asset, small_scene
@@ -109,7 +110,9 @@ def test_a_frame_is_looked_through_and_left_by_moving(shown):
     shown.scene_page._frame.value = 1
     second = shown.picture()
     assert np.abs(second.astype(int) - first).mean() > 2
-    shown.scene_page._moved(look(shown.scene_page._plan().camera.world_from_camera))
+    shown.scene_page._moved(
+        look(view_of(shown.scene_page._scene, 1, shown.scene_page._layout).camera.world_from_camera)
+    )
     assert shown.scene_page._pose is None  # it was moved there by the page
     shown.scene_page._moved(look(look_at_pose((0, 0.2, 0.9), (0, 0, 0))))
     assert shown.scene_page._pose is not None
@@ -148,7 +151,7 @@ def test_another_drop_moves_objects(shown):
     assert shown.scene_page._seed.value == "seed: 1\n"
     shown.wait(lambda: not np.allclose(before["/splats/0-nut-0"], poses(shown)["/splats/0-nut-0"]))
     assert len(poses(shown)) == 2
-    shown.scene_page._step(1, None)
+    shown.scene_page._step(1)
     assert shown.scene_page._index == 2
     shown.wait(lambda: shown.scene_page._layout is not None and shown.scene_page._layout.index == 1)
 

@@ -118,7 +118,7 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
     folder = capture.photos[0].file.parents[1]
     shown = CapturePage(page, folder)
     assert sum(part.group == "cameras" for part in page._shown.values()) == len(capture.photos)
-    shown._clicked(3, None)
+    shown._clicked(3)
     assert page._caption.content.startswith("03\\.png")
     darkened, whole = (photo_picture(capture.photos[3], masked=masked).astype(int) for masked in (True, False))
     outside = capture.photos[3].picture()[1] == 0

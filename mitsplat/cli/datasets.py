@@ -366,7 +366,7 @@ def view(
     ] = "localhost",
     port: Annotated[int, typer.Option(help="TCP port to listen on.")] = 8080,
     gaussians: Annotated[
-        int, typer.Option(help="Most Gaussians of each cloud that the browser is sent; a larger one is thinned.")
+        int, typer.Option(help="Most Gaussians of each cloud that the browser is sent, an even sample of larger ones.")
     ] = 300_000,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = False,
     device: DeviceName = "cpu",

@@ -335,7 +335,7 @@ def told_error(preview: Preview) -> str:
     error = preview.frame.order_error
     if error is None:
         return ", error of the order of blending unknown"
-    return f", error of the order of blending at most {error['largest']:.2g}, on average {error['mean']:.1g}"
+    return f", error of the order of blending {error['mean']:.1g} on average, at most {error['largest']:.2g}"
 
 
 def _strength_of(light: LightSpec) -> str:

@@ -116,19 +116,20 @@ def test_the_path_of_a_light_is_a_line(scene_data, write_scene):
     assert found["/lights/path-0"].thing.segments.tolist() == [[[0, 0, 1], [0.5, 0, 1]], [[0.5, 0, 1], [0, 1, 1]]]
 
 
-def test_a_large_cloud_keeps_what_covers_most():
+def test_a_large_cloud_is_thinned_and_covers_as_much():
     count = 100
-    scales = np.full((count, 3), 0.01, dtype=np.float32)
-    scales[:40] = 0.05
     splats = Splats(
         means=np.arange(3 * count).reshape(count, 3),
         quats=np.tile([0, 0, 0, 1], (count, 1)),
-        scales=scales,
-        opacities=np.where(np.arange(count) < 30, 0.9, 0.01),
+        scales=np.full((count, 3), 0.01),
+        opacities=np.full(count, 0.5),
         sh=np.zeros((count, 1, 3)),
     )
-    kept = Cloud(splats).thinned(30)
-    assert np.array_equal(kept.means, splats.means[:30])
+    kept = Cloud(splats).thinned(25)
+    assert len(kept) == 25
+    assert np.diff(kept.means[:, 0] / 3) == pytest.approx(np.full(24, 4), abs=1.01)  # evenly
+    area, whole = (float(np.prod(some.scales[:, :2], axis=1).sum()) for some in (kept, splats))
+    assert area == pytest.approx(whole)
     assert Cloud(splats).thinned(count) is splats
 
 

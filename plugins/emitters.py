@@ -149,8 +149,7 @@ class Emitters:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
 
             def sky(point: Any) -> tuple[Any, Any]:
-                light = mi.Color3f(0) if self.even_sky else _facing(si, emitter, point, active)[0]
-                return light, mi.Color3f(0)
+                return _facing(si, emitter, point, active)[0], mi.Color3f(0)
 
             def mirrored(point: Any) -> tuple[Any, Any]:
                 direction, weight = lobe.sample(point)

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import drjit as dr
@@ -103,17 +103,16 @@ def bin_gaussians(
     Raises:
         CrowdedError: If the view has too many pairs to hold.
     """
-    tiles, own = (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
     table, owner, local = placement_table(clouds, placements, view)
     if dr.width(local) == 0:
-        return replace(_empty(tiles), tiles=own)
+        return _empty(view, chosen)
     changed = any(placement.appearance is not None for placement in placements)
     source = Projector(clouds, table, view, quality, at_camera, changed)
 
     visible, near = source.cull(owner, local, chosen)
     index = dr.compress(visible)
     if dr.width(index) == 0:
-        return replace(_empty(tiles), tiles=own)
+        return _empty(view, chosen)
     owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
     near = dr.gather(mi.Bool, near, index)
     dr.eval(owner, local, near)
@@ -141,10 +140,10 @@ def bin_records(
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    tiles, own = (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
     pairs = _pair(dr.detach(records), least, box, view, quality, chosen)
     if pairs is None:
-        return replace(_empty(tiles, records), tiles=own)
+        return _empty(view, chosen, records)
+    tiles, own = _numbered(view, chosen)
     return _listed(records, near, pairs, least, dr.width(least), tiles, view, only, own)
 
 
@@ -185,14 +184,20 @@ def _listed(
     )
 
 
-def _empty(tiles: int, records: Any | None = None) -> TileLists:
+def _numbered(view: View, chosen: ChosenTiles | TileBox | None) -> tuple[int, Any]:
+    """How many tiles have lists, and their numbers in the view unless they are all of it."""
+    return (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
+
+
+def _empty(view: View, chosen: ChosenTiles | TileBox | None, records: Any | None = None) -> TileLists:
+    tiles, own = _numbered(view, chosen)
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
     entry = dr.zeros(mi.UInt32, 1)
     visible = 0 if records is None else dr.width(records) // RECORD
     records = dr.zeros(mi.Float, RECORD) if records is None else records
     none = dr.zeros(mi.Float, max(visible, 1))
-    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, None, none)
+    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, own, none)
 
 
 def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:

@@ -56,14 +56,13 @@ class Lanes:
         lane = dr.arange(mi.UInt32, count * per_tile)
         own = lane // per_tile
         tile = own if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, own)
-        tile_y = tile // view.tiles_x
+        tile_y, column, row = tile // view.tiles_x, lane % TILE_WIDTH, lane % per_tile // TILE_WIDTH * rows
         self.view, self.rows = view, rows
-        self.x = (tile - tile_y * view.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
-        self.y = tile_y * TILE_HEIGHT + lane % per_tile // TILE_WIDTH * rows
+        self.x = (tile - tile_y * view.tiles_x) * TILE_WIDTH + column
+        self.y = tile_y * TILE_HEIGHT + row
         self.count = count * TILE_PIXELS if apart else view.width * view.height
         if apart:
-            row = lane % per_tile // TILE_WIDTH * rows
-            first = own * TILE_PIXELS + row * TILE_WIDTH + lane % TILE_WIDTH
+            first = own * TILE_PIXELS + row * TILE_WIDTH + column
             self.pixel = [first + k * TILE_WIDTH for k in range(rows)]
         else:
             self.pixel = [(self.y + k) * view.width + self.x for k in range(rows)]

@@ -19,21 +19,10 @@ YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb
 """Where Ultralytics' tasks have their folders: labels lie beside the images that they are of."""
 _YOLO = {name: folder for name, folder in YOLO_FOLDERS.items() if folder}
 _ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic", "poses": "poses"}
+_MAPS = ("depth", "depth-sensor", "normals", "instances", "semantic", "panoptic")
 _FOLDERS = (
-    *("images", "labels", "layers", "annotations", "layouts", *_YOLO),
-    *(
-        "panoptic",
-        "voc",
-        "label-studio",
-        "bop",
-        "colmap",
-        "depth",
-        "depth-sensor",
-        "normals",
-        "instances",
-        "semantic",
-        "flow",
-    ),
+    *("images", "labels", "layers", "annotations", "layouts", *_YOLO, *_MAPS),
+    *("flow", "voc", "label-studio", "bop", "colmap"),
 )
 """Folders that hold nothing else than a dataset's files."""
 _FOLD = re.compile(r"fold[0-9]+(_train|_val)?\.(txt|yaml)")
@@ -54,7 +43,7 @@ def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]
         files |= {f"voc/JPEGImages/{image}": "voc", f"voc/Annotations/{number}.xml": "voc"}
     if "label-studio" in formats:
         files[f"label-studio/{split}/{number}.json"] = "label-studio"
-    for name in ("depth", "depth-sensor", "normals", "instances", "semantic", "panoptic"):
+    for name in _MAPS:
         if name in formats:
             files[f"{name}/{split}/{png}"] = name
     if "flow" in formats and record["view"] + 1 < output["views"]:

@@ -277,7 +277,6 @@ class Renderer:
                 next_camera=next_camera,
                 lights=lights,
             )
-        with _timed(seconds, "place"):
             # Its few parts are made sooner than threads are woken.
             mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights, lights is not None), parallel=False)
         with _timed(seconds, "render"):

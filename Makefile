@@ -28,7 +28,7 @@ lint: $(STAMPS)/tools
 
 # What the tests of the live view look at it with; they are skipped where it is missing. On Debian, as root.
 browser:
-	@command -v chromium chromedriver > /dev/null || apt-get install --yes --quiet chromium chromium-driver
+	@command -v chromedriver > /dev/null || { apt-get update --quiet && apt-get install --yes --quiet chromium chromium-driver; }
 
 # docs/_build/html/index.html; NOTEBOOKS=1 also runs the notebooks, so that the pages show what they print.
 docs: $(STAMPS)/docs

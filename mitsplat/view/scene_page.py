@@ -172,7 +172,12 @@ class ScenePage:
             pose = np.eye(4)
             pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
             pose[:3, 3] = camera.position
-            if any(np.allclose(pose, own, atol=1e-4) for own in self._looked):
+            ours = [np.allclose(pose, own, atol=1e-4) for own in self._looked]
+            if any(ours):  # the page moved it; a browser may have told of places on the way
+                if ours[-1] and self._pose is not None:
+                    self._pose = None
+                    self._show(self._layout)
+                    self._ask()
                 return
             left, self._pose = self._pose is None, pose
             if left:

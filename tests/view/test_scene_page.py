@@ -18,6 +18,7 @@ from mitsplat.arrays import ByteImage
 from mitsplat.camera import look_at_pose
 from mitsplat.scene.viewpoints import view_of
 from mitsplat.view.page import Address, Page
+from mitsplat.view.previews import SceneRenders, ViewRequest
 from mitsplat.view.scene_page import ScenePage
 from tests.conftest import box_asset, small_scene
 
@@ -110,10 +111,12 @@ def test_a_frame_is_looked_through_and_left_by_moving(shown):
     shown.scene_page._frame.value = 1
     second = shown.picture()
     assert np.abs(second.astype(int) - first).mean() > 2
-    shown.scene_page._moved(
-        look(view_of(shown.scene_page._scene, 1, shown.scene_page._layout).camera.world_from_camera)
-    )
+    own = view_of(shown.scene_page._scene, 1, shown.scene_page._layout).camera.world_from_camera
+    shown.scene_page._moved(look(own))
     assert shown.scene_page._pose is None  # it was moved there by the page
+    shown.scene_page._moved(look(look_at_pose((0, 0.3, 0.3), (0, 0, 0))))
+    shown.scene_page._moved(look(own))
+    assert shown.scene_page._pose is None  # and is there again
     shown.scene_page._moved(look(look_at_pose((0, 0.2, 0.9), (0, 0, 0))))
     assert shown.scene_page._pose is not None
     above = shown.picture()
@@ -182,3 +185,19 @@ def test_the_file_is_read_again_and_a_fault_keeps_the_last_good_scene(shown):
     assert shown.told.alerts[-1] is None
     assert "/shapes/table" in kept
     shown.picture()
+
+
+def test_a_view_from_elsewhere_compiles_nothing(shown):
+    import drjit as dr
+
+    scene = shown.scene_page._scene
+    renders = SceneRenders(lambda text: None)
+    views = [ViewRequest(scene, 0, look_at_pose((x, 0.3, 0.5), (0, 0, 0)), width=320) for x in (0.1, 0.2, -0.3)]
+    for view in views[:2]:
+        renders.render(view, "fast")
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        renders.render(views[2], "fast")
+        kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+    assert len(kernels) > 5
+    assert all(kernel["cache_hit"] for kernel in kernels)

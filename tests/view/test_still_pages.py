@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mitsplat.cli import main
 from mitsplat.dataset.manifest import Manifest
 from mitsplat.errors import InputError
 from mitsplat.view.dataset_index import DatasetIndex, Filter
@@ -153,3 +154,20 @@ def test_a_path_is_told_by_what_it_holds(tmp_path):
     for path, rule in ((tmp_path / "a.txt", "must be a scene"), (tmp_path, "must be a folder with"), ("no", "no such")):
         with pytest.raises(InputError, match=rule):
             kind_of(Path(path))
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        (["no-such-path"], "no such file or folder"),
+        ([".", "--gaussians", "0"], "--gaussians must be at least 1"),
+        (["Makefile"], "must be a scene"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(options, rule, capsys, monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    with pytest.raises(SystemExit) as exit_:
+        main(["view", *options])
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert rule in line

@@ -79,9 +79,10 @@ class Points:
         slot = dr.gather(mi.UInt32, self.slot, places)
         even = dr.gather(mi.UInt32, places, dr.compress(slot == NOWHERE))
         slot = dr.gather(mi.UInt32, slot, dr.compress(slot != NOWHERE))
-        if not dr.width(slot):
-            return even
-        return concatenated([even, *[slot + start for start in self._starts()]])
+        dr.eval(even, slot)  # so that no kernel depends on which of them there are
+        rows = concatenated([even, *[slot + start for start in self._starts()]]) if dr.width(slot) else even
+        dr.eval(rows)
+        return rows
 
     def shared(self, rays: Any, rows: Any) -> Any:
         """How many of the ``rays`` (UInt32) of their pixels start from the points ``rows``: one or more."""

@@ -18,15 +18,13 @@ from mitsplat.formats.registry import Catalogue
 from mitsplat.mesh import mass_properties
 from mitsplat.physics.settle import warp_settings
 from mitsplat.reconstruct.registration import measure_offset
-from mitsplat.reconstruct.segment_splats import NEEDLE, find_floaters
+from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.scene.scene import Scene, load_scene, plan_frame
 
 SIZES = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
 """Longest extents that are expected [m]."""
 DENSITIES = (20.0, 22600.0)
 """From foam to osmium [kg/m^3]."""
-NEEDLE_LENGTH = 0.1
-"""Share of the asset's size from which a needle is seen."""
 FEW = 0.01
 """Share of Gaussians of which nothing is said."""
 INVISIBLE = 1 / 255
@@ -91,13 +89,11 @@ def _up(asset: Asset, core: Float64Array) -> Finding:
 
 def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
     splats = asset.splats
-    ordered = np.sort(splats.scales, axis=1)
-    needles = (ordered[:, 2] > NEEDLE * ordered[:, 1]) & (ordered[:, 2] > NEEDLE_LENGTH * size)
+    needles = long_needles(splats, size)
     share = float(needles.mean())
-    remedy = "`mitsplat mesh` or `mitsplat asset` removes those that stick out of the object's masks"
+    remedy = "`mitsplat import` removes them; `mesh` and `asset` those that stick out of the object's masks"
     yield Finding("needles", share <= FEW, f"{needles.sum()} long ones ({share:.1%})", remedy)
-    weight = splats.opacities.astype(np.float64) * ordered[:, 1] * ordered[:, 2]
-    floaters = len(find_floaters(splats, weight)) / len(splats)
+    floaters = len(find_floaters(splats, visible_area(splats))) / len(splats)
     yield Finding("floaters", floaters <= FEW, f"{floaters:.1%} of the Gaussians touch no large part", remedy)
     faint = float((splats.opacities < INVISIBLE).mean())
     yield Finding("opacity", faint <= 0.2, f"{faint:.0%} are invisible", "prune them: they only cost time")

@@ -43,11 +43,12 @@ for _command in (
     assets.board,
     assets.mesh,
     assets.asset,
+    assets.import_,
     datasets.schema,
     datasets.check,
     datasets.doctor,
 ):
-    app.command()(_command)
+    app.command(_command.__name__.rstrip("_"))(_command)
 
 
 def main(args: Sequence[str] | None = None) -> None:

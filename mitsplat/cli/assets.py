@@ -407,6 +407,96 @@ def asset(
     _tell_asset(done)
 
 
+def import_(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Splats (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog).")
+    ],
+    out: AssetFolder,
+    name: Name = None,
+    class_name: ClassName = None,
+    kind: Kind = "object",
+    up: Annotated[
+        Literal["auto", "x", "-x", "y", "-y", "z", "-z"], typer.Option(help="Axis of the file that points up.")
+    ] = "auto",
+    size: Annotated[float | None, typer.Option(help="Longest extent of what is kept [m].")] = None,
+    units: Annotated[float | None, typer.Option(help="Metres per unit of the file, instead.")] = None,
+    crop: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Keep the inside of this box, in the file's units and axes."),
+    ] = None,
+    without_table: Annotated[
+        bool, typer.Option("--without-table", help="Remove the flat surface that the object stands on.")
+    ] = False,
+    mass: Annotated[float | None, typer.Option(help="Mass [kg], instead of density.")] = None,
+    density: Annotated[float | None, typer.Option(help="Mass density [kg/m^3]; 1000 if absent.")] = None,
+    friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
+    light: Annotated[
+        Literal["uniform", "scene"] | None,
+        typer.Option(help="Whether scenes light it anew, as objects by default, or only shadow it, as environments."),
+    ] = None,
+    faces: Faces = 10000,
+    voxels: Annotated[int, typer.Option(help="Cells of the mesh's grid along the longest extent.")] = 192,
+    scene: Annotated[
+        Path | None, typer.Option(metavar="SCENE", help="Also write a scene file to begin with, that has it.")
+    ] = None,
+    device: DeviceName = "cpu",
+) -> None:
+    """Make an asset of splats that were made elsewhere.
+
+    What is invisible, too large or loose is removed, up is found, and an object gets a mesh and convex pieces;
+    report.html shows it all. What is questionable is said; `check` says more.
+    """
+    from mitsplat.reconstruct.import_report import check_scene_path, write_import_report, write_scene
+    from mitsplat.reconstruct.splat_import import ImportSettings, import_splats
+    from mitsplat.reconstruct.surface import SurfaceSettings
+
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out must be a folder (got the file {out})")
+    settings = ImportSettings(
+        up=None if up == "auto" else up,
+        units=units,
+        size=size,
+        crop=crop,
+        without_table=without_table,
+        surface=SurfaceSettings(voxels=voxels, faces=faces, blur=1.0),
+    )
+    if scene is not None:
+        check_scene_path(scene, out, known=size is not None or units is not None)
+    take_device(device)
+    with stage_bar() as progress:
+        result = import_splats(
+            file,
+            name=name or out.resolve().name,
+            class_name=class_name,
+            kind=kind,
+            settings=settings,
+            density=density,
+            mass=mass,
+            friction=friction,
+            capture_light=light,
+            progress=progress,
+        )
+    made = result.asset
+    made.save(out)
+    report = write_import_report(out, result)
+    removed = ", ".join(f"{count} {reason}" for reason, count in result.removed.items() if count) or "none"
+    typer.echo(f"up: {result.upright.reason}")
+    typer.echo(f"Gaussians: {len(made.splats)} of {result.found}; removed: {removed}")
+    if made.mesh is not None:
+        extents = " x ".join(f"{extent:.4g}" for extent in made.mesh.extents)
+        pieces = f", {len(made.pieces)} convex pieces" if made.pieces else ""
+        typer.echo(
+            f"extents: {extents} {'m' if made.units == 'metre' else 'units'}; {len(made.mesh.faces)} faces{pieces}"
+        )
+    for miss in result.misses:
+        typer.echo(f"warning: {miss}")
+    typer.echo(f"report: {report}")
+    typer.echo(f"asset: {out}")
+    if scene is not None:
+        write_scene(scene, out, result)
+        typer.echo(f"scene: {scene}")
+
+
 def _board(squares: str, square: float) -> Board:
     from mitsplat.capture.targets import Board
 

@@ -58,28 +58,50 @@ _ADVICE = {
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutView:
-    """What a photo that nothing was fitted to shows, and what the asset shows from there.
+class AssetView:
+    """What an asset shows of its splats and its mesh.
 
     Attributes:
-        name: Of the photo.
         camera: At the size of these pictures.
-        photo: Display-encoded, (H, W, 3).
-        mask: Share of the pixel that is object, (H, W), or None.
         render: Splats, display-encoded and multiplied by alpha, (H, W, 3).
         alpha: Of the splats, (H, W).
         mesh: Whether the mesh covers the pixel's middle, (H, W).
         normal: Unit normals of the mesh in the world, (H, W, 3).
     """
 
-    name: str
     camera: Camera
-    photo: Float32Array
-    mask: Float32Array | None
     render: Float32Array
     alpha: Float32Array
     mesh: BoolArray
     normal: Float32Array
+
+    @property
+    def picture(self) -> Float32Array:
+        """The splats over grey, display-encoded, (H, W, 3)."""
+        return np.asarray(self.render + 0.5 * (1 - self.alpha[..., None]), dtype=np.float32)
+
+    def shaded(self, behind: Float32Array | float, share: float = 1.0) -> Float32Array:
+        """The mesh, lit from the camera, over ``behind``, of which it hides a share."""
+        towards = -self.camera.world_from_camera[:3, 2]
+        light = 0.25 + 0.75 * np.clip(self.normal @ towards, 0, 1)
+        grey = np.repeat(light[..., None], 3, axis=2) * (1.0, 0.75, 0.45)
+        cover = share * self.mesh[..., None]
+        return np.asarray(cover * grey + (1 - cover) * behind, dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutView(AssetView):
+    """What a photo that nothing was fitted to shows, and what the asset shows from there.
+
+    Attributes:
+        name: Of the photo.
+        photo: Display-encoded, (H, W, 3).
+        mask: Share of the pixel that is object, (H, W), or None.
+    """
+
+    name: str
+    photo: Float32Array
+    mask: Float32Array | None
 
 
 @dataclass(frozen=True)
@@ -156,20 +178,25 @@ def show_held_out(
     splats: Splats, mesh: trimesh.Trimesh | None, photos: Sequence[Photo], size: int
 ) -> list[HeldOutView]:
     """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
+    sized = [sized_photo(photo, size) for photo in photos]
+    shown = show_asset(splats, mesh, [camera for camera, _, _ in sized])
+    return [
+        HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask)
+        for photo, (_, rgb, mask), view in zip(photos, sized, shown, strict=True)
+    ]
+
+
+def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[Camera]) -> list[AssetView]:
+    """Splats and mesh as cameras see them."""
     integrator = make_integrator(shadow="none")
-    shape = make_splats_shape(splats, instance=1, proxy=mesh)
-    scene = mi.load_dict({"type": "scene", "splats": shape})
+    scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1, proxy=mesh)})
     views = []
-    for photo in photos:
-        camera, rgb, mask = sized_photo(photo, size)
+    for camera in cameras:
         layers = render_layers(integrator, scene, camera)
         alpha = np.maximum(layers.alpha, 1e-6)[..., None]
         views.append(
-            HeldOutView(
-                name=photo.name,
+            AssetView(
                 camera=camera,
-                photo=rgb,
-                mask=mask,
                 render=(encode_srgb(layers.captured / alpha) * layers.alpha[..., None]).astype(np.float32),
                 alpha=layers.alpha,
                 mesh=layers.proxy_instance > 0,
@@ -216,13 +243,13 @@ def judge(
         units=capture.units,
         gaussians=len(splats),
         faces=0 if mesh is None else len(mesh.faces),
-        watertight=mesh is not None and _closed(mesh),
+        watertight=mesh is not None and is_closed(mesh),
         solid=isolation is not None,
         refinement=None if refinement is None else str(refinement),
     )
 
 
-def _closed(mesh: trimesh.Trimesh) -> bool:
+def is_closed(mesh: trimesh.Trimesh) -> bool:
     """Whether a mesh is watertight also where readers weld vertices that lie on each other."""
     welded = mesh.copy()
     welded.merge_vertices(merge_tex=True, merge_norm=True)

@@ -96,9 +96,9 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
         difference = np.abs(view.render - view.photo * mask[..., None]) / _MOST_DIFFERENCE
         pictures = {
             "photo": _outlined(eight_bit(view.photo), view.mask),
-            "render": eight_bit(view.render + (1 - view.alpha[..., None]) * 0.5),
+            "render": eight_bit(view.picture),
             "difference": eight_bit(difference),
-            "mesh over photo": _shaded(view),
+            "mesh over photo": eight_bit(view.shaded(view.photo, 0.85)),
         }
         images = "".join(
             f'<figure><img alt="{kind} {html.escape(view.name, quote=True)}" src="{shrunk_image(picture, _VIEW)}">'
@@ -186,15 +186,6 @@ def _photos(capture: Capture) -> str:
         f'<div class="thumbnails">{"".join(figures)}</div>'
         f"<h3>Rejected</h3>{f'<ul>{rejected}</ul>' if rejected else '<p>none</p>'}</section>"
     )
-
-
-def _shaded(view: HeldOutView) -> ByteImage:
-    """The mesh, lit from the camera, over the photo."""
-    towards = -view.camera.world_from_camera[:3, 2]
-    light = 0.25 + 0.75 * np.clip(view.normal @ towards, 0, 1)
-    grey = np.repeat(light[..., None], 3, axis=2) * (1.0, 0.75, 0.45)
-    share = 0.85 * view.mesh[..., None]
-    return eight_bit(share * grey + (1 - share) * view.photo)
 
 
 def _outlined(picture: ByteImage, mask: Float32Array | None) -> ByteImage:

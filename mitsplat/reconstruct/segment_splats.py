@@ -39,6 +39,8 @@ SEEN = 0.05
 """Visible weight, summed over all views [px], below which nobody has seen a Gaussian."""
 NEEDLE = 8.0
 """Longest over second longest standard deviation of a needle."""
+NEEDLE_LENGTH = 0.1
+"""Share of an asset's size from which a needle is seen."""
 NEEDLE_TIP = 2.0
 """Standard deviations from a needle's middle to its tips, which must not stick out of the masks."""
 TIP_MARGIN = 1.5
@@ -185,6 +187,18 @@ def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
         outside += sample_nearest(away, view.camera, tips, missing=0.0) > TIP_MARGIN
     result[needle] = (outside.reshape(2, -1) > 1).any(axis=0)
     return result
+
+
+def long_needles(splats: Splats, size: float) -> BoolArray:
+    """Which Gaussians (N,) are elongated, and long against the ``size`` of what they are of [m]."""
+    ordered = np.sort(splats.scales, axis=1)
+    return np.asarray((ordered[:, 2] > NEEDLE * ordered[:, 1]) & (ordered[:, 2] > NEEDLE_LENGTH * size))
+
+
+def visible_area(splats: Splats) -> Float64Array:
+    """Area that each Gaussian shows at most, times its opacity, up to a constant, shape (N,)."""
+    ordered = np.sort(splats.scales, axis=1).astype(np.float64)
+    return np.asarray(splats.opacities * ordered[:, 1] * ordered[:, 2])
 
 
 def sample_nearest(

@@ -20,12 +20,14 @@ import manifold3d
 import mitsuba as mi
 import numpy as np
 import trimesh
-from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
+from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.mesh import join_meshes
 from mitsplat.plugins.sensors import view_of
 from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
@@ -44,6 +46,12 @@ _BEHIND = 2.0
 surface inwards, because all of the space in front counts; without a limit, hollows close that some views miss."""
 _DOUBT = 0.5
 """Standard deviations between views by which depth must exceed the hull to cut it: masks err less than depths."""
+_FILLED = 0.5
+"""Share of a cell's cross-section that Gaussians must cover to fill it."""
+_DRAWS = 8
+"""Points by which a Gaussian is spread over cells."""
+_SMALLEST_PART = 1e-3
+"""Volume of a leaf whose stem is lost, as a share of the largest part's."""
 _FAR = 1e6
 _APART = 0.02
 """Share of the way to its neighbours by which a vertex leaves the place that it shares with another."""
@@ -85,6 +93,7 @@ def reconstruct_surface(
     settings: SurfaceSettings = SurfaceSettings(),
     *,
     floor: float | None = None,
+    thin: bool = False,
     progress: Progress | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the splats in their own frame.
@@ -96,6 +105,8 @@ def reconstruct_surface(
             surroundings need.
         settings: Resolution and size.
         floor: Height z of the table that the object stands on, if it does.
+        thin: Keep sheets and stems that are thinner than a cell, such as leaves, three cells thick, where Gaussians lie
+            densely: depths of both sides cancel each other there.
         progress: Told after every view how many of how many are done.
 
     Returns:
@@ -114,6 +125,8 @@ def reconstruct_surface(
         if progress is not None:
             progress(number + 1, len(cameras), "finding the surface")
     distance, known = grid.combine(state, settings.blur)
+    if thin:
+        distance = np.where(grid.lost(splats, distance, state), 0.5 * np.float32(grid.cell), distance)
     if floor is not None:
         distance = np.minimum(distance, grid.heights() - np.float32(floor))
     # A border outside closes the surface at the edge of the grid.
@@ -128,7 +141,8 @@ def reconstruct_surface(
     surface = trimesh.Trimesh(grid.low + (vertices - 0.5) * grid.cell, faces)
     if not masked:
         return simplify_surface(surface, settings.faces)
-    return _untouched(_outer_shell(simplify_surface(_outer_shell(surface), settings.faces)))
+    least = _SMALLEST_PART if thin else 1.0
+    return _untouched(_outer_shells(simplify_surface(_outer_shells(surface, least), settings.faces), least))
 
 
 def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
@@ -175,10 +189,14 @@ def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, surface.faces, process=False)
 
 
-def _outer_shell(surface: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The largest closed part: without crumbs beside the object and cavities inside, which nobody has seen."""
+def _outer_shells(surface: trimesh.Trimesh, least: float) -> trimesh.Trimesh:
+    """The closed parts of at least a share of the largest one's volume, without crumbs beside and cavities inside."""
     parts = surface.split(only_watertight=True)
-    return max(parts, key=lambda part: float(part.volume), default=surface)
+    largest = max((float(part.volume) for part in parts), default=0.0)
+    kept = [part for part in parts if part.volume >= least * largest > 0]
+    if not kept:
+        return surface
+    return kept[0] if len(kept) == 1 else join_meshes(kept)
 
 
 @dataclass(eq=False)
@@ -286,6 +304,27 @@ class _Grid:
         shaped = distance.reshape(self.shape).astype(np.float32)
         smooth = gaussian_filter(shaped, blur, mode="nearest") if blur > 0 else shaped
         return smooth, known
+
+    def lost(self, splats: Splats, distance: Float32Array, state: _State) -> BoolArray:
+        """Cells that Gaussians fill in all silhouettes, but which no surface encloses, and their neighbours.
+
+        A Gaussian of opacity a and standard deviations s, t stops light on an area of 2 pi a s t; it is spread over
+        cells by random points.
+        """
+        ordered = np.sort(splats.scales.astype(np.float64), axis=1)
+        area = 2 * np.pi * splats.opacities * ordered[:, 1] * ordered[:, 2] / self.cell**2
+        offsets = np.random.default_rng(0).normal(size=(_DRAWS, len(splats), 3)) * splats.scales
+        frames = Rotation.from_quat(splats.quats).as_matrix()
+        points = (splats.means + np.einsum("nij,snj->sni", frames, offsets)).reshape(-1, 3)
+        place = (points - self.low) / self.cell
+        inside = ((place >= 0) & (place < self.shape)).all(axis=1)
+        index = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), self.shape)
+        cover = np.bincount(index, np.tile(area / _DRAWS, _DRAWS)[inside], self.count).reshape(self.shape)
+        enclosed = binary_dilation(distance > 0, np.ones((3, 3, 3)), iterations=2)
+        lost = (cover >= _FILLED) & ~enclosed
+        if state.hull:
+            lost &= np.array(state.hull[-1]).reshape(self.shape) > -self.cell
+        return np.asarray(binary_dilation(lost))
 
     def _in_camera(self, camera: Camera) -> tuple[Any, Any, Any]:
         """Camera coordinates of the middles of all cells [m]."""

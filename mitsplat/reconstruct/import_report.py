@@ -1,0 +1,217 @@
+"""What came of a splat file: a page to look at, and a scene to begin with."""
+
+from __future__ import annotations
+
+import html
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mitsplat.arrays import Float32Array
+from mitsplat.errors import InputError
+from mitsplat.files import is_inside, write_text
+from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image
+from mitsplat.mesh import mass_properties
+from mitsplat.reconstruct.evaluation import show_asset
+from mitsplat.reconstruct.splat_import import Imported
+from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.splats import Splats
+
+_VIEW = 420
+_REMOVED_SHOWN = 4
+"""Views that show what was removed."""
+
+
+def write_import_report(folder: Path, imported: Imported) -> Path:
+    """Write ``report.html`` into an asset's folder.
+
+    Raises:
+        OSError: If the page cannot be written.
+    """
+    name = imported.asset.name
+    body = [f"<h1>{html.escape(name)}</h1>", _verdict(imported), _views(imported), _removed(imported)]
+    path = folder / REPORT_FILE
+    write_text(path, make_page(f"{name}: import report", "\n".join(body)))
+    return path
+
+
+def _verdict(imported: Imported) -> str:
+    asset = imported.asset
+    unit = "m" if asset.units == "metre" else "in the file's units"
+    removed = ", ".join(f"{count} {reason}" for reason, count in imported.removed.items() if count) or "none"
+    rows: dict[str, str | None] = {
+        "Up": imported.upright.reason,
+        "Gaussians": f"{len(asset.splats)} of {imported.found}; removed: {removed}",
+        "IoU of mesh and splats": figure_of(imported.mesh_iou, "{:.3f}"),
+        "Shift between mesh and splats": figure_of(imported.offset, "{:.3%} of the diagonal"),
+        "Light that it carries": asset.capture_light,
+    }
+    if asset.mesh is not None:
+        rows["Extents"] = " x ".join(f"{extent:.4g}" for extent in asset.mesh.extents) + f" {unit}"
+        rows["Mesh"] = f"{len(asset.mesh.faces)} faces, {'watertight' if imported.watertight else 'open'}"
+        if asset.pieces and asset.units == "metre":
+            mass = mass_properties(asset.mesh, asset.pieces, density=asset.density, mass=asset.mass)
+            rows["Mass"] = f"{mass.mass:.4g} kg in {len(asset.pieces)} convex pieces"
+    if imported.support is not None:
+        width, depth = imported.support.size
+        rows["Surface to drop on"] = f"{width:.3g} x {depth:.3g} {unit}, {imported.support.share:.0%} of what is seen"
+    table = "".join(
+        f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value
+    )
+    lines = "".join(f'<p class="bad">{html.escape(miss)}</p>' for miss in imported.misses)
+    good = '<p class="good">Nothing to note.</p>'
+    return _section("Verdict", f"{lines or good}<table>{table}</table>")
+
+
+def _views(imported: Imported) -> str:
+    rows = []
+    for number, view in enumerate(imported.views, 1):
+        pictures = {
+            "splats": view.picture,
+            "mesh": view.shaded(0.5),
+            "mesh over splats": view.shaded(view.picture, 0.5),
+        }
+        images = "".join(_figure(f"view {number}, {kind}", kind, shown) for kind, shown in pictures.items())
+        rows.append(f'<div class="row">{images}</div>')
+    note = "<p>Up in the pictures is up in scenes. The mesh was fitted to other views.</p>"
+    return _section("Views", note + ("".join(rows) or "<p>none</p>"))
+
+
+def _removed(imported: Imported) -> str:
+    """What was removed in red, beside what is left."""
+    rubbish = imported.rubbish
+    if not len(rubbish) or not imported.views:
+        return ""
+    red = np.zeros((len(rubbish), 1, 3), dtype=np.float32)
+    red[:, 0] = np.array([0.4, -0.4, -0.4]) / SH_C0
+    everything = Splats.concatenate([imported.asset.splats, replace(rubbish, sh=red)])
+    cameras = [view.camera for view in imported.views[:_REMOVED_SHOWN]]
+    images = "".join(
+        _figure(f"view {number}, removed in red", f"view {number}", view.picture)
+        for number, view in enumerate(show_asset(everything, None, cameras), 1)
+    )
+    return _section("Removed", f'<p>In red what is not in the asset.</p><div class="row">{images}</div>')
+
+
+def _section(title: str, body: str) -> str:
+    key = title.lower()
+    return f'<section aria-labelledby="{key}"><h2 id="{key}">{title}</h2>{body}</section>'
+
+
+def _figure(alt: str, caption: str, picture: Float32Array) -> str:
+    source = rgb_image(picture, _VIEW)
+    return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+
+
+def check_scene_path(path: Path, asset_folder: Path, *, known: bool) -> None:
+    """Refuse, before there is an asset, a scene file that could not be written for it.
+
+    Args:
+        path: Of the scene file.
+        asset_folder: Of the asset.
+        known: Whether its size is.
+
+    Raises:
+        InputError: If there is such a file, the asset is not below its folder, or its size is not known.
+    """
+    if path.exists():
+        raise InputError(f"{path}: is there already: name another scene, or remove it")
+    if not known:
+        raise InputError(f"{path}: a scene is in metres: give --size or --units as well")
+    if not is_inside(path.parent, os.path.relpath(asset_folder, path.parent)):
+        raise InputError(f"{path}: a scene reads below its own folder only, where {asset_folder} is not")
+
+
+def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
+    """Write a scene file to begin with: the object on a table, or solids dropped where the surroundings are flat.
+
+    Raises:
+        InputError: As :func:`check_scene_path`, or if surroundings have no horizontal surface.
+    """
+    asset = imported.asset
+    check_scene_path(path, asset_folder, known=asset.units == "metre")
+    name = os.path.relpath(asset_folder, path.parent)
+    if asset.kind == "object":
+        size = (
+            float(np.ptp(asset.splats.bounds, axis=0).max()) if asset.mesh is None else float(asset.mesh.extents.max())
+        )
+        text = _OBJECT_SCENE.format(
+            name=asset.name, asset=name, reach=_metres(1.1 * size), low=_metres(0.1 * size), top=_metres(2.5 * size),
+            table=_metres(max(1.2, 8 * size)), target=_metres(0.35 * size), near=_metres(2.8 * size),
+            far=_metres(4.2 * size), room=_metres(max(5.0, 24 * size)), floor=_metres(-max(0.75, 4 * size)),
+        )  # fmt: skip
+    else:
+        if imported.support is None:
+            raise InputError(f"{path}: no horizontal surface was found to drop things on: write the scene by hand")
+        width, depth = imported.support.size
+        reach = [min(0.35 * edge, 0.3) for edge in (width, depth)]
+        text = _ENVIRONMENT_SCENE.format(
+            name=asset.name, asset=name, width=_metres(width), depth=_metres(depth), x=_metres(reach[0]),
+            y=_metres(reach[1]), near=_metres(1.8 * max(reach)), far=_metres(2.8 * max(reach)),
+            proxy=", proxy: true" if asset.mesh is None else "",
+        )  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, text)
+
+
+def _metres(length: float) -> str:
+    return f"{length:.3g}"
+
+
+_OBJECT_SCENE = """\
+# {name} on a table, under the light of a room. `mitsplat render` makes images of it.
+name: {name}
+
+shapes:
+  - name: table
+    box: {{size: [{table}, {table}, 0.05], position: [0, 0, -0.025]}}
+    visible: true
+    materials: [{{kind: wood}}, {{kind: noise, saturation: [0, 0.3]}}]
+backdrop: {{size: [{room}, {room}, {room}], position: [0, 0, {floor}]}}
+
+objects:
+  - {{asset: {asset}, count: [1, 2]}}
+region: {{min: [-{reach}, -{reach}, {low}], max: [{reach}, {reach}, {top}]}}
+enclosure: {{}}
+settle: {{arrangement: upright, stepper: mujoco}}  # as it stands; `drop` lets it tumble
+
+camera:
+  kind: hemisphere
+  target: [0, 0, {target}]
+  radius: [{near}, {far}]
+  elevation: [18, 60]
+  intrinsics: {{fov_x: 50}}
+lights:
+  - {{kind: room, size: {room}}}
+randomise: {{exposure: [-0.3, 0.3], iso: [100, 400]}}
+output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
+"""
+
+_ENVIRONMENT_SCENE = """\
+# Solids of random materials dropped on {name}. Put assets of your own in their place.
+name: {name}
+environment: {asset}
+
+shapes:
+  # The horizontal surface that was found in it; the splats show it, and this carries what falls there.
+  - {{name: table, box: {{size: [{width}, {depth}, 0.05], position: [0, 0, -0.025]}}{proxy}}}
+
+objects:
+  - {{pool: primitives, count: [2, 5]}}
+region: {{min: [-{x}, -{y}, 0.04], max: [{x}, {y}, 0.25]}}
+enclosure: {{}}
+settle: {{stepper: mujoco}}
+
+camera:
+  kind: hemisphere
+  target: [0, 0, 0.02]
+  radius: [{near}, {far}]
+  elevation: [30, 60]
+  intrinsics: {{fov_x: 50}}
+lights:
+  - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
+  - {{kind: environment, radiance: 0.4}}
+output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
+"""

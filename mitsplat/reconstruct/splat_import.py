@@ -1,0 +1,377 @@
+"""Splats that were made elsewhere to an asset: cleaned, upright, in metres, with a mesh of their own.
+
+Nothing but the file is needed. What the photographs of a capture decide otherwise is found from the splats themselves:
+pictures of them from all around are the masks of an object, and the depths of its surface. A file says neither which
+way is up nor how large a unit is; the one is found, the other is for the user to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import shapely
+import trimesh
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.asset import Asset
+from mitsplat.camera import Camera
+from mitsplat.errors import InputError
+from mitsplat.mesh import convex_pieces
+from mitsplat.progress import Progress
+from mitsplat.reconstruct.evaluation import AssetView, Thresholds, iou, is_closed, show_asset
+from mitsplat.reconstruct.registration import measure_offset, surface_points
+from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
+from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
+from mitsplat.reconstruct.upright import USUAL_UP, Axis, Plane, Upright, cut_support, find_up
+from mitsplat.render.layers import render_splats
+from mitsplat.splats import Splats
+from mitsplat.variant import one_at_a_time
+
+FAINT = 1 / 255
+"""Opacity below which a Gaussian is in no picture."""
+HUGE = 0.2
+"""Standard deviation of a Gaussian of an object that is no part of it but haze, as a share of the longest extent."""
+_BULK = 0.005
+"""Share of the Gaussians at either end of an axis that do not decide how large an object is."""
+_FOV, _DISTANCE = 29.0, 4.5
+"""Field of view [degrees], and distance in radii of what it shows, of the views of an object."""
+_HELD_OUT = 6
+_CONCAVITY = 0.04
+"""Of convex pieces: the surface of splats is too rough for less."""
+_STAGES = 6
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """How a splat file becomes an asset.
+
+    Attributes:
+        up: Axis of the file that points up; found if None.
+        units: Metres per unit of the file.
+        size: Longest extent [m], instead of units.
+        crop: Lower and upper corner of the box that is kept, in the file's units and axes.
+        without_table: Remove the flat surface that the object stands on, and what is below it.
+        views: Pictures that the surface is found by.
+        view_size: Their edge [px].
+        surface: How the mesh is reconstructed.
+    """
+
+    up: Axis | None = None
+    units: float | None = None
+    size: float | None = None
+    crop: tuple[float, float, float, float, float, float] | None = None
+    without_table: bool = False
+    views: int = 48
+    view_size: int = 480
+    surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings(blur=1.0))
+
+    def __post_init__(self) -> None:
+        for name in ("units", "size"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise InputError(f"{name} must be finite and > 0 (got {value:g})")
+        if self.units is not None and self.size is not None:
+            raise InputError("units and size both say how large it is: give one of them")
+        if self.crop is not None and not all(
+            low < high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
+        ):
+            raise InputError(f"crop must be a lower and an upper corner (got {' '.join(f'{v:g}' for v in self.crop)})")
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """A horizontal surface of surroundings that things can be dropped on, in the middle of which the origin is.
+
+    Attributes:
+        size: Along x and y [m].
+        share: Share of what is seen that lies in it.
+    """
+
+    size: tuple[float, float]
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """An asset, and what came of its file on the way.
+
+    Attributes:
+        asset: In metres, or in the file's units where these are unknown; z up. An object stands on z = 0, the middle of
+            its base in the origin; surroundings have the middle of the surface in the origin that most of them lie in.
+        upright: Why up is where it is, in the file's axes.
+        found: Number of Gaussians of the file.
+        removed: Number of those removed, by the reason.
+        rubbish: The removed ones, in the asset's frame.
+        support: What things can be dropped on in surroundings, or None.
+        views: Asset and mesh from where the mesh was not fitted to.
+        mesh_iou: Mean IoU of the mesh's silhouette with that of the splats in these, of an object.
+        offset: Shift between mesh and splats' surface, as a share of the mesh's diagonal.
+        watertight: Whether the mesh encloses a volume.
+        topples: Whether it would fall over as it stands there.
+    """
+
+    asset: Asset
+    upright: Upright
+    found: int
+    removed: dict[str, int]
+    rubbish: Splats
+    support: Support | None
+    views: Sequence[AssetView]
+    mesh_iou: float | None
+    offset: float | None
+    watertight: bool
+    topples: bool
+
+    @property
+    def misses(self) -> tuple[str, ...]:
+        """What is questionable, a sentence each with what to do."""
+        asset, found, thresholds = self.asset, [], Thresholds()
+        if asset.units == "unknown":
+            found.append("how large it is is unknown: give --size, the longest extent in metres, or --units")
+        if self.topples:
+            found.append("it would fall over as it stands in the pictures: if it lies on its side there, give --up")
+        if self.mesh_iou is not None and self.mesh_iou < thresholds.mesh_iou:
+            found.append(
+                f"the mesh meets the outline of the splats with an IoU of only {self.mesh_iou:.3f} (at least "
+                f"{thresholds.mesh_iou:g} is wanted): crop what is soft around the object, or give more --voxels"
+            )
+        if self.offset is not None and self.offset > thresholds.offset:
+            found.append(
+                f"mesh and splats are {self.offset:.2%} of the diagonal apart (at most {thresholds.offset:.2%} is "
+                "wanted): see whether the file holds more than the object, and crop it"
+            )
+        if asset.kind == "object" and not self.watertight:
+            found.append("the mesh is open (a closed one is wanted): give more --voxels, or crop what is around")
+        if asset.kind == "environment" and self.support is None:
+            found.append("no horizontal surface was found: state shapes and the region of a scene by hand")
+        return tuple(found)
+
+
+@one_at_a_time
+def import_splats(
+    path: str | Path,
+    *,
+    name: str,
+    class_name: str | None = None,
+    kind: Literal["object", "environment"] = "object",
+    settings: ImportSettings = ImportSettings(),
+    density: float | None = None,
+    mass: float | None = None,
+    friction: float = 0.5,
+    capture_light: Literal["uniform", "scene"] | None = None,
+    progress: Progress | None = None,
+) -> Imported:
+    """Make an asset of a splat file.
+
+    Args:
+        path: Any file that :meth:`mitsplat.Splats.load` reads.
+        name: Of the asset.
+        class_name: Class that detectors learn; the name if None.
+        kind: Objects can be dropped: they get a closed mesh and convex pieces. Environments stay where they are.
+        settings: Up, scale, what to cut away, and resolutions.
+        density: Mass density [kg/m^3]; 1000 if neither this nor ``mass`` is given.
+        mass: Mass [kg].
+        friction: Coulomb friction coefficient.
+        capture_light: As :class:`mitsplat.Asset` has it; by default ``uniform`` of objects, ``scene`` of environments.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: If the file cannot be read, nothing of it is left, or a value breaks a rule.
+    """
+    path = Path(path)
+    if density is not None and mass is not None:
+        raise InputError("density and mass both say how heavy it is: give one of them")
+    for key, value in (("density", density), ("mass", mass)):
+        if value is not None and not 0 < value < np.inf:
+            raise InputError(f"{key} must be finite and > 0 (got {value:g})")
+    stages = iter(range(_STAGES))
+
+    def tell(doing: str) -> None:
+        if progress is not None:
+            progress(next(stages), _STAGES, doing)
+
+    tell("reading the file")
+    loaded = Splats.load(path)
+    if not len(loaded):
+        raise InputError(f"{path}: must hold at least one Gaussian (got 0)")
+    cleaner = _Cleaner(path, loaded)
+    if settings.crop is not None:
+        low, high = np.reshape(settings.crop, (2, 3))
+        outside = np.asarray(((loaded.means < low) | (loaded.means > high)).any(axis=1))
+        span = ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", *loaded.bounds, strict=True))
+        cleaner.remove("outside of the box", outside, f"crop keeps nothing: the file has {span}")
+    tell("removing floaters")
+    cleaner.remove_floaters(kind)
+    tell("finding up")
+    upright = find_up(cleaner.splats, kind, USUAL_UP.get(path.suffix.lower(), "-y"), settings.up)
+    turn = np.eye(4)
+    turn[:3, :3] = upright.rotation
+    if settings.without_table:
+        if upright.support is None:
+            raise InputError(f"{path}: has no flat surface that the object stands on: leave out --without-table")
+        cleaner.remove("table", ~cut_support(cleaner.splats, upright.support), "nothing stands on the flat surface")
+        cleaner.remove_floaters(kind)
+    splats = cleaner.splats.transformed(turn)
+    support = None
+    if kind == "environment" and upright.support is not None:
+        support, placed = _on_support(splats, upright.support)
+        turn = placed @ turn
+        splats = cleaner.splats.transformed(turn)
+    tell("finding the surface")
+    seen_below = kind == "object" and not settings.without_table
+    mesh = _surface(splats, kind, settings, lowest=-1.0 if seen_below else 0.0)
+    asset = Asset(
+        name=name,
+        class_name=class_name or name,
+        splats=splats,
+        mesh=mesh,
+        kind=kind,
+        density=1000.0 if density is None else density,
+        mass=mass,
+        friction=friction,
+        capture_light=capture_light or ("uniform" if kind == "object" else "scene"),
+        units="unknown",
+    )
+    metres_from_file = turn
+    if kind == "object":
+        low, high = splats.bounds if mesh is None else mesh.bounds
+        base = trimesh.transformations.translation_matrix(-np.array([*(low[:2] + high[:2]) / 2, low[2]]))
+        asset, metres_from_file = asset.transformed(base), base @ turn
+    factor = settings.units if settings.size is None else asset.factor_to(settings.size)
+    if factor is not None:
+        larger = np.diag([factor, factor, factor, 1.0])
+        asset, metres_from_file = replace(asset.transformed(larger), units="metre"), larger @ metres_from_file
+        if support is not None:
+            support = replace(support, size=(factor * support.size[0], factor * support.size[1]))
+    views: list[AssetView] = []
+    mesh_iou = offset = None
+    if asset.mesh is not None:
+        tell("comparing mesh and splats")
+        cameras = _cameras(asset.splats, kind, settings, _HELD_OUT, lowest=-0.3 if seen_below else 0.0, turn=0.7)
+        views = show_asset(asset.splats, asset.mesh, cameras)
+        offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
+        if kind == "object":
+            mesh_iou = float(np.mean([iou(view.alpha >= 0.5, view.mesh) for view in views]))
+            tell("splitting the mesh into convex pieces")
+            asset = replace(asset, pieces=convex_pieces(asset.mesh, threshold=_CONCAVITY))
+    return Imported(
+        asset=asset,
+        upright=upright,
+        found=len(loaded),
+        removed=cleaner.removed,
+        rubbish=cleaner.rubbish().transformed(metres_from_file),
+        support=support,
+        views=views,
+        mesh_iou=mesh_iou,
+        offset=offset,
+        watertight=asset.mesh is not None and is_closed(asset.mesh),
+        topples=kind == "object" and asset.mesh is not None and _topples(asset.mesh),
+    )
+
+
+class _Cleaner:
+    """The Gaussians of a file that are left, and why the others went."""
+
+    def __init__(self, path: Path, splats: Splats) -> None:
+        self._path, self._all, self._kept = path, splats, np.ones(len(splats), dtype=bool)
+        self.removed: dict[str, int] = {}
+
+    @property
+    def splats(self) -> Splats:
+        """What is left."""
+        return self._all.select(self._kept)
+
+    def rubbish(self) -> Splats:
+        """What was removed."""
+        return self._all.select(~self._kept)
+
+    def remove(self, reason: str, which: BoolArray, otherwise: str) -> None:
+        """Remove some of those that are left, and refuse to remove all."""
+        self.removed[reason] = self.removed.get(reason, 0) + int(which.sum())
+        self._kept[np.flatnonzero(self._kept)[which]] = False
+        if not self._kept.any():
+            raise InputError(f"{self._path}: {otherwise}")
+
+    def remove_floaters(self, kind: str) -> None:
+        """Remove what is invisible, too large to be part of an object, or touches no large part."""
+        self.remove("invisible", self.splats.opacities < FAINT, "all Gaussians are invisible")
+        if kind == "object":
+            splats = self.splats
+            size = _extent(splats)
+            haze = (splats.scales.max(axis=1) > HUGE * size) | long_needles(splats, size)
+            self.remove("haze and needles", haze, "all Gaussians are haze or needles: is it an environment?")
+        splats = self.splats
+        floating = np.zeros(len(splats), dtype=bool)
+        floating[find_floaters(splats, visible_area(splats))] = True
+        self.remove("floaters", floating, "the Gaussians do not touch each other")
+
+
+def _extent(splats: Splats) -> float:
+    """Longest extent of the bulk of the Gaussians."""
+    return float(np.ptp(np.quantile(splats.means, (_BULK, 1 - _BULK), axis=0), axis=0).max())
+
+
+def _cameras(
+    splats: Splats, kind: str, settings: ImportSettings, count: int, *, lowest: float, turn: float = 0.0
+) -> list[Camera]:
+    """Views from all around, from a height of ``lowest`` upwards, where 1 is straight above and -1 below.
+
+    Of surroundings they look at the origin, from within their reach.
+    """
+    low, high = np.quantile(splats.means.astype(np.float64), (_BULK, 1 - _BULK), axis=0)
+    if kind == "object":
+        middle, radius, fov = (low + high) / 2, 0.5 * float(np.linalg.norm(high - low)), _FOV
+        away = _DISTANCE * radius
+    else:
+        middle, radius, fov = np.zeros(3), 0.5 * float((high - low)[:2].max()), 75.0
+        away, lowest = radius, 0.25
+    height = lowest + (1.0 - lowest) * (np.arange(count) + 0.5) / count
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + turn
+    ring = np.sqrt(1.0 - height**2)
+    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=1)
+    size = settings.view_size
+    return [
+        Camera.look_at(middle + away * d, middle, width=size, height=size, fov_x=fov, near=0.02 * away) for d in outward
+    ]
+
+
+def _surface(splats: Splats, kind: str, settings: ImportSettings, lowest: float) -> trimesh.Trimesh | None:
+    """The mesh of what the splats show; None of surroundings in which nothing is opaque."""
+    cameras = _cameras(splats, kind, settings, settings.views, lowest=lowest)
+    if kind == "object":
+        masks = [render_splats(splats, camera, quality="fast").alpha for camera in cameras]
+        return reconstruct_surface(splats, cameras, masks, settings.surface, thin=True)
+    try:
+        return reconstruct_surface(splats, cameras, None, settings.surface)
+    except InputError:
+        return None
+
+
+def _on_support(splats: Splats, plane: Plane) -> tuple[Support, Float64Array]:
+    """The horizontal surface of surroundings, and the motion that takes its middle to the origin, its sides to x, y."""
+    inside = np.abs(splats.means[:, 2] - plane.height) <= 3 * plane.thickness
+    flat = splats.means[inside & (splats.opacities > 0.1), :2].astype(np.float64)
+    low, high = np.quantile(flat, (0.02, 0.98), axis=0)
+    flat = flat[((flat >= low) & (flat <= high)).all(axis=1)]
+    corners = np.array(shapely.oriented_envelope(shapely.MultiPoint(flat)).exterior.coords)[:4]
+    along = corners[1] - corners[0]
+    across = corners[2] - corners[1]
+    if np.abs(along[0]) < np.abs(along[1]):  # the smaller turn
+        along, across = across, along
+    angle = float(np.arctan2(along[1], along[0]))
+    angle -= np.pi * np.round(angle / np.pi)
+    motion = trimesh.transformations.rotation_matrix(-angle, (0, 0, 1)) @ trimesh.transformations.translation_matrix(
+        -np.append(corners.mean(axis=0), plane.height)
+    )
+    return Support((float(np.linalg.norm(along)), float(np.linalg.norm(across))), plane.share), motion
+
+
+def _topples(mesh: trimesh.Trimesh) -> bool:
+    """Whether the centre of mass of what stands on z = 0 is beside what it stands on."""
+    middle = mesh.center_mass if mesh.is_watertight else mesh.centroid
+    contact = mesh.vertices[mesh.vertices[:, 2] < 0.02 * float(mesh.extents.max()), :2]
+    return not shapely.MultiPoint(contact).convex_hull.buffer(1e-3 * mesh.scale).contains(shapely.Point(middle[:2]))

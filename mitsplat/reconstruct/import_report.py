@@ -140,7 +140,8 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
         text = _OBJECT_SCENE.format(
             name=asset.name, asset=name, reach=_metres(1.1 * size), low=_metres(0.1 * size), top=_metres(2.5 * size),
             table=_metres(max(1.2, 8 * size)), target=_metres(0.35 * size), near=_metres(2.8 * size),
-            far=_metres(4.2 * size), room=_metres(max(5.0, 24 * size)), floor=_metres(-max(0.75, 4 * size)),
+            far=_metres(4.2 * size), room=_metres(max(4.0, 16 * size)), walls=_metres(max(7.0, 28 * size)),
+            floor=_metres(-max(0.75, 4 * size)),
         )  # fmt: skip
     else:
         if imported.support is None:
@@ -169,7 +170,7 @@ shapes:
     box: {{size: [{table}, {table}, 0.05], position: [0, 0, -0.025]}}
     visible: true
     materials: [{{kind: wood}}, {{kind: noise, saturation: [0, 0.3]}}]
-backdrop: {{size: [{room}, {room}, {room}], position: [0, 0, {floor}]}}
+backdrop: {{size: [{walls}, {walls}, {walls}], position: [0, 0, {floor}]}}
 
 objects:
   - {{asset: {asset}, count: [1, 2]}}

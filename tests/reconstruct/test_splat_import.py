@@ -1,0 +1,208 @@
+"""Splat files made elsewhere, whose axes, units and rubbish are planted here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mitsplat.asset import Asset
+from mitsplat.cli import app
+from mitsplat.errors import InputError
+from mitsplat.reconstruct.import_report import write_import_report, write_scene
+from mitsplat.reconstruct.splat_import import Imported, ImportSettings, import_splats
+from mitsplat.reconstruct.surface import SurfaceSettings
+from mitsplat.reconstruct.upright import axis_vector, cut_support, find_up, rotation_to_z
+from mitsplat.scene.scene import load_scene
+from mitsplat.splats import Splats
+from mitsplat.surfels import place_surfels
+
+COARSE = SurfaceSettings(voxels=48, faces=2000, blur=1.0)
+
+
+def splats_on(mesh: trimesh.Trimesh, count: int, opacity: float = 0.98) -> Splats:
+    surfels = place_surfels(mesh, 1.0, count, np.random.default_rng(0))
+    return Splats(
+        means=surfels.points,
+        quats=surfels.quats,
+        scales=surfels.scales,
+        opacities=np.full(len(surfels), opacity),
+        sh=np.zeros((len(surfels), 1, 3)),
+    )
+
+
+@pytest.fixture(scope="module")
+def pin() -> trimesh.Trimesh:
+    """A column on a foot, 0.5 high, from z = 0."""
+    foot = trimesh.creation.box(bounds=[[-0.1, -0.15, 0], [0.1, 0.15, 0.1]])
+    column = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.05], [0.05, 0.05, 0.5]])
+    return trimesh.boolean.union([foot, column], engine="manifold")
+
+
+@pytest.fixture(scope="module")
+def on_mat(pin: trimesh.Trimesh) -> Splats:
+    """The same on a mat of half a unit, z up."""
+    mat = trimesh.creation.box(bounds=[[-0.25, -0.25, -0.001], [0.25, 0.25, 0.0]])
+    return Splats.concatenate([splats_on(pin, 2500), splats_on(mat, 1500)])
+
+
+def turned(splats: Splats, rotation: Rotation) -> Splats:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.as_matrix()
+    return splats.transformed(matrix)
+
+
+def test_the_smallest_rotation_takes_every_axis_up() -> None:
+    for axis in ("x", "-x", "y", "-y", "z", "-z"):
+        rotation = rotation_to_z(axis_vector(axis))
+        assert np.allclose(rotation @ axis_vector(axis), (0, 0, 1))
+        assert np.isclose(np.linalg.det(rotation), 1)
+    with pytest.raises(InputError, match="got 'w'"):
+        axis_vector("w")
+
+
+@pytest.mark.parametrize("tilt", [0.0, 17.0])
+def test_a_table_says_how_far_a_capture_is_tilted(on_mat: Splats, tilt: float) -> None:
+    rotation = Rotation.from_euler("zx", [tilt, 90], degrees=True)  # z up to -y, then askew
+    found = find_up(turned(on_mat, rotation), "object", "-y")
+    assert np.degrees(np.arccos(found.up @ rotation.apply((0, 0, 1)))) < 0.5
+    assert found.support is not None
+
+
+def test_without_anything_flat_up_is_as_usual() -> None:
+    ball = splats_on(trimesh.creation.icosphere(3, 0.1), 500)
+    found = find_up(ball, "object", "y")
+    assert np.allclose(found.up, (0, 1, 0))
+    assert "as is usual" in found.reason
+    assert np.allclose(find_up(ball, "object", "y", "-x").up, (-1, 0, 0))
+
+
+def test_surroundings_stand_on_their_floor_though_a_wall_is_larger() -> None:
+    floor = trimesh.creation.box(bounds=[[-1, -1, -0.01], [1, 1, 0]])
+    wall = trimesh.creation.box(bounds=[[-1, 1, 0], [1, 1.01, 3]])
+    room = Splats.concatenate([splats_on(floor, 1500), splats_on(wall, 2500)])
+    rotation = Rotation.from_euler("xy", [100, 5], degrees=True)
+    found = find_up(turned(room, rotation), "environment", "-y")
+    assert np.degrees(np.arccos(found.up @ rotation.apply((0, 0, 1)))) < 0.5
+
+
+def test_the_table_goes_and_what_stands_on_it_stays(on_mat: Splats) -> None:
+    support = find_up(on_mat, "object", "z").support
+    assert support is not None
+    kept = cut_support(on_mat, support)
+    means = on_mat.means
+    beside = (np.abs(means[:, :2]) > (0.12, 0.17)).any(axis=1)
+    assert not kept[beside].any()
+    assert kept[means[:, 2] > 0.02].all()
+
+
+@pytest.fixture(scope="module")
+def file(on_mat: Splats, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pin on its mat with y down, in units of 2, among what is no part of it."""
+    rotation = Rotation.from_euler("x", 90, degrees=True)
+    lone = splats_on(trimesh.creation.icosphere(1, 0.01), 20)
+    lone = replace(lone, means=lone.means + np.float32([0.2, 0.2, 0.45]))
+    haze = replace(lone.select([0]), means=[[0, 0, 0.3]], scales=[[0.4, 0.4, 0.4]], opacities=[0.05])
+    faint = replace(lone.select([0, 1]), opacities=[0.001, 0.0])
+    scene = turned(Splats.concatenate([on_mat, lone, haze, faint]), rotation)
+    path = tmp_path_factory.mktemp("file") / "pin.ply"
+    scene.transformed(np.diag([2.0, 2.0, 2.0, 1.0])).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def imported(file: Path) -> Imported:
+    settings = ImportSettings(size=0.25, without_table=True, views=24, view_size=160, surface=COARSE)
+    return import_splats(file, name="pin", settings=settings, mass=0.3)
+
+
+def test_an_object_comes_out_upright_clean_and_of_its_size(imported: Imported, pin: trimesh.Trimesh) -> None:
+    asset = imported.asset
+    assert imported.removed["invisible"] == 2
+    assert imported.removed["haze and needles"] == 1
+    assert imported.removed["floaters"] >= 15
+    assert imported.removed["table"] > 1000
+    assert len(imported.rubbish) + len(asset.splats) == imported.found
+    assert asset.mesh is not None
+    assert asset.mesh.is_volume
+    truth = pin.copy().apply_scale(0.5)
+    assert np.allclose(asset.mesh.bounds, truth.bounds, atol=0.006)
+    assert float(asset.mesh.extents.max()) == pytest.approx(0.25)
+    assert abs(asset.mesh.volume / truth.volume - 1) < 0.15
+    assert asset.units == "metre"
+    assert asset.mass == 0.3
+    assert asset.pieces
+    assert not imported.topples
+    assert imported.mesh_iou is not None
+    assert imported.mesh_iou > 0.9
+
+
+def test_the_asset_its_report_and_its_scene_are_whole(imported: Imported, tmp_path: Path) -> None:
+    folder = tmp_path / "assets" / "pin"
+    imported.asset.save(folder)
+    assert len(Asset.load(folder).splats) == len(imported.asset.splats)
+    page = write_import_report(folder, imported).read_text()
+    assert "removed in red" in page
+    assert "as is usual for such files" in page
+    write_scene(tmp_path / "table.yaml", folder, imported)
+    assert [asset.name for asset in load_scene(tmp_path / "table.yaml").assets] == ["pin"]
+    with pytest.raises(InputError, match="is there already"):
+        write_scene(tmp_path / "table.yaml", folder, imported)
+    with pytest.raises(InputError, match="below its own folder"):
+        write_scene(tmp_path / "elsewhere" / "table.yaml", folder, imported)
+
+
+def test_surroundings_get_a_surface_to_drop_on(tmp_path: Path) -> None:
+    table = trimesh.creation.box(bounds=[[-0.6, -0.4, -0.02], [0.6, 0.4, 0]])
+    box = trimesh.creation.box(bounds=[[0.3, 0.1, 0], [0.5, 0.3, 0.2]])
+    rotation = Rotation.from_euler("zx", [30, 90], degrees=True)
+    turned(Splats.concatenate([splats_on(table, 2500), splats_on(box, 500)]), rotation).save(tmp_path / "cell.ply")
+    settings = ImportSettings(units=1.0, views=8, view_size=120, surface=COARSE)
+    done = import_splats(tmp_path / "cell.ply", name="cell", kind="environment", settings=settings)
+    assert done.support is not None
+    assert sorted(done.support.size) == pytest.approx([0.8, 1.2], rel=0.08)
+    top = np.abs(done.asset.splats.means[:, 2]) < 0.003
+    assert np.ptp(done.asset.splats.means[top], axis=0)[:2] == pytest.approx([1.2, 0.8], abs=0.06)
+    assert np.abs(done.asset.splats.means[top].mean(axis=0)).max() < 0.08
+    assert done.asset.capture_light == "scene"
+    done.asset.save(tmp_path / "assets" / "cell")
+    write_scene(tmp_path / "cell.yaml", tmp_path / "assets" / "cell", done)
+    scene = load_scene(tmp_path / "cell.yaml")
+    assert scene.environments[0].name == "cell"
+    assert scene.spec.region.max[0] <= 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["empty.ply"], "empty.ply: the file is empty"),
+        (["none.ply"], "none.ply: must hold at least one Gaussian (got 0)"),
+        (["torn.splat"], "torn.splat: a .splat file must hold 32 bytes per Gaussian (got 100 bytes)"),
+        (["mesh.obj"], "mesh.obj: splats must be"),
+        (["missing.ply"], "missing.ply: cannot be read"),
+        (["pin.ply", "--crop", "5", "5", "5", "6", "6", "6"], "pin.ply: crop keeps nothing: the file has x -"),
+        (["pin.ply", "--crop", "1", "0", "0", "0", "1", "1"], "crop must be a lower and an upper corner"),
+        (["pin.ply", "--size", "0"], "size must be finite and > 0 (got 0)"),
+        (["pin.ply", "--size", "1", "--units", "1"], "units and size both say"),
+        (["pin.ply", "--mass", "1", "--density", "1"], "density and mass both say"),
+        (["pin.ply", "--scene", "x.yaml"], "x.yaml: a scene is in metres: give --size or --units"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(
+    arguments: list[str], sentence: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.ply").touch()
+    Splats.load(file).select(slice(0)).save(tmp_path / "none.ply")
+    (tmp_path / "torn.splat").write_bytes(bytes(100))
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\n")
+    (tmp_path / "pin.ply").symlink_to(file)
+    with pytest.raises(InputError) as raised:
+        app(["import", *arguments, "-o", "assets/pin"], standalone_mode=False)
+    assert sentence in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "assets").exists()

@@ -44,6 +44,7 @@ _HOME = {
     "settle_layout": "physics.settle",
     "use_device": "device",
     "write_dataset": "dataset.write",
+    "write_frames": "dataset.given_frames",
 }
 
 __all__ = sorted(_HOME)
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from mitsplat.asset import Asset as Asset
     from mitsplat.bake.bake import bake_asset as bake_asset
     from mitsplat.camera import Camera as Camera
+    from mitsplat.dataset.given_frames import write_frames as write_frames
     from mitsplat.dataset.remake import remake_frame as remake_frame
     from mitsplat.dataset.write import write_dataset as write_dataset
     from mitsplat.device import use_device as use_device

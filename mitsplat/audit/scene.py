@@ -26,15 +26,24 @@ class SceneReader:
         self._cameras, self._output = (scene["camera"], *scene.get("cameras", ())), scene["output"]
         self._distractors = set(content.get("distractors", ()))
         self._held_out = _held_out(content["scene"])
+        self._given = content.get("given", False)
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Whether the frame's camera can be one of the scene's, and its labels are of what is labelled."""
+        """Whether its camera, unless that was given, can be the scene's, and its labels are of what is labelled."""
+        width, height = self._output["width"], self._output["height"]
+        if frame.size != (width, height):
+            text = f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as the scene says"
+            yield f"manifest.jsonl, frame {frame.index}", text
+        for text in (*(() if self._given else self._check_camera(frame)), *self._check_objects(frame)):
+            yield f"manifest.jsonl, frame {frame.index}", text
+
+    def _check_camera(self, frame: TrueFrame) -> Iterator[str]:
         drawn, (number, right) = frame.record.get("viewpoint") or {}, self._seat(frame)
         sides = ("left", "right") if self._cameras[number].get("stereo") else (None, None)
         if (drawn.get("camera", 0), drawn.get("side")) != (number, sides[right]):
-            yield f"manifest.jsonl, frame {frame.index}", "it is not of the camera whose turn it is"
-        for text in (*self._check_lens(frame), *self._check_place(frame), *self._check_objects(frame)):
-            yield f"manifest.jsonl, frame {frame.index}", text
+            yield "it is not of the camera whose turn it is"
+        yield from self._check_lens(frame)
+        yield from self._check_place(frame)
 
     def finish(self) -> Violations:
         """Nothing is left."""
@@ -62,8 +71,6 @@ class SceneReader:
         zoom = drawn.get("zoom", low)
         if not low <= zoom <= high or (low < high and "zoom" not in drawn):
             yield f"its zoom must be stated, and in the scene's {low:g} to {high:g} (got {drawn.get('zoom')})"
-        if frame.size != (width, height):
-            yield f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as the scene says"
         wide, tall = lens["size"] or (width, height)
         if lens["fov_x"] is not None:
             fx = fy = wide / (2 * np.tan(np.radians(lens["fov_x"]) / 2))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from mitsplat.dataset.folder import Shard
 from mitsplat.dataset.folds import Fold, write_folds
+from mitsplat.dataset.given_frames import write_frames
 from mitsplat.dataset.remake import RemadeFrame, remake_frame
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
@@ -21,4 +22,5 @@ __all__ = [
     "remake_frame",
     "write_dataset",
     "write_folds",
+    "write_frames",
 ]

@@ -58,6 +58,7 @@ class _Content(_Stored):
     distractors: list[Count] = []
     libraries: dict[str, str]
     device: Literal["cpu", "cuda"] = "cpu"
+    given: bool = False
 
 
 class _Camera(_Stored):

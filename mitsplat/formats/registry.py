@@ -68,8 +68,11 @@ TABLE = {
 """Formats in the order in which they are written."""
 
 
-def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue) -> Record:
-    """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest."""
+def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue, *, given: bool = False) -> Record:
+    """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest.
+
+    Of a frame whose layout was ``given``, and not drawn as the specification says, no draws of that are stated.
+    """
     plan, output = frame.plan, spec.output
     ids = frame.instance if spec.labels.source == "splats" else frame.proxy_instance
     if distractors := [instance.id for instance in frame.layout.instances if instance.class_index is None]:
@@ -89,17 +92,17 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue)
     }
     if catalogue.drawn:
         record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
-        if spec.regions:
+        if spec.regions and not given:
             regions = draw_regions(spec, plan.layout)
             for drawn, region in zip(record["objects"], regions, strict=True):
                 drawn["region"] = spec.region_names[region]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
-    if place := draw_place(spec, frame.index).to_json(spec):
+    if place := draw_place(spec, frame.layout.index * spec.output.views).to_json(spec):
         record["place"] = place
     if any(entry.appearance for entry in spec.objects):
         record["appearance"] = [one.to_json() for one in frame.appearances.values()]
-    if spec.empty:
+    if spec.empty and not given:
         record["empty"] = is_empty(spec, plan.layout)
     if frame.order_error is not None:
         record["order_error"] = {name: round(value, 6) for name, value in frame.order_error.items()}

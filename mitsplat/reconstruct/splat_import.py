@@ -42,6 +42,8 @@ _FOV, _DISTANCE = 29.0, 4.5
 _HELD_OUT = 6
 _CONCAVITY = 0.04
 """Of convex pieces: the surface of splats is too rough for less."""
+_LEAF = 0.1
+"""Volume of a part, as a share of the largest one's, below which its hull is a piece: leaves, lids, screws."""
 _STAGES = 6
 
 
@@ -257,7 +259,7 @@ def import_splats(
         if kind == "object":
             mesh_iou = float(np.mean([iou(view.alpha >= 0.5, view.mesh) for view in views]))
             tell("splitting the mesh into convex pieces")
-            asset = replace(asset, pieces=convex_pieces(asset.mesh, threshold=_CONCAVITY))
+            asset = replace(asset, pieces=_pieces(asset.mesh))
     return Imported(
         asset=asset,
         upright=upright,
@@ -349,6 +351,15 @@ def _surface(splats: Splats, kind: str, settings: ImportSettings, lowest: float)
         return reconstruct_surface(splats, cameras, None, settings.surface)
     except InputError:
         return None
+
+
+def _pieces(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
+    """Convex pieces of every part."""
+    parts = sorted(mesh.split(only_watertight=True), key=lambda part: -float(part.volume)) or [mesh]
+    small = [part for part in parts[1:] if part.volume < _LEAF * parts[0].volume]
+    large = parts[: len(parts) - len(small)]
+    split = [piece for part in large for piece in convex_pieces(part, threshold=_CONCAVITY)]
+    return (*split, *(part.convex_hull for part in small))
 
 
 def _on_support(splats: Splats, plane: Plane) -> tuple[Support, Float64Array]:

@@ -67,6 +67,7 @@ CALLS = {
     "settle_layout": "assert ms.settle_layout(ms.load_scene('scene.yaml'), 0).certificate.rested",
     "use_device": "assert ms.use_device('cpu').kind == 'cpu' and mitsuba.variant() == 'llvm_ad_rgb'",
     "write_dataset": "assert ms.write_dataset(ms.load_scene('scene.yaml'), 'out', frames=1, workers=1).frames == 1",
+    "write_frames": "scene = ms.load_scene('scene.yaml'); ms.write_frames(scene, 'own', ms.render_frames(scene, 1))",
 }
 """Each public name, used as the first thing in a process."""
 

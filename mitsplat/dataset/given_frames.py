@@ -1,0 +1,81 @@
+"""A dataset of frames that were made in Python: with layouts, cameras and lights of one's own."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shlex
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mitsplat.dataset.folder import RUNS, TIMINGS, content_of, finish_folder, open_folder
+from mitsplat.dataset.manifest import append_line
+from mitsplat.dataset.write import DatasetSummary, FrameCounts
+from mitsplat.device import current_device
+from mitsplat.errors import InputError
+from mitsplat.files import storage_errors, write_text
+from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.scene.contents import split_of
+from mitsplat.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from mitsplat.frames.frame import Frame
+
+
+def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, overwrite: bool = False) -> DatasetSummary:
+    """Write frames that were made in Python as a dataset folder, in the formats of the scene.
+
+    ::
+
+        ms.write_frames(scene, "out/film", ms.render_frames(scene, layouts=simulate(), cameras=camera))
+
+    Frames are numbered as they come, and each counts as a layout of its own, by which it belongs to a split. The audit
+    then holds pictures, labels, layouts and cameras against each other, but not cameras against the scene. What was
+    begun cannot be resumed.
+
+    Args:
+        scene: The scene that all of them are of; sizes and formats are in ``scene.spec``.
+        out: Folder, made if missing. It must be empty.
+        frames: Of :func:`mitsplat.render_frames`, :func:`mitsplat.render_frame` or a :class:`mitsplat.Renderer`.
+        overwrite: Remove a dataset that is there first.
+
+    Raises:
+        InputError: If there are no frames, a frame is not of the scene's image size, flow is among the formats, which
+            is of views of one layout, or the folder holds something else.
+    """
+    out, output = Path(out), scene.spec.output
+    if "flow" in output.formats:
+        raise InputError(
+            "output.formats: flow is of views of one layout: keep frame.flow of frames of your own yourself"
+        )
+    alone = replace(scene, spec=scene.spec.model_copy(update={"output": output.model_copy(update={"views": 1})}))
+    catalogue = Catalogue.of(scene)
+    device = current_device().kind
+    content = content_of(alone, catalogue, device) | {"given": True}
+    counts = FrameCounts()
+    with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
+        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+        append_line(
+            out / RUNS, {"command": command, "python": platform.python_version(), "workers": 1, "device": device}
+        )
+        for index, frame in enumerate(frames):
+            if frame.image.shape[:2] != (output.height, output.width):
+                height, width = frame.image.shape[:2]
+                raise InputError(
+                    f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
+                )
+            split = split_of(index, output.validation, output.test)
+            plan = replace(frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint={})
+            layout = replace(frame.layout, index=index)
+            with storage_errors(out):
+                write_text(out / f"layouts/{index:04d}.json", json.dumps(layout.to_json()))
+                record = write_frame(replace(frame, plan=plan), out, scene.spec, catalogue, given=True)
+            append_line(out / TIMINGS, {"index": index, **{k: round(v, 4) for k, v in frame.seconds.items()}})
+            manifest.append(record)
+        if not len(manifest):
+            raise InputError("frames must have at least one frame (got none)")
+        finish_folder(out, manifest, content, catalogue, counts.add)
+        return counts.summary(out, rendered=len(manifest))

@@ -1,0 +1,87 @@
+"""Endless labelled frames for PyTorch, rendered while a model learns from them. Needs the extra ``torch``.
+
+::
+
+    from torch.utils.data import DataLoader
+    from mitsplat.frames.torch_dataset import FrameStream
+
+    stream = FrameStream(ms.load_scene("scenes/workcell.yaml"))
+    for images, targets in DataLoader(stream, 4, num_workers=2, collate_fn=stream.collate,
+                                      multiprocessing_context="spawn"):
+        losses = detector(images, targets)
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import IterableDataset, get_worker_info
+
+from mitsplat.frames.frame import Frame
+from mitsplat.frames.sequence import render_frames
+from mitsplat.quality import Quality
+from mitsplat.scene.scene import Scene
+
+Sample = tuple[torch.Tensor, dict[str, torch.Tensor]]
+"""An image and what it shows."""
+
+
+class FrameStream(IterableDataset[Sample]):
+    """Frames of a scene without end, as detection models of torchvision take them.
+
+    A worker process of a ``DataLoader`` takes every so-many-th layout, so that none renders what another one does. The
+    scene's seed decides all of them: ``ms.load_scene(path, overrides={"seed": 1})`` gives others. Processes must be
+    spawned, as a renderer does not survive a fork.
+
+    Each sample is an image, (3, H, W) float32 from 0 to 1, and a target:
+
+    ======== ============================ ===================================
+    boxes    (N, 4) float32               x0, y0, x1, y1 [px]
+    labels   (N,) int64                   index of the class + 1; 0 is nothing
+    masks    (N, H, W) uint8              visible pixels
+    area     (N,) float32                 of the masks [px]
+    image_id () int64                     index of the frame
+    ======== ============================ ===================================
+
+    Args:
+        scene: The scene; its number of layouts is of no account.
+        quality: As in :func:`mitsplat.render_frame`.
+    """
+
+    def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
+        super().__init__()
+        self.scene, self.quality = scene, quality
+
+    def __iter__(self) -> Iterator[Sample]:
+        worker = get_worker_info()
+        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        views = self.scene.spec.output.views
+        indices = (layout * views + view for layout in itertools.count(first, step) for view in range(views))
+        for frame in render_frames(self.scene, indices, quality=self.quality, progress=False):
+            yield sample_of(frame)
+
+    @staticmethod
+    def collate(samples: Sequence[Sample]) -> tuple[list[torch.Tensor], list[dict[str, torch.Tensor]]]:
+        """A batch as lists, because images show different numbers of objects."""
+        return [image for image, _ in samples], [target for _, target in samples]
+
+
+def sample_of(frame: Frame) -> Sample:
+    """A frame as an image and a target, see :class:`FrameStream`."""
+    labels = frame.labels.instances
+    masks = np.zeros((len(labels), *frame.image.shape[:2]), dtype=np.uint8)
+    for mask, label in zip(masks, labels, strict=True):
+        x0, y0, x1, y1 = label.box
+        mask[y0:y1, x0:x1] = label.mask
+    target: dict[str, Any] = {
+        "boxes": torch.tensor([label.box for label in labels], dtype=torch.float32).reshape(-1, 4),
+        "labels": torch.tensor([label.class_index + 1 for label in labels], dtype=torch.int64),
+        "masks": torch.from_numpy(masks),
+        "area": torch.tensor([label.area for label in labels], dtype=torch.float32),
+        "image_id": torch.tensor(frame.index),
+    }
+    return torch.from_numpy(np.moveaxis(frame.image, 2, 0).astype(np.float32) / 255), target

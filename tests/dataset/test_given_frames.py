@@ -1,0 +1,75 @@
+"""Datasets of frames that were made in Python pass the audit, and what such frames cannot be is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.audit import audit_dataset
+from mitsplat.camera import Camera
+from mitsplat.dataset.given_frames import write_frames
+from mitsplat.errors import InputError
+from mitsplat.frames.sequence import render_frames
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec import FORMATS
+from tests.conftest import BOTH, small_scene
+from tests.drawn import large_boxes
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """One that draws places and empty layouts, which frames of one's own are not drawn by."""
+    formats = [name for name in FORMATS if name not in ("flow", "colmap", "depth-sensor")]
+    return small_scene(tmp_path_factory.mktemp("scene"), large_boxes(), BOTH, layouts=1, views=4, formats=formats)
+
+
+def film(scene: Scene, count: int = 3, width: int = 64) -> list:
+    """The nut moves, below a camera that is none of the scene's."""
+    layouts = []
+    for step in range(count):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.05 + 0.01 * step, 0, 0.02
+        layouts.append(Layout.of_poses(scene, {"nut": [pose], "bolt": [np.diag([1, -1, -1, 1])]}))
+    above = Camera.look_at((0, -0.05, 0.5), (0, 0, 0), width=width, height=48, fov_x=40)
+    return list(render_frames(scene, layouts=layouts, cameras=above, quality="fast", progress=False))
+
+
+@pytest.fixture(scope="module")
+def frames(scene: Scene) -> list:
+    return film(scene)
+
+
+def test_frames_of_ones_own_pass_the_audit_in_every_format(scene: Scene, frames: list, tmp_path: Path) -> None:
+    summary = write_frames(scene, tmp_path / "out", iter(frames))
+    assert summary.frames == 3
+    assert summary.instances == {"bolt": 3, "nut": 3}
+    assert summary.images == {"train": 2, "val": 1}
+    assert list(audit_dataset(tmp_path / "out").violations) == []
+    records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    assert [record["layout"] for record in records] == [0, 1, 2]
+    poses = [label["world_from_object"] for label in records[2]["labels"]["instances"] if label["class"] == "nut"]
+    assert poses[0][0][3] == pytest.approx(0.07)
+
+
+def test_the_audit_still_holds_such_frames_against_their_layouts(scene: Scene, frames: list, tmp_path: Path) -> None:
+    out = write_frames(scene, tmp_path / "out", frames).path
+    (out / "layouts/0001.json").write_bytes((out / "layouts/0002.json").read_bytes())
+    assert any("layouts/0001.json" in str(one) for one in audit_dataset(out).violations)
+
+
+def test_what_cannot_be_written_is_one_sentence(scene: Scene, frames: list, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least one frame"):
+        write_frames(scene, tmp_path / "none", [])
+    with pytest.raises(InputError, match="already holds a dataset"):
+        write_frames(scene, tmp_path / "none", frames)
+    with pytest.raises(InputError, match="frame 0: must be of the scene's 64x48 px"):
+        write_frames(scene, tmp_path / "wide", film(scene, 1, width=80))
+    output = scene.spec.output.model_copy(update={"formats": ("flow",)})
+    flowing = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
+    with pytest.raises(InputError, match="flow is of views of one layout"):
+        write_frames(flowing, tmp_path / "flow", frames)

@@ -1,0 +1,55 @@
+"""Endless frames for PyTorch: each worker its own, the same from run to run, targets as the labels say."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.frames.frame import render_frame
+from mitsplat.scene.scene import Scene
+from tests.conftest import BOTH, small_scene
+from tests.drawn import large_boxes
+
+torch = pytest.importorskip("torch", reason="the extra torch is not installed")
+from mitsplat.frames.torch_dataset import FrameStream, sample_of  # noqa: E402 - needs torch
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
+
+
+def test_a_target_is_what_the_labels_say(scene: Scene) -> None:
+    frame = render_frame(scene, 0, quality="fast")
+    image, target = sample_of(frame)
+    assert image.shape == (3, 48, 64)
+    assert np.array_equal((255 * image).round().byte().permute(1, 2, 0).numpy(), frame.image)
+    for number, label in enumerate(frame.labels.instances):
+        y, x = np.nonzero(target["masks"][number].numpy())
+        assert target["boxes"][number].tolist() == [x.min(), y.min(), x.max() + 1, y.max() + 1]
+        assert target["labels"][number] == label.class_index + 1
+        assert target["area"][number] == len(x)
+    assert len(frame.labels.instances)
+
+
+def test_workers_share_the_layouts_of_an_endless_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a DataLoader tells its workers is told here; two processes would compile their kernels for nothing else."""
+    from torch.utils.data._utils.worker import WorkerInfo
+
+    found = {}
+    for number in (0, 1):
+        info = WorkerInfo(id=number, num_workers=2, seed=0, dataset=None)
+        monkeypatch.setattr("mitsplat.frames.torch_dataset.get_worker_info", lambda info=info: info)
+        taken = list(itertools.islice(FrameStream(scene, quality="fast"), 3))
+        found[number] = [int(target["image_id"]) for _, target in taken]
+    assert found == {0: [0, 1, 4], 1: [2, 3, 6]}
+
+
+def test_batches_are_lists(scene: Scene) -> None:
+    loader = torch.utils.data.DataLoader(FrameStream(scene, quality="fast"), 2, collate_fn=FrameStream.collate)
+    images, targets = next(iter(loader))
+    assert [image.shape for image in images] == [(3, 48, 64)] * 2
+    assert [int(target["image_id"]) for target in targets] == [0, 1]

@@ -91,7 +91,7 @@ def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
     splats = asset.splats
     needles = long_needles(splats, size)
     share = float(needles.mean())
-    remedy = "`mitsplat import` removes them; `mesh` and `asset` those that stick out of the object's masks"
+    remedy = "`mitsplat import` removes them; `mitsplat mesh` those that stick out of the object's masks"
     yield Finding("needles", share <= FEW, f"{needles.sum()} long ones ({share:.1%})", remedy)
     floaters = len(find_floaters(splats, visible_area(splats))) / len(splats)
     yield Finding("floaters", floaters <= FEW, f"{floaters:.1%} of the Gaussians touch no large part", remedy)

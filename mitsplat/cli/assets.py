@@ -427,6 +427,9 @@ def import_(
     without_table: Annotated[
         bool, typer.Option("--without-table", help="Remove the flat surface that the object stands on.")
     ] = False,
+    flat_base: Annotated[
+        bool, typer.Option("--flat-base", help="Cut off what hangs below the base, until the object stands.")
+    ] = False,
     mass: Annotated[float | None, typer.Option(help="Mass [kg], instead of density.")] = None,
     density: Annotated[float | None, typer.Option(help="Mass density [kg/m^3]; 1000 if absent.")] = None,
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
@@ -458,6 +461,7 @@ def import_(
         size=size,
         crop=crop,
         without_table=without_table,
+        flat_base=flat_base,
         surface=SurfaceSettings(voxels=voxels, faces=faces, blur=1.0),
     )
     if scene is not None:

@@ -44,6 +44,12 @@ _CONCAVITY = 0.04
 """Of convex pieces: the surface of splats is too rough for less."""
 _LEAF = 0.1
 """Volume of a part, as a share of the largest one's, below which its hull is a piece: leaves, lids, screws."""
+_TILT = 4.0
+"""Tilt that an object must bear without falling over [degrees]."""
+_CONTACT = 0.01
+"""Height up to which its lowest parts touch the table, as a share of the longest extent."""
+_BASE = 0.06
+"""Most that is cut off an object for a flat base, as a share of its height."""
 _STAGES = 6
 
 
@@ -57,6 +63,7 @@ class ImportSettings:
         size: Longest extent [m], instead of units.
         crop: Lower and upper corner of the box that is kept, in the file's units and axes.
         without_table: Remove the flat surface that the object stands on, and what is below it.
+        flat_base: Cut off what hangs below the base, until it stands: nobody saw the bottom of what stood somewhere.
         views: Pictures that the surface is found by.
         view_size: Their edge [px].
         surface: How the mesh is reconstructed.
@@ -67,6 +74,7 @@ class ImportSettings:
     size: float | None = None
     crop: tuple[float, float, float, float, float, float] | None = None
     without_table: bool = False
+    flat_base: bool = False
     views: int = 48
     view_size: int = 480
     surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings(blur=1.0))
@@ -135,7 +143,10 @@ class Imported:
         if asset.units == "unknown":
             found.append("how large it is is unknown: give --size, the longest extent in metres, or --units")
         if self.topples:
-            found.append("it would fall over as it stands in the pictures: if it lies on its side there, give --up")
+            found.append(
+                "it would roll or fall over as it stands in the pictures: give --up if it lies on its side there, or "
+                "--flat-base if nobody saw its bottom"
+            )
         if self.mesh_iou is not None and self.mesh_iou < thresholds.mesh_iou:
             found.append(
                 f"the mesh meets the outline of the splats with an IoU of only {self.mesh_iou:.3f} (at least "
@@ -226,6 +237,10 @@ def import_splats(
     tell("finding the surface")
     seen_below = kind == "object" and not settings.without_table
     mesh = _surface(splats, kind, settings, lowest=-1.0 if seen_below else 0.0)
+    if mesh is not None and (settings.flat_base or (settings.without_table and _topples(mesh))):
+        mesh, height = _cut_base(path, mesh)
+        cleaner.remove("below the base", splats.means[:, 2] < height, "nothing is above its base")
+        splats = cleaner.splats.transformed(turn)
     asset = Asset(
         name=name,
         class_name=class_name or name,
@@ -381,8 +396,23 @@ def _on_support(splats: Splats, plane: Plane) -> tuple[Support, Float64Array]:
     return Support((float(np.linalg.norm(along)), float(np.linalg.norm(across))), plane.share), motion
 
 
-def _topples(mesh: trimesh.Trimesh) -> bool:
-    """Whether the centre of mass of what stands on z = 0 is beside what it stands on."""
+def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
+    """A solid without its lowest part, as little of it as makes it stand, and the height of the cut."""
+    (low, *_), high = mesh.bounds[:, 2], mesh.bounds[1] + mesh.scale
+    for height in low + _BASE * np.linspace(0, 1, 11)[1:] * float(mesh.extents[2]):
+        corner = np.append(mesh.bounds[0, :2] - mesh.scale, height)
+        above = trimesh.creation.box(bounds=[corner, high])
+        cut = trimesh.boolean.intersection([mesh, above], engine="manifold")
+        if len(cut.faces) and not _topples(cut, contact=0.2 * _CONTACT):
+            return cut, float(height)
+    raise InputError(f"{path}: has no base that it could stand on: give --up, or leave out --flat-base")
+
+
+def _topples(mesh: trimesh.Trimesh, contact: float = _CONTACT) -> bool:
+    """Whether something falls over or rolls away when it is put down as it is and tilted by :data:`_TILT`."""
+    low = float(mesh.bounds[0, 2])
     middle = mesh.center_mass if mesh.is_watertight else mesh.centroid
-    contact = mesh.vertices[mesh.vertices[:, 2] < 0.02 * float(mesh.extents.max()), :2]
-    return not shapely.MultiPoint(contact).convex_hull.buffer(1e-3 * mesh.scale).contains(shapely.Point(middle[:2]))
+    touching = mesh.vertices[mesh.vertices[:, 2] <= low + contact * float(mesh.extents.max()), :2]
+    ground = shapely.MultiPoint(touching).convex_hull
+    reach = np.tan(np.radians(_TILT)) * (float(middle[2]) - low)
+    return not ground.contains(shapely.Point(middle[:2]).buffer(reach))

@@ -14,7 +14,7 @@ from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
 from mitsplat.reconstruct.import_report import write_import_report, write_scene
-from mitsplat.reconstruct.splat_import import Imported, ImportSettings, import_splats
+from mitsplat.reconstruct.splat_import import Imported, ImportSettings, _cut_base, _topples, import_splats
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.reconstruct.upright import axis_vector, cut_support, find_up, rotation_to_z
 from mitsplat.scene.scene import load_scene
@@ -154,6 +154,20 @@ def test_the_asset_its_report_and_its_scene_are_whole(imported: Imported, tmp_pa
         write_scene(tmp_path / "table.yaml", folder, imported)
     with pytest.raises(InputError, match="below its own folder"):
         write_scene(tmp_path / "elsewhere" / "table.yaml", folder, imported)
+
+
+def test_what_hangs_below_a_base_is_cut_off(pin: trimesh.Trimesh) -> None:
+    bulge = trimesh.creation.icosphere(3, 0.03)
+    bulge.apply_translation((0.02, 0, 0.015))
+    swollen = trimesh.boolean.union([pin, bulge], engine="manifold")
+    assert _topples(swollen)
+    assert not _topples(pin)
+    cut, height = _cut_base(Path("pin.ply"), swollen)
+    assert cut.is_volume
+    assert -0.01 < height <= cut.bounds[0, 2] + 1e-9 < 0.01
+    assert not _topples(cut)
+    with pytest.raises(InputError, match="no base that it could stand on"):
+        _cut_base(Path("ball.ply"), trimesh.creation.cone(0.05, 0.5, transform=np.diag([1, -1, -1, 1])))
 
 
 def test_surroundings_get_a_surface_to_drop_on(tmp_path: Path) -> None:

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mitsplat.frames.frame import render_frame
-from mitsplat.scene.scene import Scene
-from tests.conftest import BOTH, small_scene
-from tests.drawn import large_boxes
+from mitsplat.scene.scene import Scene, load_scene
+from tests.conftest import WriteScene
 
 torch = pytest.importorskip("torch", reason="the extra torch is not installed")
 from mitsplat.frames.torch_dataset import FrameStream, sample_of  # noqa: E402 - needs torch
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Scene:
-    return small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
+def scene(scene_data: dict[str, Any], write_scene: WriteScene) -> Scene:
+    scene_data["settle"] = {"stepper": "mujoco"}
+    scene_data["output"] = {"width": 64, "height": 48, "layouts": 1, "views": 2}
+    scene_data["objects"] = [{"asset": "assets/bolt", "scale": 3.0}]
+    return load_scene(write_scene(scene_data))
 
 
 def test_a_target_is_what_the_labels_say(scene: Scene) -> None:

@@ -16,7 +16,7 @@ from mitsplat.errors import InputError
 from mitsplat.frames.sequence import render_frames
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec import FORMATS
+from mitsplat.spec.spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes
 

@@ -37,7 +37,7 @@ from mitsplat.spec.spec import FORMATS
 ROOT = Path(__file__).resolve().parents[2]
 SKIPPED = ("yolo-pose", "exr")
 """Formats that need keypoints, or that hold nothing that an audit reads."""
-UNLIKE = ("runs.jsonl", "timings.jsonl")
+UNLIKE = ("runs.jsonl", "timings.jsonl", ".lock")
 """Files of a dataset that say when and where it was made."""
 PLAIN: dict[str, Any] = {
     "environment": "assets/workcell",
@@ -99,7 +99,7 @@ def differing(one: Path, other: Path) -> list[str]:
     found = [
         {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()} for root in (one, other)
     ]
-    names = sorted((found[0].keys() | found[1].keys()) - set(UNLIKE))
+    names = sorted(name for name in found[0].keys() | found[1].keys() if Path(name).name not in UNLIKE)
     return [
         name
         for name in names

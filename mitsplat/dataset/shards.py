@@ -25,7 +25,7 @@ from mitsplat.dataset.manifest import Manifest
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
-from mitsplat.files import Record, file_inside, link_file, write_file
+from mitsplat.files import Record, file_inside, link_file, splits_of, write_file
 from mitsplat.formats.registry import Catalogue
 from mitsplat.progress import Progress
 
@@ -57,7 +57,8 @@ def merge_shards(
     with ExitStack() as stack:
         manifests = {folder: stack.enter_context(open_finished(folder)) for folder in folders}
         total = _check_frames(manifests, stated)
-        catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], ())
+        splits = splits_of(content["scene"]["output"])
+        catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], (), splits=splits)
         scene_file = next((folders[0] / "scene").iterdir())
         _check_layouts(folders)
         manifest = stack.enter_context(open_folder(out, content, scene_file, None, resume=True, overwrite=overwrite))

@@ -75,7 +75,9 @@ class Points:
         return cls(surface, owner, slot, count, bent)
 
     def rows(self, places: Any) -> Any:
-        """Rows of the points of some pixels."""
+        """Rows of the points of some pixels, which may be none."""
+        if not dr.width(places):
+            return places
         slot = dr.gather(mi.UInt32, self.slot, places)
         even = dr.gather(mi.UInt32, places, dr.compress(slot == NOWHERE))
         slot = dr.gather(mi.UInt32, slot, dr.compress(slot != NOWHERE))

@@ -49,7 +49,7 @@ def write_scene(folder: Path, frames: int, size: str, **output: object) -> Path:
     layouts = -(-frames // data["output"]["views"])
     data["output"] |= {"width": width, "height": height, "layouts": layouts, **output}
     for entry in data["objects"]:
-        entry["asset"] = str(WORKCELL.parent / entry["asset"])
+        entry["pool"] = str(WORKCELL.parent / entry["pool"])
     data["environment"] = str(WORKCELL.parent / data["environment"])
     path = folder / "workcell.yaml"
     folder.mkdir(parents=True, exist_ok=True)

@@ -75,8 +75,8 @@ def test_lights_that_are_drawn_compile_nothing() -> None:
     layout = strewn(0, [0, 1, 2, 3, 3])
     with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.flush_kernel_cache()
-        # The second view of a layout makes what its other views share, and on a GPU an emitter that is alone has kernels
-        # of its own once others have been.
+        # The second view of a layout makes what its other views share, and on a GPU an emitter that is alone has
+        # kernels of its own once others have been.
         for number in (1, 2, 1):
             for _ in range(2):
                 compiled(renderer, numbers.index(number), layout)

@@ -21,11 +21,14 @@ class PartialResultError(RuntimeError):
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the machine's memory has run out, or a GPU's, which Dr.Jit tells by a text."""
+    """Whether the machine's memory has run out, or a GPU's, which Dr.Jit tells by a text.
+
+    A `TypeError` is what that becomes where an array is made of values that do not fit.
+    """
     if isinstance(error, MissingResourceError | PartialResultError):
         return False
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and bool(_OUT_OF_MEMORY.search(str(error)))
+        isinstance(error, RuntimeError | TypeError) and bool(_OUT_OF_MEMORY.search(str(error)))
     )
 
 

@@ -98,7 +98,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
                 drawn["region"] = spec.region_names[region]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
-    if place := draw_place(spec, frame.layout.index * spec.output.views).to_json(spec):
+    if place := draw_place(spec, frame.index, frame.layout.index).to_json(spec):
         record["place"] = place
     if any(entry.appearance for entry in spec.objects):
         record["appearance"] = [one.to_json() for one in frame.appearances.values()]

@@ -283,7 +283,7 @@ class Renderer:
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
             composite, shape = self.scene.spec.composite, layers.shape
-            behind = self._background(draw_place(self.scene.spec, index).background, plan.camera)
+            behind = self._background(draw_place(self.scene.spec, index, layout.index).background, plan.camera)
             linear = light_layers(layers, composite, behind)
             motion = plan.viewpoint.get("motion")
             development = develop_layers(
@@ -344,7 +344,7 @@ class Renderer:
                 )
             self._placed = layout, objects
         emitters = {f"light_{i}": self._made(self._emitter(light), replaced) for i, light in enumerate(lights)}
-        place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
+        place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views, layout.index)
         return {"type": "scene", **self._surroundings(place), **self._placed[1], **emitters}
 
     def _emitter(self, light: LightSpec) -> dict[str, Any]:

@@ -109,9 +109,9 @@ class Place:
         return told
 
 
-def draw_place(spec: SceneSpec, index: int) -> Place:
-    """The place of frame ``index``."""
-    layout = index // spec.output.views
+def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> Place:
+    """The place of frame ``index``, of a layout of one's own where its number is given."""
+    layout = index // spec.output.views if layout is None else layout
     materials = {finish_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
     finishes = {name: draw_finish(among, spec.seed, name, layout) for name, among in materials.items()}
     background = None

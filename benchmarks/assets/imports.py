@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder for assets, scenes and datasets")
     arguments = parser.parse_args()
     ignore = ("folder", "keep", "jobs")
-    with tempfile.TemporaryDirectory() as made, recording("assets.imports", parser, arguments, ignore=ignore):
+    with recording("assets.imports", parser, arguments, ignore=ignore), tempfile.TemporaryDirectory() as made:
         work = arguments.keep or Path(made)
         work.mkdir(parents=True, exist_ok=True)
         names = [arguments.only] if arguments.only else list(FILES)

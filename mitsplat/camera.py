@@ -251,6 +251,16 @@ def direction(azimuth: float, sine: float) -> Float64Array:
     return np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
 
 
+def spiral(sines: Float64Array, turn: float = 0.0) -> Float64Array:
+    """Unit vectors (N, 3) of sines of the elevation (N,), each the golden angle further around, from ``turn`` [rad] on.
+
+    Sines that are evenly spaced give directions that are even over the sphere (Fibonacci lattice).
+    """
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(sines)) + turn
+    cosine = np.sqrt(1.0 - sines**2)
+    return np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sines], axis=1)
+
+
 def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Float64Array:
     """``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that looks at ``target`` [m].
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -47,6 +48,15 @@ def eight_bit(values: npt.NDArray[np.floating]) -> ByteImage:
 def figure_of(value: float | None, form: str) -> str | None:
     """A figure as text, or None where it is not known."""
     return None if value is None else form.format(value)
+
+
+def verdict_of(wrong: Sequence[str], good: str, rows: Mapping[str, str | None]) -> str:
+    """What is wrong, a paragraph each, or a sentence that all is good, and a table of the figures that are known."""
+    lines = "".join(f'<p class="bad">{html.escape(line)}</p>' for line in wrong) or f'<p class="good">{good}</p>'
+    table = "".join(
+        f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value
+    )
+    return f"{lines}<table>{table}</table>"
 
 
 _PAGE = """<!doctype html>

@@ -26,7 +26,7 @@ from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts, world_fr
 from mitsplat.bake.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
-from mitsplat.camera import Camera
+from mitsplat.camera import Camera, spiral
 from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
@@ -290,10 +290,7 @@ def _check_size(source: str, surface: trimesh.Trimesh, metres_per_unit: float) -
 
 def _hemisphere(count: int) -> Float64Array:
     """Directions (M, 3) evenly over the hemisphere around z, none closer than 3 degrees to the horizon."""
-    height = 1.0 - 0.95 * (np.arange(count) + 0.5) / count
-    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    radius = np.sqrt(1.0 - height**2)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
+    return spiral(1.0 - 0.95 * (np.arange(count) + 0.5) / count)
 
 
 def _turned(frames: Float64Array, directions: Float64Array, rng: np.random.Generator) -> Float64Array:
@@ -422,10 +419,7 @@ def _orbit(surface: trimesh.Trimesh, count: int, *, turn: float = 0.7) -> list[C
     """Views (``count``) from all around that frame the mesh."""
     centre = surface.bounds.mean(axis=0)
     radius = 0.5 * float(np.linalg.norm(surface.extents))
-    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + turn
-    ring = np.sqrt(1.0 - height**2)
-    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=1)
+    outward = spiral(1.0 - 2.0 * (np.arange(count) + 0.5) / count, turn)
     return [
         Camera.look_at(centre + 4.5 * radius * d, centre, width=256, height=256, fov_x=29.0, near=0.1 * radius)
         for d in outward

@@ -10,7 +10,7 @@ import numpy as np
 from mitsplat.bake.bake import BakeResult
 from mitsplat.bake.verification import BakedView
 from mitsplat.files import write_text
-from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image
+from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
 from mitsplat.mesh import mass_properties
 from mitsplat.mesh_distance import Surface, standoff
 
@@ -49,15 +49,8 @@ def _figures(result: BakeResult) -> str:
             truth = asset.mesh if result.surface is None else result.surface
             gap = 1e3 * standoff(Surface(truth), asset.pieces)
             rows["Convex pieces"] = f"{len(asset.pieces)}, at most {gap:.2f} mm outside of the mesh"
-    table = "".join(
-        f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value
-    )
-    good = '<p class="good">Nothing to note.</p>'
-    lines = "".join(f'<p class="bad">{html.escape(warning)}</p>' for warning in result.warnings)
-    return (
-        f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{lines or good}'
-        f"<table>{table}</table></section>"
-    )
+    told = verdict_of(result.warnings, "Nothing to note.", rows)
+    return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{told}</section>'
 
 
 def _views(result: BakeResult) -> str:

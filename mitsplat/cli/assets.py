@@ -89,8 +89,7 @@ def bake(
     from mitsplat.bake.materials import Finish
     from mitsplat.bake.report import write_bake_report
 
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out must be a folder (got the file {out})")
+    _check_folder(out)
     if not 0 < units < math.inf:
         raise InputError(f"--units must be finite and > 0 (got {units})")
     if seed < 0:
@@ -453,8 +452,7 @@ def import_(
     from mitsplat.reconstruct.splat_import import ImportSettings, import_splats
     from mitsplat.reconstruct.surface import SurfaceSettings
 
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out must be a folder (got the file {out})")
+    _check_folder(out)
     settings = ImportSettings(
         up=None if up == "auto" else up,
         units=units,
@@ -483,9 +481,8 @@ def import_(
     made = result.asset
     made.save(out)
     report = write_import_report(out, result)
-    removed = ", ".join(f"{count} {reason}" for reason, count in result.removed.items() if count) or "none"
     typer.echo(f"up: {result.upright.reason}")
-    typer.echo(f"Gaussians: {len(made.splats)} of {result.found}; removed: {removed}")
+    typer.echo(f"Gaussians: {result.removed_of_all}")
     if made.mesh is not None:
         extents = " x ".join(f"{extent:.4g}" for extent in made.mesh.extents)
         pieces = f", {len(made.pieces)} convex pieces" if made.pieces else ""
@@ -499,6 +496,12 @@ def import_(
     if scene is not None:
         write_scene(scene, out, result)
         typer.echo(f"scene: {scene}")
+
+
+def _check_folder(out: Path) -> None:
+    """Refuse, before work starts, a file as the folder to write."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out must be a folder (got the file {out})")
 
 
 def _board(squares: str, square: float) -> Board:

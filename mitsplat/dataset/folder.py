@@ -6,10 +6,13 @@ import fcntl
 import importlib.metadata
 import json
 import os
+import platform
 import re
+import shlex
 import shutil
 import socket
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +22,7 @@ from ruamel.yaml import YAML
 
 from mitsplat.dataset.contact_sheet import ContactSheet
 from mitsplat.dataset.inputs import describe_inputs
-from mitsplat.dataset.manifest import Manifest, cut_torn_line
+from mitsplat.dataset.manifest import Manifest, append_line, cut_torn_line
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, storage_errors, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
@@ -163,6 +166,13 @@ def _take_lock(out: Path, lock: IO[str]) -> None:
     except BlockingIOError:
         lock.seek(0)
         raise InputError(f"{out} is being written by another run ({lock.read()})") from None
+
+
+def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] = ()) -> None:
+    """Note that this process adds frames, how, and by what command, in the log of runs."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    run = {"command": command, "python": platform.python_version(), "workers": workers, "device": device}
+    append_line(out / RUNS, run | ({"gpus": list(gpus)} if gpus else {}))
 
 
 def finish_folder(

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import platform
-import shlex
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mitsplat.dataset.folder import RUNS, TIMINGS, content_of, finish_folder, open_folder
+from mitsplat.dataset.folder import TIMINGS, append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.device import current_device
@@ -57,10 +54,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     content = content_of(alone, catalogue, device) | {"given": True}
     counts = FrameCounts()
     with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
-        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-        append_line(
-            out / RUNS, {"command": command, "python": platform.python_version(), "workers": 1, "device": device}
-        )
+        append_run(out, 1, device)
         for index, frame in enumerate(frames):
             if frame.image.shape[:2] != (output.height, output.width):
                 height, width = frame.image.shape[:2]

@@ -19,16 +19,13 @@ Shards are datasets of their own that share everything but their frames; :mod:`m
 
 from __future__ import annotations
 
-import platform
-import shlex
-import sys
 from collections import Counter
 from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mitsplat.dataset.folder import RUNS, SHEET, TIMINGS, Shard, content_of, finish_folder, open_folder
+from mitsplat.dataset.folder import SHEET, TIMINGS, Shard, append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.prospects import refuse, run_faults
@@ -154,9 +151,7 @@ def write_dataset(
         if chosen.reason:
             note(f"device {chosen}: {chosen.reason}")
         if layouts:
-            command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-            run = {"command": command, "python": platform.python_version(), "workers": workers, "device": chosen.kind}
-            append_line(out / RUNS, run | ({"gpus": [gpu.name for gpu in chosen.gpus]} if chosen.gpus else {}))
+            append_run(out, workers, chosen.kind, [gpu.name for gpu in chosen.gpus])
         make = FrameMaker(scene, catalogue, out, render or render_frame, settle or settle_layout)
         with closing(_results(make, layouts, workers, cluster, chosen, note)) as results:
             for record, seconds in results:

@@ -344,7 +344,7 @@ class Renderer:
                 )
             self._placed = layout, objects
         emitters = {f"light_{i}": self._made(self._emitter(light), replaced) for i, light in enumerate(lights)}
-        place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views, layout.index)
+        place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
         return {"type": "scene", **self._surroundings(place), **self._placed[1], **emitters}
 
     def _emitter(self, light: LightSpec) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.files import is_inside, write_text
-from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image
+from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
 from mitsplat.mesh import mass_properties
 from mitsplat.reconstruct.evaluation import show_asset
 from mitsplat.reconstruct.splat_import import Imported
@@ -40,10 +40,9 @@ def write_import_report(folder: Path, imported: Imported) -> Path:
 def _verdict(imported: Imported) -> str:
     asset = imported.asset
     unit = "m" if asset.units == "metre" else "in the file's units"
-    removed = ", ".join(f"{count} {reason}" for reason, count in imported.removed.items() if count) or "none"
     rows: dict[str, str | None] = {
         "Up": imported.upright.reason,
-        "Gaussians": f"{len(asset.splats)} of {imported.found}; removed: {removed}",
+        "Gaussians": imported.removed_of_all,
         "IoU of mesh and splats": figure_of(imported.mesh_iou, "{:.3f}"),
         "Shift between mesh and splats": figure_of(imported.offset, "{:.3%} of the diagonal"),
         "Light that it carries": asset.capture_light,
@@ -57,12 +56,7 @@ def _verdict(imported: Imported) -> str:
     if imported.support is not None:
         width, depth = imported.support.size
         rows["Surface to drop on"] = f"{width:.3g} x {depth:.3g} {unit}, {imported.support.share:.0%} of what is seen"
-    table = "".join(
-        f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value
-    )
-    lines = "".join(f'<p class="bad">{html.escape(miss)}</p>' for miss in imported.misses)
-    good = '<p class="good">Nothing to note.</p>'
-    return _section("Verdict", f"{lines or good}<table>{table}</table>")
+    return _section("Verdict", verdict_of(imported.misses, "Nothing to note.", rows))
 
 
 def _views(imported: Imported) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.files import write_text
-from mitsplat.html import REPORT_FILE, eight_bit, figure_of, make_page, shrunk_image
+from mitsplat.html import REPORT_FILE, eight_bit, figure_of, make_page, shrunk_image, verdict_of
 from mitsplat.reconstruct.evaluation import HeldOutView, sized_photo
 from mitsplat.reconstruct.reconstruct import Reconstruction
 
@@ -78,15 +78,8 @@ def _verdict(result: Reconstruction) -> str:
             f"{removed.outside} outside the masks, {removed.unseen} unseen, {removed.needles} needles, "
             f"{removed.floaters} floaters"
         )
-    table = "".join(
-        f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value
-    )
-    good = '<p class="good">Every threshold is met.</p>'
-    lines = "".join(f'<p class="bad">{html.escape(miss)}</p>' for miss in misses)
-    return (
-        f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>'
-        f"{lines or good}<table>{table}</table></section>"
-    )
+    told = verdict_of(misses, "Every threshold is met.", rows)
+    return f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>{told}</section>'
 
 
 def _held_out(views: Sequence[HeldOutView]) -> str:

@@ -18,7 +18,7 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
+from mitsplat.camera import Camera, spiral
 from mitsplat.errors import InputError
 from mitsplat.mesh import convex_pieces
 from mitsplat.progress import Progress
@@ -135,6 +135,12 @@ class Imported:
     offset: float | None
     watertight: bool
     topples: bool
+
+    @property
+    def removed_of_all(self) -> str:
+        """How many Gaussians of the file are left, and how many went why, in words."""
+        removed = ", ".join(f"{count} {reason}" for reason, count in self.removed.items() if count) or "none"
+        return f"{len(self.asset.splats)} of {self.found}; removed: {removed}"
 
     @property
     def misses(self) -> tuple[str, ...]:
@@ -346,10 +352,7 @@ def _cameras(
     else:
         middle, radius, fov = np.zeros(3), 0.5 * float((high - low)[:2].max()), 75.0
         away, lowest = radius, 0.25
-    height = lowest + (1.0 - lowest) * (np.arange(count) + 0.5) / count
-    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count) + turn
-    ring = np.sqrt(1.0 - height**2)
-    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=1)
+    outward = spiral(lowest + (1.0 - lowest) * (np.arange(count) + 0.5) / count, turn)
     size = settings.view_size
     return [
         Camera.look_at(middle + away * d, middle, width=size, height=size, fov_x=fov, near=0.02 * away) for d in outward

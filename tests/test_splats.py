@@ -1,5 +1,6 @@
 """Splats: rules, colours that turn with the object, files there and back, and every way a file can be bad."""
 
+import gzip
 import struct
 import tracemalloc
 from dataclasses import fields, replace
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
+from mitsplat import splat_files
 from mitsplat.errors import InputError
 from mitsplat.spherical_harmonics import SH_C0, evaluate_sh, sh_basis, sh_rotation
 from mitsplat.splats import Splats
@@ -296,6 +298,31 @@ class TestFiles:
         again = (tmp_path / "a.spz").read_bytes()
         splats.save(tmp_path / "a.spz")
         assert (tmp_path / "a.spz").read_bytes() == again
+
+    @pytest.mark.parametrize("degree", range(4))
+    def test_spz_is_what_gaussforge_makes_of_it_to_the_bit(self, tmp_path, degree):
+        random_splats(500, degree=degree).save(tmp_path / "a.spz")
+        data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+        turns = slice(16 + 500 * 16, 16 + 500 * 20)  # anything is allowed before and after
+        kept, data[16:] = data[turns], np.random.default_rng(degree).bytes(len(data) - 16)
+        data[turns] = kept
+        (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
+        converted = splat_files._decode_ply(splat_files._convert((tmp_path / "a.spz").read_bytes(), "spz", "ply"))
+        for name, array in splat_files.read_splats(tmp_path / "a.spz")._asdict().items():
+            np.testing.assert_array_equal(array, getattr(converted, name), err_msg=name, strict=True)
+
+    def test_spz_of_an_earlier_version(self, tmp_path):
+        means, quats = np.float32([[0.5, -0.25, 2.0]]), np.float32([[0.5, -0.5, 0.5, 0.5]])
+        positions = (means * 4096).astype("<i4").view(np.uint8).reshape(1, 3, 4)[..., :3].tobytes()
+        turns = np.rint(127.5 * (quats[:, :3] + 1)).astype(np.uint8).tobytes()
+        header = struct.pack("<4s2I4B", b"NGSP", 2, 1, 0, 12, 0, 0)
+        (tmp_path / "a.spz").write_bytes(
+            gzip.compress(header + positions + b"\xff" + bytes(3) + bytes([96] * 3) + turns)
+        )
+        loaded = Splats.load(tmp_path / "a.spz")
+        np.testing.assert_array_equal(loaded.means, means)
+        np.testing.assert_allclose(loaded.quats, quats, atol=0.01)
+        np.testing.assert_allclose(loaded.scales, np.exp(-4), rtol=1e-6)
 
     def test_spz_keeps_full_and_no_opacity(self, tmp_path):
         replace(random_splats(2), opacities=[0.0, 1.0]).save(tmp_path / "a.spz")

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
-from mitsplat.colour import LUMINANCE, colour_science, hue_matrix, saturation_matrix
+from mitsplat.colour import LUMINANCE, encode_srgb, hue_matrix, saturation_matrix, white_balance_matrix
 from mitsplat.plugins.device import wrapped
 from mitsplat.render.layers import Layers, device_array, host_array
 from mitsplat.spec.image import Composite, ImageShadow, Sensor
@@ -298,23 +298,12 @@ def colour_matrix(*, white_balance: float = 6504.0, hue: float = 0.0, saturation
     """
     matrix = np.eye(3)
     if white_balance != 6504.0:
-        matrix = _adaptation(float(white_balance))
+        matrix = white_balance_matrix(float(white_balance))
     if hue:
         matrix = hue_matrix(hue) @ matrix
     if saturation != 1.0:
         matrix = saturation_matrix(saturation) @ matrix
     return np.asarray(matrix, dtype=np.float64)
-
-
-@lru_cache(maxsize=64)
-def _adaptation(kelvin: float) -> Float64Array:
-    colour = colour_science()
-    xyz_from_rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
-    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="CIE Illuminant D Series"))
-    target = colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint)
-    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(white, target, transform="Bradford")
-    matrix = np.linalg.inv(xyz_from_rgb) @ adapt @ xyz_from_rgb
-    return np.asarray(matrix / (LUMINANCE @ matrix @ np.ones(3)), dtype=np.float64)
 
 
 @lru_cache(maxsize=2)
@@ -323,7 +312,6 @@ def tone_curve(tone: Tone) -> Float32Array:
 
     ``filmic`` is Hable's curve (2010, "Filmic tonemapping operators", Uncharted 2), scaled so that 0.18 stays 0.18.
     """
-    colour = colour_science()
     x = CURVE_WHITE * (np.arange(CURVE_STEPS) / (CURVE_STEPS - 1)) ** 2
     if tone == "filmic":
 
@@ -333,8 +321,7 @@ def tone_curve(tone: Tone) -> Float32Array:
         grid = np.linspace(0.0, 11.2, 4096)
         gain = np.interp(0.18 * hable(np.array(11.2)), hable(grid), grid) / 0.18
         x = hable(gain * x) / hable(np.array(11.2))
-    encoded = colour.cctf_encoding(np.clip(x, 0.0, 1.0), function="sRGB")
-    return np.asarray(encoded, dtype=np.float32)
+    return np.asarray(encode_srgb(np.clip(x, 0.0, 1.0)), dtype=np.float32)
 
 
 @lru_cache(maxsize=4)

@@ -5,23 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from mitsplat.asset import ASSET_FILE
 from mitsplat.capture.capture import CAPTURE_FILE
 from mitsplat.errors import InputError
 from mitsplat.view.page import Address, Page
-from mitsplat.view.scene_page import ScenePage
-from mitsplat.view.still_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, StillPage
+
+if TYPE_CHECKING:
+    from mitsplat.view.scene_page import ScenePage
+    from mitsplat.view.still_pages import StillPage
 
 Kind = Literal["scene", "asset", "capture", "dataset", "splats"]
 
-_STILL: dict[Kind, Callable[[Page, Path], StillPage]] = {
-    "asset": AssetPage,
-    "capture": CapturePage,
-    "dataset": DatasetPage,
-    "splats": SplatsPage,
-}
 _BY_CONTENT: dict[str, Kind] = {ASSET_FILE: "asset", CAPTURE_FILE: "capture", "dataset.json": "dataset"}
 SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog")
 
@@ -53,9 +49,7 @@ def serve(
     kind = kind_of(path)
     page = Page(path.name, address or Address(), gaussians=gaussians)
     try:
-        shown: ScenePage | StillPage = (
-            ScenePage(page, path, allow_outside=allow_outside) if kind == "scene" else _STILL[kind](page, path)
-        )
+        shown = _filled(page, path, kind, allow_outside)
         try:
             ready(page.url)
             while True:
@@ -67,6 +61,23 @@ def serve(
             shown.close()
     finally:
         page.close()
+
+
+def _filled(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StillPage:
+    """What is shown of a path; only what its kind needs is imported, which takes a part of the time to the picture."""
+    if kind == "scene":
+        from mitsplat.view.scene_page import ScenePage  # fast start: renders, physics
+
+        return ScenePage(page, path, allow_outside=allow_outside)
+    from mitsplat.view import still_pages  # fast start: datasets and captures
+
+    pages = {
+        "asset": still_pages.AssetPage,
+        "capture": still_pages.CapturePage,
+        "dataset": still_pages.DatasetPage,
+        "splats": still_pages.SplatsPage,
+    }
+    return pages[kind](page, path)
 
 
 def kind_of(path: Path) -> Kind:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsplat.colour import black_body_colour
+from mitsplat.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
 from mitsplat.frames.camera_response import (
     SENSOR,
     blurred,
@@ -245,6 +246,36 @@ def test_black_bodies_are_warm_below_daylight_and_of_luminance_one() -> None:
         assert colour @ [0.2126, 0.7152, 0.0722] == pytest.approx(1, rel=1e-6)
     assert warm[0] > warm[1] > warm[2] and cool[2] > cool[1] > cool[0]
     np.testing.assert_allclose(black_body_colour(6504.0), 1, atol=0.06)
+
+
+@pytest.fixture(scope="module")
+def colour_science() -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it imports Matplotlib, and says so where that warns
+        return pytest.importorskip("colour")
+
+
+@pytest.mark.parametrize("kelvin", [1700.0, 2222.0, 2700.0, 4000.0, 6504.0, 7000.0, 12000.0])
+def test_temperatures_are_the_colours_that_colour_science_gives_them(colour_science: Any, kelvin: float) -> None:
+    space, temperature = colour_science.RGB_COLOURSPACES["sRGB"], colour_science.temperature
+    body = colour_science.xy_to_XYZ(temperature.CCT_to_xy(kelvin, method="Kang 2002"))
+    rgb = np.maximum(np.linalg.inv(space.matrix_RGB_to_XYZ) @ body, 0.0)
+    np.testing.assert_allclose(black_body_colour(kelvin), rgb / (LUMINANCE @ rgb), rtol=1e-12, atol=1e-15)
+    if kelvin < 4000:
+        return  # no daylight
+    day = colour_science.xy_to_XYZ(temperature.CCT_to_xy(kelvin, method="CIE Illuminant D Series"))
+    white = colour_science.xy_to_XYZ(space.whitepoint)
+    adapt = colour_science.adaptation.matrix_chromatic_adaptation_VonKries(day, white, transform="Bradford")
+    matrix = np.linalg.inv(space.matrix_RGB_to_XYZ) @ adapt @ space.matrix_RGB_to_XYZ
+    expected = matrix / (LUMINANCE @ matrix @ np.ones(3))
+    np.testing.assert_allclose(white_balance_matrix(kelvin), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_the_transfer_is_that_of_colour_science(colour_science: Any) -> None:
+    linear = np.linspace(0.0, 1.0, 1001)
+    expected = colour_science.cctf_encoding(linear, function="sRGB")
+    np.testing.assert_allclose(encode_srgb(linear), expected, rtol=1e-14, atol=0)
+    np.testing.assert_allclose(decode_srgb(expected), linear, rtol=1e-12, atol=1e-15)
 
 
 def test_published_shadow_is_darkest_in_shadow_and_one_in_light() -> None:

@@ -138,14 +138,10 @@ class Splats:
                 Gaussians with orthonormal axes or of band-limited colours.
         """
         rotation, scale, translation = split_similarity(matrix)
-        means, quats = self.means.astype(np.float64), Rotation.from_quat(self.quats)
-        if np.array_equal(rotation, np.eye(3)):  # as of every file in other units than metres
-            means = scale * means
-        else:
-            means, quats = means @ (scale * rotation).T, Rotation.from_matrix(rotation) * quats
+        turn = Rotation.from_matrix(rotation)
         return Splats(
-            means=(means + translation).astype(np.float32),
-            quats=quats.as_quat(),
+            means=(self.means.astype(np.float64) @ (scale * rotation).T + translation).astype(np.float32),
+            quats=(turn * Rotation.from_quat(self.quats)).as_quat() if len(self) else self.quats,
             scales=(self.scales.astype(np.float64) * scale).astype(np.float32),
             opacities=self.opacities,
             sh=sh_rotation(rotation, self.sh_degree).astype(np.float32) @ self.sh,

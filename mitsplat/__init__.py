@@ -2,7 +2,8 @@
 
 Conventions (frames, units, colour) are stated in :mod:`mitsplat.splats`. Importing this package points Dr.Jit at a
 usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the current and any
-later variant; heavy modules load when a name that needs them is first used.
+later variant, once Mitsuba is imported; heavy modules, Mitsuba among them, load when a name that needs them is first
+used.
 """
 
 from __future__ import annotations
@@ -11,15 +12,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mitsplat.gpu_memory import hide_full_gpus
+from mitsplat.late_mitsuba import after_mitsuba
 from mitsplat.llvm import use_bundled_llvm
 from mitsplat.version import __version__ as __version__
 
+# Dr.Jit must be told, before it is imported, which LLVM to load, and which GPUs not.
 use_bundled_llvm()
 hide_full_gpus()
-
-import mitsuba as _mi  # noqa: E402 - after Dr.Jit was told which LLVM to load, and which GPUs not
-
-from mitsplat.variant import register_plugins as _register_plugins  # noqa: E402 - imports Mitsuba
 
 _HOME = {
     "Asset": "asset",
@@ -85,6 +84,13 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-_mi.detail.add_variant_callback(lambda _old, new: _register_plugins(new))
-if _mi.variant():
-    _register_plugins(_mi.variant())
+def _register_plugins() -> None:
+    import mitsuba as mi  # which is imported: this is what follows
+
+    from mitsplat.variant import register_plugins  # imports Mitsuba
+
+    mi.detail.add_variant_callback(lambda _old, new: register_plugins(new))
+    register_plugins(mi.variant())
+
+
+after_mitsuba(_register_plugins)

@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import InputError, LateDeviceError, MissingResourceError
 from mitsplat.gpu_memory import NEEDED, VISIBLE, unused_gpu_memory
 from mitsplat.variant import VARIANTS, choose_variant
 
@@ -88,21 +88,6 @@ class Lack(NamedTuple):
     remedy: str
 
 
-class LateDeviceError(InputError):
-    """Another GPU is visible first to this process than the one it was to take.
-
-    Attributes:
-        environment: Variables with which a process can take it.
-    """
-
-    def __init__(self, text: str, gpu: Gpu) -> None:
-        super().__init__(
-            f"{text} must be the first GPU that a process sees when it imports mitsplat: set {VISIBLE}={gpu.id} "
-            "before, and use the device cuda"
-        )
-        self.environment = {**gpu_environment(gpu), NUMBER: text.partition(":")[2]}
-
-
 def use_device(device: str | Device) -> Device:
     """Compute on a device from now on, in this process: choose Mitsuba's variant for it.
 
@@ -118,7 +103,7 @@ def use_device(device: str | Device) -> Device:
     """
     found = find_device(device)
     if not found.is_here:
-        raise LateDeviceError(str(device), found.gpus[0])
+        raise _too_late(str(device), found.gpus[0])
     choose_variant(VARIANTS[found.kind == "cuda"])
     return found
 
@@ -168,6 +153,14 @@ def find_device(device: str | Device) -> Device:
         numbers = f"cuda:0 to cuda:{len(gpus) - 1}" if len(gpus) > 1 else "cuda:0"
         raise InputError(f"the GPUs that are visible here are {numbers} (got {text})")
     return Device("cuda", (gpus[int(which)],))
+
+
+def _too_late(text: str, gpu: Gpu) -> LateDeviceError:
+    return LateDeviceError(
+        f"{text} must be the first GPU that a process sees when it imports mitsplat: set {VISIBLE}={gpu.id} "
+        "before, and use the device cuda",
+        {**gpu_environment(gpu), NUMBER: text.partition(":")[2]},
+    )
 
 
 def check_name(device: str) -> str:

@@ -12,6 +12,18 @@ class InputError(ValueError):
     """Bad input: one sentence that names file or place, rule and value. The command line exits with status 2."""
 
 
+class LateDeviceError(InputError):
+    """Another GPU is visible first to this process than the one it was to take.
+
+    Attributes:
+        environment: Variables with which a process can take it.
+    """
+
+    def __init__(self, sentence: str, environment: dict[str, str]) -> None:
+        super().__init__(sentence)
+        self.environment = environment
+
+
 class MissingResourceError(RuntimeError):
     """Something that mitsplat needs of the machine is missing; the sentence says what to do. Exit status 3."""
 

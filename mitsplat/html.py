@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage
+from mitsplat.masks import Silhouette
 
 REPORT_FILE = "report.html"
 
@@ -43,6 +44,15 @@ def rgb_image(values: npt.NDArray[np.floating], width: int) -> str:
 def eight_bit(values: npt.NDArray[np.floating]) -> ByteImage:
     """Colours from 0 to 1 as bytes."""
     return np.asarray(255 * np.clip(values, 0, 1) + 0.5).astype(np.uint8)
+
+
+def mask_path(shape: Silhouette) -> str:
+    """Outlines of a mask along its pixels' centres as an SVG path, holes cut out by the even-odd rule."""
+    x, y = shape.box[:2]
+    rings, _ = cv2.findContours(shape.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
+    return "".join(
+        "M" + "L".join(f"{px + x + 0.5:g} {py + y + 0.5:g}" for px, py in ring.reshape(-1, 2)) + "Z" for ring in rings
+    )
 
 
 def figure_of(value: float | None, form: str) -> str | None:
@@ -103,6 +113,9 @@ figcaption { font-size: .9rem; padding: .35rem 0; }
 .charts svg { width: 100%; height: auto; font-size: 12px; fill: var(--ink); }
 .bar { fill: var(--bar); }
 .axis { stroke: var(--line); }
+.curve { fill: none; stroke: var(--bar); stroke-linejoin: round; }
+.matrix td { text-align: right; padding: .2rem .6rem; }
+.pair { display: grid; gap: .6rem; grid-template-columns: 1fr 1fr; }
 .frame { fill: none; stroke: var(--line); }
 summary { cursor: pointer; }
 pre { overflow: auto; max-height: 30rem; background: var(--soft); padding: .8rem; font-size: .85rem; }

@@ -9,8 +9,8 @@ import pytest
 import mitsplat as ms
 from mitsplat import device as devices
 from mitsplat import gpu_memory
-from mitsplat.device import CPU, Device, LateDeviceError, current_device, find_device, gpu_environment, use_device
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.device import CPU, Device, current_device, find_device, gpu_environment, use_device
+from mitsplat.errors import InputError, LateDeviceError, MissingResourceError
 
 
 class FakeDriver:

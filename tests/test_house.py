@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 FLOORS = (
     ("cli",),
-    ("report", "view"),
+    ("detector", "report", "view"),
     ("audit", "checks"),
     ("dataset",),
     ("bake", "formats", "reconstruct"),

@@ -13,9 +13,8 @@ from typing import Annotated
 
 import typer
 
-from mitsplat.cli import assets, datasets, fault
-from mitsplat.device import LateDeviceError
-from mitsplat.errors import exit_status, sentence_of
+from mitsplat.cli import assets, datasets, detectors, fault
+from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.version import __version__
 
 app = typer.Typer(
@@ -37,6 +36,8 @@ for _command in (
     datasets.view,
     datasets.settle,
     datasets.export,
+    detectors.train,
+    detectors.evaluate,
     assets.bake,
     assets.fit,
     assets.capture,

@@ -47,13 +47,15 @@ def tell_device(device: Device) -> None:
 
 
 @contextmanager
-def command_log(json_log: bool, command: str) -> Iterator[Callable[[], AbstractContextManager[Progress]]]:
+def command_log(
+    json_log: bool, command: str, unit: str = "images/s"
+) -> Iterator[Callable[[], AbstractContextManager[Progress]]]:
     """How a command shows its progress: by bars, or as a log for machines, which then holds its errors too.
 
     The log's events are started, progress, then finished, or failed with the exit status and a sentence.
     """
     if not json_log:
-        yield progress_bar
+        yield lambda: progress_bar(unit)
         return
 
     def tell(event: str, **details: Any) -> None:

@@ -18,12 +18,12 @@ from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import Record, write_text
 from mitsplat.formats.coco import image_file
-from mitsplat.html import inline_image, make_page
+from mitsplat.html import inline_image, make_page, mask_path
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour
 from mitsplat.masks import Silhouette
-from mitsplat.report.svg_charts import HeatMap, Histogram, bars, columns
 from mitsplat.report.variety import Variety
+from mitsplat.svg_charts import HeatMap, Histogram, bars, columns
 
 SAMPLES = 12
 """Images that are shown, evenly spread over the dataset."""
@@ -181,8 +181,8 @@ def _sample(root: Path, record: Record) -> str:
         )
         marks.append(
             f"<g><title>{html.escape(title)}</title>"
-            f'<path class="alone" d="{_path(label.amodal)}" stroke="{colour}"/>'
-            f'<path class="mask" d="{_path(Silhouette(label.box, label.mask))}" fill="{colour}" stroke="{colour}"/>'
+            f'<path class="alone" d="{mask_path(label.amodal)}" stroke="{colour}"/>'
+            f'<path class="mask" d="{mask_path(Silhouette(label.box, label.mask))}" fill="{colour}" stroke="{colour}"/>'
             f'<rect class="box" x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}" stroke="{colour}"/></g>'
         )
         names.append(
@@ -196,15 +196,6 @@ def _sample(root: Path, record: Record) -> str:
         f'<figure><div class="picture"><img alt="{text}" src="{source}">'
         f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks + names)}</svg></div>'
         f"<figcaption>{text}</figcaption></figure>"
-    )
-
-
-def _path(shape: Silhouette) -> str:
-    """Outlines of a mask along its pixels' centres as an SVG path, holes cut out by the even-odd rule."""
-    x, y = shape.box[:2]
-    rings, _ = cv2.findContours(shape.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
-    return "".join(
-        "M" + "L".join(f"{px + x + 0.5:g} {py + y + 0.5:g}" for px, py in ring.reshape(-1, 2)) + "Z" for ring in rings
     )
 
 

@@ -14,7 +14,7 @@ from pycocotools import mask as coco_mask
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.files import Record
-from mitsplat.report.svg_charts import Histogram, bars, discs
+from mitsplat.svg_charts import Histogram, bars, discs
 
 OCCLUDED = 0.05
 """Share of an instance's pixels in the image that are hidden if it is occluded."""

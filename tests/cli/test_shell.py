@@ -49,6 +49,8 @@ SMALLER = {
     "mesh": ["--faces", "300", "--voxels", "48"],
     "import": ["--faces", "300", "--voxels", "48"],
     "split": ["--folds", "2"],
+    "train": ["--steps", "2", "--batch", "2", "--size", "64", "--device", "cpu"],
+    "evaluate": ["--size", "64", "--device", "cpu"],
 }
 """Options that are added to documented commands, in place of their own, so that they are quick."""
 
@@ -130,6 +132,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 PHOTOGRAPHS = ("capture", "asset", "fit", "mesh")
 """Commands that begin with photographs."""
 
+DETECTORS = ("train", "evaluate")
+"""Commands that need the extra ``train``."""
+
 DOCUMENTED = [words for page in PAGES for words in commands(page)]
 
 SHOWN = [words for words in {form(words): words for words in reversed(DOCUMENTED)}.values() if "--engine" not in words]
@@ -157,7 +162,7 @@ def test_every_command_is_shown() -> None:
 @pytest.mark.slow
 def test_every_command_runs_by_itself_as_documented(desk: Path) -> None:
     for words in SHOWN:
-        if words[1] == "view":  # which serves until it is ended: tests/view
+        if words[1] in ("view", *DETECTORS):  # one serves until it is ended: tests/view
             continue
         if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
             # 1 is that of findings, which a box of sixty Gaussians and small machines may give.
@@ -168,6 +173,21 @@ def test_every_command_runs_by_itself_as_documented(desk: Path) -> None:
     ] == []
     assert json.loads((desk / "scene.schema.json").read_text())["properties"]["camera"]
     assert len(list((desk / "out/cell/images").rglob("*.jpg"))) == 2
+
+
+@pytest.mark.slow
+def test_detectors_learn_as_documented(desk: Path) -> None:
+    """After the commands above, which have made the dataset; its COCO files are those of photographs."""
+    if not all(map(find_spec, ("torch", "torchvision", "ultralytics"))):
+        pytest.skip("Ultralytics and PyTorch are not installed")
+    if subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, check=False).returncode:
+        pytest.skip("torchvision was built for another PyTorch")
+    shutil.copytree(desk / "out/cell/images/train", desk / "photographs/images")
+    shutil.copyfile(desk / "out/cell/annotations/instances_train.json", desk / "photographs/labels.json")
+    for words in SHOWN:
+        if words[1] in DETECTORS:
+            obey(words, desk)
+    assert (desk / "runs/mixed/evaluation/photographs-all/report.html").stat().st_size
 
 
 @pytest.mark.slow

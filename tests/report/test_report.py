@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mitsplat.report.report import SAMPLES, write_report
-from mitsplat.report.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.svg_charts import HeatMap, Histogram, bars, columns
 from tests.audit.test_audit import records_of, store, swap_a_class
 from tests.cli.test_cli import run
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from mitsplat.camera import look_at_pose
 from mitsplat.report import variety
 from mitsplat.report.report import write_report
-from mitsplat.report.svg_charts import discs
 from mitsplat.report.variety import FEW_VIEWS, RINGS, SECTORS, Variety, cell_of
+from mitsplat.svg_charts import discs
 from tests.audit.test_audit import records_of, store
 from tests.cli.test_cli import run
 

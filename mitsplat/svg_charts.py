@@ -64,6 +64,29 @@ def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names
     return _columns(caption, np.asarray(counts), names, ends, axis)
 
 
+def curves(
+    caption: str, lines: Mapping[str, npt.NDArray[np.float64]], axes: tuple[str, str], numbers: Mapping[str, str]
+) -> str:
+    """Lines of points (x, y) in [0, 1], shape (N, 2) each, the first one thick; ``numbers`` is the table."""
+    width, height = _WIDTH - _LEFT - 10, 0.6 * (_WIDTH - _LEFT - 10)
+    base = _TOP + height
+    marks = [f'<rect class="frame" x="{_LEFT}" y="{_TOP}" width="{width}" height="{height:.1f}"/>']
+    for name, points in reversed(list(lines.items())):
+        path = " ".join(f"{_LEFT + width * x:.1f},{base - height * y:.1f}" for x, y in points.tolist())
+        style = 'stroke-width="3"' if name == next(iter(lines)) else 'stroke-width="1" stroke-opacity="0.6"'
+        marks.append(f'<polyline class="curve" points="{path}" {style}><title>{html.escape(name)}</title></polyline>')
+    for text, left, top, anchor in (
+        ("0", _LEFT, base + 14, "start"),
+        ("1", _LEFT + width, base + 14, "end"),
+        ("0", _LEFT - 5, base, "end"),
+        ("1", _LEFT - 5, _TOP + 10, "end"),
+        (axes[0], _LEFT + width / 2, base + 28, "middle"),
+        (axes[1], _LEFT + 8, _TOP + 16, "start"),
+    ):
+        marks.append(f'<text x="{left:.1f}" y="{top:.1f}" text-anchor="{anchor}">{html.escape(text)}</text>')
+    return _figure(caption, _svg(caption, base + 34, marks), list(numbers.items()))
+
+
 def discs(caption: str, counts: Mapping[str, npt.NDArray[np.integer]]) -> str:
     """Hemispheres seen from above, their cells (rings from the top, sectors from +x to +y) darker the more they count.
 

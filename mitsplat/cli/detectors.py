@@ -1,0 +1,118 @@
+"""Commands on detectors.
+
+Commands import what they need inside of their functions, so that the start of every other one stays short.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from mitsplat.cli.options import JsonLog, Seed, command_log
+
+TorchDevice = Annotated[
+    str,
+    typer.Option(
+        "--device", metavar="NAME", help="Compute on the cpu, or on a GPU: cuda, cuda:1, or auto if there is one."
+    ),
+]
+
+
+def train(
+    datasets: Annotated[
+        list[Path], typer.Argument(metavar="DATASETS...", help="Dataset folders with YOLO files; all are learnt from.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run to write.")],
+    real: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Labelled photographs to mix in: a YOLO folder, a COCO folder or a dataset."),
+    ] = None,
+    share: Annotated[float, typer.Option(help="Of photographs among the images of every step.")] = 0.1,
+    model: Annotated[
+        str, typer.Option(help="Network of Ultralytics: yolo11n-seg for masks, yolo11n for boxes; s and m are larger.")
+    ] = "yolo11n-seg.yaml",
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Weights to start from (.pt), instead of random ones.")
+    ] = None,
+    steps: Annotated[int, typer.Option(help="Batches to learn from, however many images there are.")] = 1500,
+    batch: Annotated[int, typer.Option(help="Images of a step.")] = 16,
+    size: Annotated[int, typer.Option(help="Longer side that images are scaled to [px], a multiple of 32.")] = 640,
+    seed: Seed = 0,
+    device: TorchDevice = "auto",
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that read images; if absent, up to 8, and none on the cpu.")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite/--resume", help="Replace the run in the folder, or go on with it.")
+    ] = False,
+    json_log: JsonLog = False,
+) -> None:
+    """Train a detector on DATASETS, by Ultralytics.
+
+    Nothing is downloaded: networks start from random weights, or from a file. Needs the extra train.
+    """
+    from mitsplat.detector.training import TrainSettings, train_detector
+
+    settings = TrainSettings(
+        model=model,
+        weights=weights,
+        steps=steps,
+        batch=batch,
+        size=size,
+        share=share,
+        seed=seed,
+        device=device,
+        workers=workers,
+    )
+    with command_log(json_log, "train", "steps/s") as progress_bars, progress_bars() as progress:
+        run = train_detector(datasets, out, settings, real=real, overwrite=overwrite, progress=progress)
+    done = run.record["finished"]
+    if run.was_finished:
+        typer.echo(f"run: {run.path} is finished already ({done['steps']} steps); --overwrite trains again")
+    else:
+        resumed = f", resumed at step {done['resumed_at_step']}" if done["resumed_at_step"] else ""
+        typer.echo(
+            f"run: {run.path} ({done['steps']} steps of {done['images_a_step']} images, {done['real_images_taken']} of "
+            f"{done['images_taken']} real, {done['seconds']:.0f} s on {run.record['device']}{resumed})"
+        )
+    typer.echo(f"weights: {run.weights}")
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished `mitsplat train`.")],
+    data: Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset, YOLO or COCO folder with labelled images.")],
+    split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Which of its images.")] = "val",
+    size: Annotated[
+        int | None, typer.Option(help="Longer side that images are scaled to [px]; that of the training if absent.")
+    ] = None,
+    device: TorchDevice = "auto",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder to write; evaluation/<name of DATASET>-<split> in RUN if absent."),
+    ] = None,
+    json_log: JsonLog = False,
+) -> None:
+    """Judge the detector of RUN on labelled images: average precision by COCO's rules, and a page.
+
+    The page shows precision over recall, what is taken for what, and the images that went worst.
+    """
+    from mitsplat.detector.evaluation import evaluate_detector
+
+    with command_log(json_log, "evaluate") as progress_bars, progress_bars() as progress:
+        found = evaluate_detector(run, data, out, split=split, size=size, device=device, progress=progress)
+    for kind, words in (("box", "boxes"), ("mask", "masks")):
+        if kind in found.results:
+            typer.echo(f"{words}: {_scores(found.results[kind])}")
+    for name, count in found.results["data"]["instances"].items():
+        scores = [found.results[kind]["classes"].get(name) for kind in ("box", "mask") if kind in found.results]
+        told = [f"{score['ap50_95']:.3f}" for score in scores if score]
+        typer.echo(f"  {name}: {count} labelled, AP50-95 {' of boxes, '.join(told) or 'unknown'}")
+    typer.echo(f"report: {found.page}")
+
+
+def _scores(score: dict[str, Any]) -> str:
+    if score["map50"] is None:
+        return "nothing but crowds is labelled"
+    return f"mAP50-95 {score['map50_95']:.3f}, mAP50 {score['map50']:.3f}"

@@ -1,0 +1,170 @@
+"""Ultralytics and PyTorch, as far as they are there: imported so that they neither download nor tell anyone anything.
+
+They are imported inside of their functions, because they are optional and take seconds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import importlib.metadata
+import os
+import re
+import shutil
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from mitsplat.errors import InputError, MissingResourceError
+
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,2})?")
+
+
+def check_device(device: str) -> None:
+    """Refuse what is no device.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if not _DEVICE.fullmatch(device):
+        raise InputError(f"device must be auto, cpu, cuda or cuda:N (got {device})")
+
+
+def load_libraries() -> None:
+    """Import Ultralytics: offline, silent, and with its settings in a folder that ends with this process.
+
+    ``YOLO_CONFIG_DIR`` and ``YOLO_VERBOSE`` keep the values that a user has given them.
+
+    Raises:
+        MissingResourceError: If it is not installed.
+    """
+    missing = [name for name in ("torch", "torchvision", "ultralytics") if find_spec(name) is None]
+    if missing:
+        raise MissingResourceError(f"detectors need {' and '.join(missing)}: pip install 'mitsplat[train]'")
+    os.environ["YOLO_OFFLINE"] = "true"
+    os.environ["YOLO_AUTOINSTALL"] = "false"
+    os.environ.setdefault("YOLO_VERBOSE", "false")
+    os.environ.setdefault("ULTRALYTICS_SAFE_LOAD", "true")  # weights are pickles: only classes that it knows
+    if "YOLO_CONFIG_DIR" not in os.environ:
+        folder = tempfile.mkdtemp(prefix="mitsplat-ultralytics-")
+        os.environ["YOLO_CONFIG_DIR"] = folder
+        atexit.register(_remove, folder, os.getpid())
+    import ultralytics  # noqa: F401 - reads these variables as it is imported
+
+
+def check_torchvision() -> None:
+    """Refuse a torchvision that cannot be imported: prediction takes its suppression of overlapping boxes.
+
+    Raises:
+        MissingResourceError: If it was built for another PyTorch.
+    """
+    try:
+        import torchvision  # noqa: F401
+    except (RuntimeError, ImportError, OSError) as error:
+        raise MissingResourceError(
+            "torchvision cannot be imported, as it was built for another PyTorch: install both from the same place "
+            f"({str(error).splitlines()[0]})"
+        ) from error
+
+
+def _remove(folder: str, process: int) -> None:
+    if os.getpid() == process:  # and not in the workers that it forks
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def versions() -> dict[str, str]:
+    """Releases of what decides a training's result."""
+    names = ("mitsplat", "torch", "torchvision", "numpy")
+    found = {name: importlib.metadata.version(name) for name in names if _is_installed(name)}
+    import ultralytics
+
+    return found | {"ultralytics": str(ultralytics.__version__)}
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def torch_device(device: str) -> tuple[str, str]:
+    """A device as Ultralytics names it, and as its maker does.
+
+    Raises:
+        InputError: If there is no such GPU.
+        MissingResourceError: If there is none at all.
+    """
+    import torch
+
+    check_device(device)
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device == "cpu" or (device == "auto" and not count):
+        return "cpu", "cpu"
+    if not count:
+        raise MissingResourceError(f"{device} cannot be used, as PyTorch finds no GPU: use --device cpu")
+    number = int(device.partition(":")[2] or 0)
+    if number >= count:
+        raise InputError(f"the GPUs that PyTorch finds are cuda:0 to cuda:{count - 1} (got {device})")
+    return str(number), str(torch.cuda.get_device_name(number))
+
+
+def read_network(model: str) -> tuple[str, bool]:
+    """The name of a network's YAML file for Ultralytics, and whether the network predicts masks.
+
+    Args:
+        model: ``yolo11n-seg.yaml``, without its suffix, or the path of such a file.
+
+    Raises:
+        InputError: If there is no such network, or it predicts neither boxes nor masks.
+    """
+    from ultralytics.nn.tasks import guess_model_task, yaml_model_load
+
+    name = model if Path(model).suffix in (".yaml", ".yml") else f"{model}.yaml"
+    try:
+        task = guess_model_task(yaml_model_load(name))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"--model must be a network of Ultralytics, such as yolo11n-seg (got {model})") from error
+    if task not in ("detect", "segment"):
+        raise InputError(f"--model must predict boxes or masks, such as yolo11n or yolo11n-seg (got {model}: {task})")
+    return name, task == "segment"
+
+
+def check_weights(weights: Path, network: str, *, masks: bool) -> None:
+    """Refuse weights that are not of a network, whatever the classes that they know.
+
+    Raises:
+        InputError: If they cannot be read, or their tensors are others.
+    """
+    from ultralytics.nn.tasks import DetectionModel, SegmentationModel
+
+    found = load_weights(weights)
+    kind = SegmentationModel if masks else DetectionModel
+    expected = kind(network, nc=len(found.names), verbose=False).state_dict()
+    own = found.state_dict()
+    for name in sorted(expected.keys() | own.keys()):
+        shapes = [tuple(tensors[name].shape) if name in tensors else None for tensors in (own, expected)]
+        if shapes[0] != shapes[1]:
+            raise InputError(
+                f"{weights}: does not fit {network}: {name} must have the shape {shapes[1] or 'of nothing'} "
+                f"(got {shapes[0] or 'none'})"
+            )
+
+
+def load_weights(path: Path) -> Any:
+    """The network of a file of weights.
+
+    Raises:
+        InputError: If it is none of Ultralytics.
+    """
+    import pickle
+
+    from ultralytics.nn.tasks import load_checkpoint
+
+    if not path.is_file() or path.suffix != ".pt":
+        raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {path})")
+    try:
+        return load_checkpoint(path)[0]
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, pickle.UnpicklingError) as error:
+        raise InputError(f"{path}: cannot be read as weights of Ultralytics ({str(error).splitlines()[0]})") from error

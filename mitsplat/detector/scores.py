@@ -1,0 +1,195 @@
+"""How well detections match what is labelled, by COCO's rules, from what was stored of both.
+
+``truth`` is a COCO dataset of instances: ``images``, ``annotations``, numbered from 1, and ``categories``.
+``detections`` is a list in COCO's results format: ``image_id``, ``category_id``, ``bbox`` (x, y, width, height in px),
+``score``, and ``segmentation`` (compressed run lengths) where there are masks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.errors import InputError
+
+IouType = Literal["bbox", "segm"]
+Detection = dict[str, Any]
+
+MOST_DETECTIONS = 300
+"""Detections of a class that count in an image, those with the highest scores; COCO's own summary takes 100."""
+CONFIDENCE, IOU = 0.25, 0.5
+"""Least score, and least overlap of boxes, of what counts as found in the confusion matrix."""
+
+
+@dataclass(frozen=True, eq=False)
+class AveragePrecision:
+    """Average precision, of the mean over classes that are labelled in the images, and of each.
+
+    Attributes:
+        map50_95: Mean over IoU thresholds 0.5 to 0.95 in steps of 0.05; NaN if nothing is labelled.
+        map50: At the threshold 0.5.
+        classes: Both by class; without classes that are not labelled in the images.
+        curves: Precision at IoU 0.5 over recall 0, 0.01, ..., 1, by class, shape (101,) each.
+    """
+
+    map50_95: float
+    map50: float
+    classes: dict[str, tuple[float, float]]
+    curves: dict[str, Float64Array]
+
+
+class Matches:
+    """Detections matched to what is labelled in each image, once; any sample of the images is judged from it.
+
+    Args:
+        truth: What is labelled.
+        detections: What was found.
+        iou_type: Whether boxes or masks must overlap.
+
+    Raises:
+        InputError: If a detection is of an image or a class that is not in ``truth``.
+    """
+
+    def __init__(self, truth: Mapping[str, Any], detections: Sequence[Detection], iou_type: IouType = "bbox") -> None:
+        self.images = [image["id"] for image in truth["images"]]
+        self._names = {category["id"]: str(category["name"]) for category in truth["categories"]}
+        known = set(self.images)
+        for detection in detections:
+            if detection["image_id"] not in known or detection["category_id"] not in self._names:
+                raise InputError(
+                    "detections must be of images and classes that are labelled (got image "
+                    f"{detection['image_id']}, class {detection['category_id']})"
+                )
+        with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints what it does
+            labelled = _coco(truth)
+            found = labelled.loadRes([dict(detection) for detection in detections]) if detections else _nothing(truth)
+            self._eval = COCOeval(labelled, found, iou_type)
+            self._eval.params.maxDets = [MOST_DETECTIONS]
+            self._eval.params.areaRng, self._eval.params.areaRngLbl = [[0, 1e10]], ["all"]
+            self._eval.evaluate()
+        self._place = {image: i for i, image in enumerate(self._eval.params.imgIds)}
+
+    def average_precision(self, images: Sequence[int] | None = None) -> AveragePrecision:
+        """Average precision on images, all if None; an image that is named twice counts twice, as in a bootstrap.
+
+        Raises:
+            InputError: If there is no image, or no such image.
+        """
+        chosen = self.images if images is None else list(images)
+        if not chosen or not self._place.keys() >= set(chosen):
+            raise InputError("images must be among those that are labelled, one or more")
+        sample, total, params = copy(self._eval), len(self._place), copy(self._eval.params)
+        places = [self._place[image] for image in chosen]
+        sample.evalImgs = [self._eval.evalImgs[k * total + i] for k in range(len(params.catIds)) for i in places]
+        params.imgIds = list(range(len(chosen)))
+        sample.params = sample._paramsEval = params
+        with contextlib.redirect_stdout(io.StringIO()):
+            sample.accumulate()
+        precision = sample.eval["precision"][:, :, :, 0, 0]  # thresholds, recalls, classes
+        labelled = [k for k in range(len(params.catIds)) if precision[0, 0, k] >= 0]
+        names = [self._names[params.catIds[k]] for k in labelled]
+        values = precision[:, :, labelled].mean(axis=1)  # thresholds, classes
+        return AveragePrecision(
+            float(values.mean()) if labelled else float("nan"),
+            float(values[0].mean()) if labelled else float("nan"),
+            {name: (float(values[:, i].mean()), float(values[0, i])) for i, name in enumerate(names)},
+            {name: precision[0, :, k] for name, k in zip(names, labelled, strict=True)},
+        )
+
+
+def average_precision(
+    truth: Mapping[str, Any],
+    detections: Sequence[Detection],
+    images: Sequence[int] | None = None,
+    iou_type: IouType = "bbox",
+) -> AveragePrecision:
+    """Average precision of stored detections on some of the images; see :class:`Matches` for many such samples.
+
+    Args:
+        truth: What is labelled.
+        detections: What was found.
+        images: Ids of images, which may be named twice; all if None.
+        iou_type: Whether boxes or masks must overlap.
+    """
+    return Matches(truth, detections, iou_type).average_precision(images)
+
+
+@dataclass(frozen=True, eq=False)
+class Confusion:
+    """What was taken for what, where boxes overlap by :data:`IOU` and scores are at least :data:`CONFIDENCE`.
+
+    Attributes:
+        matrix: Counts by class that is labelled (rows) and that was found (columns), the last one nothing.
+        errors: For each image, by id: how many were right, missed, taken for another class, and found where is nothing.
+    """
+
+    matrix: Int64Array
+    errors: dict[int, tuple[int, int, int, int]]
+
+
+def confuse(truth: Mapping[str, Any], detections: Sequence[Detection]) -> Confusion:
+    """Compare classes of detections and labels that overlap; the highest scores choose first, by overlap."""
+    index = {category["id"]: i for i, category in enumerate(truth["categories"])}
+    nothing = len(index)
+    matrix = np.zeros((nothing + 1, nothing + 1), dtype=np.int64)
+    labels, found, errors = defaultdict(list), defaultdict(list), {}
+    for annotation in truth["annotations"]:
+        if not annotation.get("iscrowd"):
+            labels[annotation["image_id"]].append(annotation)
+    for detection in detections:
+        if detection["score"] >= CONFIDENCE:
+            found[detection["image_id"]].append(detection)
+    for image in (image["id"] for image in truth["images"]):
+        own, seen = labels[image], sorted(found[image], key=lambda detection: -detection["score"])
+        pairs = match_boxes([d["bbox"] for d in seen], [a["bbox"] for a in own])
+        own_index, seen_index = ([index[x["category_id"]] for x in xs] for xs in (own, seen))
+        right = confused = 0
+        for d, a in pairs.items():
+            matrix[own_index[a], seen_index[d]] += 1
+            right += own_index[a] == seen_index[d]
+            confused += own_index[a] != seen_index[d]
+        missed = [a for a in range(len(own)) if a not in pairs.values()]
+        extra = [d for d in range(len(seen)) if d not in pairs]
+        for a in missed:
+            matrix[own_index[a], nothing] += 1
+        for d in extra:
+            matrix[nothing, seen_index[d]] += 1
+        errors[image] = right, len(missed), confused, len(extra)
+    return Confusion(matrix, errors)
+
+
+def match_boxes(found: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]]) -> dict[int, int]:
+    """Positions of boxes that were found, in their order, to those of the free labelled box that each overlaps most."""
+    pairs: dict[int, int] = {}
+    if not found or not labelled:
+        return pairs
+    overlap = np.asarray(
+        coco_mask.iou(np.array(found, dtype=np.float64), np.array(labelled, dtype=np.float64), [0] * len(labelled))
+    )
+    for d, row in enumerate(overlap):
+        best = int(np.where(np.isin(np.arange(len(labelled)), list(pairs.values())), -1, row).argmax())
+        if row[best] >= IOU and best not in pairs.values():
+            pairs[d] = best
+    return pairs
+
+
+def _coco(content: Mapping[str, Any]) -> COCO:
+    coco = COCO()
+    coco.dataset = dict(content)
+    coco.createIndex()
+    return coco
+
+
+def _nothing(truth: Mapping[str, Any]) -> COCO:
+    return _coco({"images": truth["images"], "categories": truth["categories"], "annotations": []})

@@ -1,0 +1,511 @@
+"""Labelled images that a detector learns from or is judged by, as they lie in a folder.
+
+======== ===============================================================================================================
+kind     what makes a folder one
+======== ===============================================================================================================
+mitsplat ``dataset.json``, and files of the format ``yolo``
+yolo     ``data.yaml``, which names folders or lists of images; labels lie where Ultralytics looks for them
+coco     JSON files of ``images``, ``annotations`` and ``categories``, images beside them or anywhere in the folder
+======== ===============================================================================================================
+
+Everything is read and checked before anything is done with it: an image or a label that is torn is found now, and not
+left out by whoever reads it later.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from PIL import Image
+from pycocotools import mask as coco_mask
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.content_hash import ContentHash
+from mitsplat.errors import InputError
+from mitsplat.files import IMAGE_ERRORS, SPLITS, is_inside
+from mitsplat.labels.polygons import fill_polygon, outline
+from mitsplat.progress import Progress
+
+Split = Literal["train", "val", "test", "all"]
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+"""Images that Ultralytics reads as well."""
+
+_BEYOND = 0.01
+"""How far positions may lie outside of the image, as a share of its sides; they are cut off there."""
+_SMALLEST = 10
+"""Sides of images that Ultralytics takes [px]."""
+_ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
+"""The EXIF tag by which OpenCV turns images as it reads them, and its values that swap width and height."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One labelled object.
+
+    Attributes:
+        class_index: Position of its class among those of its set.
+        box: x0, y0, x1, y1 [px].
+        polygon: Closed outline [px], shape (M, 2), if that is how it is labelled.
+        rle: COCO's compressed run-length code of its mask, if that is how it is labelled.
+        crowd: Whether it is a crowd of COCO, which no detector has to find.
+    """
+
+    class_index: int
+    box: tuple[float, float, float, float]
+    polygon: Float64Array | None = None
+    rle: dict[str, Any] | None = None
+    crowd: bool = False
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether more is known of it than a box."""
+        return self.polygon is not None or self.rle is not None
+
+    def encoded(self, width: int, height: int) -> dict[str, Any]:
+        """Its mask in an image [px] as COCO's compressed run-length code; that of its box, if it is all there is."""
+        if self.rle is not None:
+            return self.rle
+        if self.polygon is not None:
+            return encode(fill_polygon(self.polygon, width, height))
+        x0, y0, x1, y1 = self.box
+        corners = [[x0, y0, x1, y0, x1, y1, x0, y1]]
+        return _text(coco_mask.merge(coco_mask.frPyObjects(corners, height, width)))
+
+    def outlined(self) -> Float64Array:
+        """Its outline [px], shape (M, 2)."""
+        if self.polygon is not None:
+            return self.polygon
+        return outline(np.asarray(coco_mask.decode(self.rle), dtype=bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """An image and what it shows.
+
+    Attributes:
+        path: Of the image.
+        name: Of the image, below its set.
+        width: As it is shown, turned by its EXIF orientation [px].
+        height: Likewise.
+        instances: What is labelled in it.
+        digest: SHA-256 of the image and its label.
+    """
+
+    path: Path
+    name: str
+    width: int
+    height: int
+    instances: tuple[Instance, ...]
+    digest: str
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledSet:
+    """Labelled images, at least one.
+
+    Attributes:
+        root: The folder that was named.
+        kind: How they are labelled.
+        split: Which of them were asked for.
+        class_names: Their classes.
+        samples: The images.
+    """
+
+    root: Path
+    kind: Literal["mitsplat", "yolo", "coco"]
+    split: Split
+    class_names: tuple[str, ...]
+    samples: tuple[Sample, ...]
+
+    def described(self) -> dict[str, Any]:
+        """What a record says of it; its digest is that of images, labels and classes."""
+        sha = ContentHash()
+        sha.add_json([self.class_names, [(sample.name, sample.digest) for sample in self.samples]])
+        counts = Counter(instance.class_index for sample in self.samples for instance in sample.instances)
+        return {
+            "path": str(self.root),
+            "kind": self.kind,
+            "split": self.split,
+            "images": len(self.samples),
+            "instances": {name: counts[i] for i, name in enumerate(self.class_names)},
+            "digest": sha.hexdigest(),
+        }
+
+
+def read_set(path: str | Path, split: Split, progress: Progress | None = None) -> LabelledSet:
+    """Read labelled images.
+
+    Args:
+        path: A dataset of mitsplat, a YOLO folder, or a COCO folder.
+        split: Which images. Of COCO's files that with the split in its name, and if there is but one file, all of it.
+        progress: Told of each image.
+
+    Raises:
+        InputError: If it is none, has no image in the split, or an image or a label is missing, torn or out of range.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise InputError(f"{root}: must be the folder of a dataset (got {'a file' if root.exists() else 'nothing'})")
+    if (root / "dataset.json").is_file():
+        if not (root / "labels").is_dir():
+            raise InputError(f"{root}: a detector learns from its YOLO files: add yolo to output.formats of its scene")
+        classes = _class_names(_yaml(root / "data.yaml"), root / "data.yaml")
+        return _yolo(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
+    if (root / "data.yaml").is_file():
+        content = _yaml(root / "data.yaml")
+        base = content.get("path") or "."
+        entries = {name: content[name] for name in SPLITS if content.get(name)}
+        listed = {
+            name: [
+                f"{base}/{entry}" for entry in (entries[name] if isinstance(entries[name], list) else [entries[name]])
+            ]
+            for name in entries
+        }
+        return _yolo(root, "yolo", split, _class_names(content, root / "data.yaml"), listed, progress)
+    return _coco(root, split, progress)
+
+
+def in_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> LabelledSet:
+    """The set with its classes in another order, which is that of ``owner``.
+
+    Raises:
+        InputError: If it has not the same classes.
+    """
+    own, wanted = set(found.class_names), set(class_names)
+    if own != wanted:
+        more, less = sorted(own - wanted), sorted(wanted - own)
+        told = [f"it also has {', '.join(more)}"] * bool(more) + [f"it lacks {', '.join(less)}"] * bool(less)
+        raise InputError(f"{found.root}: its classes must be those of {owner}: {' and '.join(told)}")
+    if tuple(class_names) == found.class_names:
+        return found
+    place = [list(class_names).index(name) for name in found.class_names]
+    samples = tuple(
+        replace(sample, instances=tuple(replace(i, class_index=place[i.class_index]) for i in sample.instances))
+        for sample in found.samples
+    )
+    return replace(found, class_names=tuple(class_names), samples=samples)
+
+
+def check_masks(found: LabelledSet) -> None:
+    """Refuse a set of which something is labelled by a box alone.
+
+    Raises:
+        InputError: With the first image that does.
+    """
+    for sample in found.samples:
+        if not all(instance.has_mask for instance in sample.instances):
+            raise InputError(
+                f"{found.root}: masks are to be learnt, but {sample.name} is labelled by boxes alone: "
+                "choose a model of boxes, such as yolo11n"
+            )
+
+
+def encode(mask: BoolArray) -> dict[str, Any]:
+    """COCO's compressed run-length code of a mask (height, width)."""
+    return _text(coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8)))
+
+
+def _text(rle: dict[str, Any]) -> dict[str, Any]:
+    return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
+
+
+def _yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = YAML(typ="safe", pure=True).load(path)
+    except (OSError, ValueError, YAMLError) as error:
+        raise InputError(f"{path}: cannot be read as YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: must name the images and classes of a YOLO dataset")
+    return content
+
+
+def _class_names(content: dict[str, Any], path: Path) -> tuple[str, ...]:
+    names = content.get("names")
+    if isinstance(names, dict) and sorted(names) == list(range(len(names))):
+        names = [names[i] for i in range(len(names))]
+    if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
+        raise InputError(f"{path}: names must be different classes, numbered from 0 (got {str(names)[:80]})")
+    return tuple(map(str, names))
+
+
+def _yolo(
+    root: Path,
+    kind: Literal["mitsplat", "yolo"],
+    split: Split,
+    classes: tuple[str, ...],
+    listed: dict[str, list[str]],
+    progress: Progress | None,
+) -> LabelledSet:
+    wanted = [name for name in SPLITS if split in (name, "all") and name in listed]
+    images = list(dict.fromkeys(path for name in wanted for entry in listed[name] for path in _images(root, entry)))
+    if not images:
+        raise InputError(f"{root}: there is no image for {split}" + _has(_counted(root, listed)))
+    if not any(_label_of(image).is_file() for image in images):
+        raise InputError(f"{root}: there is no label of its images, such as {_label_of(images[0])}")
+
+    def read(image: Path) -> Sample:
+        width, height, content = _look(image)
+        label = _label_of(image)
+        if label.is_file():
+            text = label.read_text(encoding="utf-8-sig", errors="replace")
+        elif kind == "mitsplat":
+            raise InputError(f"{label}: is missing, though its image is there")
+        else:
+            text = ""
+        instances = tuple(_yolo_instances(text, label, len(classes), (width, height)))
+        return Sample(image, _below(root, image), width, height, instances, content.add_text(text))
+
+    return LabelledSet(root, kind, split, classes, _all(read, images, root, progress))
+
+
+def _counted(root: Path, listed: dict[str, list[str]]) -> dict[str, int]:
+    return {name: sum(len(_images(root, entry)) for entry in entries) for name, entries in listed.items()}
+
+
+def _has(counts: dict[str, int]) -> str:
+    shown = ", ".join(f"{count} for {name}" for name, count in counts.items() if count)
+    return f" (it has {shown})" if shown else ""
+
+
+def _images(root: Path, entry: str) -> list[Path]:
+    """Images of a folder or of a list, by name; none if it is missing."""
+    place = root / entry
+    if place.is_dir():
+        return sorted(path for path in place.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not place.is_file():
+        return []
+    lines = place.read_text(encoding="utf-8-sig").split("\n")
+    return [place.parent / line.strip() for line in lines if line.strip()]
+
+
+def _label_of(image: Path) -> Path:
+    """The label of an image, for which Ultralytics takes ``labels`` for the last ``images`` of its path."""
+    before, found, after = str(image).rpartition("/images/")
+    return Path(f"{before}/labels/{after}" if found else str(image)).with_suffix(".txt")
+
+
+def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, int]) -> Iterator[Instance]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        place = f"{path}:{number}"
+        try:
+            values = np.array(words, dtype=np.float64)
+        except ValueError as error:
+            raise InputError(f"{place}: must be numbers (got {line[:60]!r})") from error
+        if len(values) != 5 and (len(values) < 7 or len(values) % 2 == 0):
+            raise InputError(
+                f"{place}: must be a class and a box (5 numbers) or a polygon of 3 points or more (got {len(values)})"
+            )
+        if values[0] not in range(num_classes):
+            raise InputError(f"{place}: the class must be 0 to {num_classes - 1} (got {words[0]})")
+        points = values[1:].reshape(-1, 2)
+        if len(values) == 5:
+            (x, y), (w, h) = points
+            points = np.array([[x - w / 2, y - h / 2], [x + w / 2, y + h / 2]])
+        polygon = _clipped(points * size, size, place)
+        (x0, y0), (x1, y1) = polygon.min(axis=0), polygon.max(axis=0)
+        if not (x1 > x0 and y1 > y0):
+            raise InputError(f"{place}: must have a width and a height (got {line[:60]!r})")
+        box = float(x0), float(y0), float(x1), float(y1)
+        yield Instance(int(values[0]), box, None if len(values) == 5 else polygon)
+
+
+def _clipped(points: Float64Array, size: tuple[int, int], place: str) -> Float64Array:
+    """Points [px] as far as they are in the image, or almost."""
+    shares = points / size
+    if not (np.isfinite(shares).all() and shares.min() >= -_BEYOND and shares.max() <= 1 + _BEYOND):
+        worst = shares.ravel()[np.abs(np.nan_to_num(shares.ravel(), nan=np.inf) - 0.5).argmax()]
+        raise InputError(f"{place}: must lie in the image, at 0 to 1 of its width and height (got {worst:.4g})")
+    return np.clip(points, 0, size)
+
+
+def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
+    path = _coco_file(root, split)
+    content = _coco_content(path)
+    try:
+        categories = sorted(content["categories"], key=lambda category: category["id"])
+        names = tuple(str(category["name"]) for category in categories)
+        index = {category["id"]: i for i, category in enumerate(categories)}
+        by_image: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in content["images"]}
+        for annotation in content["annotations"]:
+            for key, known in (("image_id", by_image), ("category_id", index)):
+                if annotation[key] not in known:
+                    raise InputError(
+                        f"{path}: annotation {annotation.get('id')}: {key} must be in the file (got {annotation[key]})"
+                    )
+            by_image[annotation["image_id"]].append(annotation)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: is no COCO dataset of instances (key {error} is missing or wrong)") from error
+    if len(set(names)) < len(names) or len(by_image) < len(content["images"]):
+        raise InputError(f"{path}: ids of images and names of categories must differ")
+    if not by_image:
+        raise InputError(f"{root}: there is no image for {split}")
+    find = _finder(root, path)
+
+    def read(image: dict[str, Any]) -> Sample:
+        file = find(str(image.get("file_name")))
+        width, height, digest = _look(file)
+        if (image.get("width"), image.get("height")) != (width, height):
+            raise InputError(
+                f"{file}: must be as large as {path.name} says, {image.get('width')} x {image.get('height')} px, "
+                f"turned by its EXIF orientation (got {width} x {height})"
+            )
+        found = by_image[image["id"]]
+        instances = tuple(_coco_instance(a, index[a["category_id"]], (width, height), path) for a in found)
+        labels = json.dumps([names, found], sort_keys=True)
+        return Sample(file, _below(root, file), width, height, instances, digest.add_text(labels))
+
+    images = sorted(content["images"], key=lambda image: str(image.get("file_name")))
+    return LabelledSet(root, "coco", split, names, _all(read, images, root, progress))
+
+
+def _coco_file(root: Path, split: Split) -> Path:
+    files = [path for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))]
+    files = [path for path in files if {"images", "annotations", "categories"} <= _keys(path)]
+    if len(files) > 1:
+        files = [path for path in files if split in path.stem] or files
+    if len(files) == 1:
+        return files[0]
+    if files:
+        raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {_names(files)})")
+    raise InputError(
+        f"{root}: must be a dataset of mitsplat (dataset.json), a YOLO folder (data.yaml) or a COCO folder (a JSON "
+        "file with images, annotations and categories)"
+    )
+
+
+def _names(files: Iterable[Path]) -> str:
+    return ", ".join(path.name for path in files)
+
+
+def _keys(path: Path) -> set[str]:
+    content = _coco_content(path)
+    return set(content) if isinstance(content, dict) else set()
+
+
+def _coco_content(path: Path) -> Any:
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+
+
+def _finder(root: Path, listing: Path) -> Callable[[str], Path]:
+    """Finds the images that a file of annotations names."""
+    below: dict[str, list[Path]] = {}
+    for path in sorted(root.rglob("*")):
+        if path.suffix.lower() in SUFFIXES:
+            below.setdefault(path.name, []).append(path)
+
+    def find(name: str) -> Path:
+        if not is_inside(root, name):
+            raise InputError(f"{listing}: file_name must be of an image in {root} (got {name})")
+        for folder in (listing.parent, root):
+            if (folder / name).is_file():
+                return folder / name
+        found = [path for path in below.get(Path(name).name, ()) if f"/{path}".endswith(f"/{name}")]
+        if len(found) != 1:
+            raise InputError(f"{listing}: {name} must be one image in {root} (got {len(found)})")
+        return found[0]
+
+    return find
+
+
+def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int, int], path: Path) -> Instance:
+    place = f"{path}: annotation {annotation.get('id')}"
+    width, height = size
+    try:
+        x, y, w, h = (float(value) for value in annotation["bbox"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{place}: bbox must be x, y, width, height (got {annotation.get('bbox')})") from error
+    corners = _clipped(np.array([[x, y], [x + w, y + h]]), size, f"{place}: bbox")
+    (x0, y0), (x1, y1) = corners.tolist()
+    if not (x1 > x0 and y1 > y0):
+        raise InputError(f"{place}: bbox must have a width and a height (got {annotation['bbox']})")
+    rle, given = None, annotation.get("segmentation")
+    if given:
+        try:
+            if isinstance(given, list):
+                for part in given:
+                    if len(part) < 6 or len(part) % 2:
+                        raise InputError(
+                            f"{place}: segmentation must be polygons of 3 points or more (got {len(part)} numbers)"
+                        )
+                    _clipped(np.array(part, dtype=np.float64).reshape(-1, 2), size, f"{place}: segmentation")
+                rle = coco_mask.merge(coco_mask.frPyObjects(given, height, width))
+            elif list(given["size"]) != [height, width]:
+                raise InputError(f"{place}: segmentation must be of {height} x {width} px (got {given['size']})")
+            elif isinstance(given["counts"], list):
+                rle = coco_mask.frPyObjects(given, height, width)
+            else:
+                rle = {"size": [height, width], "counts": str(given["counts"]).encode("ascii")}
+            if int(coco_mask.area(rle)) == 0:
+                raise InputError(f"{place}: segmentation must cover a pixel")
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, IndexError, UnicodeError) as error:
+            raise InputError(f"{place}: segmentation must be polygons or run lengths ({error})") from error
+    crowd = bool(annotation.get("iscrowd"))
+    return Instance(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), crowd)
+
+
+class _Content:
+    """SHA-256 of an image, to which the text of its label is added."""
+
+    def __init__(self, data: bytes) -> None:
+        self._sha = ContentHash(data)
+
+    def add_text(self, text: str) -> str:
+        self._sha.add(text)
+        return self._sha.hexdigest()
+
+
+def _look(path: Path) -> tuple[int, int, _Content]:
+    """Width and height of an image as it is shown [px], and its content, which must be whole."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            image.verify()
+        with Image.open(io.BytesIO(data)) as image:
+            width, height = image.size
+            turned = image.getexif().get(_ORIENTATION) in _TURNED
+            jpeg = image.format in ("JPEG", "MPO")
+    except IMAGE_ERRORS as error:
+        raise InputError(f"{path}: cannot be read as an image ({error})") from error
+    if jpeg and not data.endswith(b"\xff\xd9"):
+        raise InputError(f"{path}: is torn: a JPEG file must end with its end marker")
+    if min(width, height) < _SMALLEST:
+        raise InputError(f"{path}: an image must have sides of {_SMALLEST} px or more (got {width} x {height})")
+    return (height, width, _Content(data)) if turned else (width, height, _Content(data))
+
+
+def _below(root: Path, path: Path) -> str:
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.as_posix()
+
+
+def _all(
+    read: Callable[[Any], Sample], images: Sequence[Any], root: Path, progress: Progress | None
+) -> tuple[Sample, ...]:
+    samples = []
+    for number, image in enumerate(images, start=1):
+        samples.append(read(image))
+        if progress is not None:
+            progress(number, len(images), f"reading {root.name}")
+    if not any(sample.instances for sample in samples):
+        raise InputError(f"{root}: nothing is labelled in its {len(samples)} images")
+    return tuple(samples)

@@ -1,0 +1,129 @@
+"""Average precision against cases that are counted by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsplat.detector.scores import Matches, average_precision, confuse, match_boxes
+from mitsplat.errors import InputError
+
+
+def truth(boxes: dict[int, list[tuple[int, list[float]]]]) -> dict[str, Any]:
+    """Boxes by image, each with its class; masks are the boxes."""
+    annotations = []
+    for image, shown in boxes.items():
+        for kind, (x, y, w, h) in shown:
+            corners = [x, y, x + w, y, x + w, y + h, x, y + h]
+            annotations.append(
+                {"id": len(annotations) + 1, "image_id": image, "category_id": kind, "bbox": [x, y, w, h],
+                 "area": w * h, "iscrowd": 0, "segmentation": [corners]}
+            )  # fmt: skip
+    images = [{"id": image, "width": 100, "height": 100, "file_name": f"{image}.png"} for image in boxes]
+    return {
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": 1, "name": "a"}, {"id": 2, "name": "b"}],
+    }
+
+
+def found(image: int, kind: int, box: list[float], score: float) -> dict[str, Any]:
+    return {"image_id": image, "category_id": kind, "bbox": box, "score": score}
+
+
+TRUE = truth({1: [(1, [0, 0, 10, 10]), (1, [50, 50, 20, 20])], 2: [(1, [0, 0, 10, 10])], 3: [(2, [10, 10, 30, 30])]})
+
+
+def test_average_precision_of_a_hand_made_case() -> None:
+    """Class a: 3 labelled; by score right, wrong, right: precisions 1, 1/2, 2/3 at recalls 1/3, 1/3, 2/3.
+
+    Of the 101 recalls, 0 to 0.33 (34) have precision 1, 0.34 to 0.66 (33) the 2/3, and the rest 0. Class b: one box
+    that overlaps by 0.6, so that it counts at thresholds 0.5, 0.55 and 0.6.
+    """
+    detections = [
+        found(1, 1, [0, 0, 10, 10], 0.9),
+        found(2, 1, [40, 40, 10, 10], 0.8),
+        found(2, 1, [0, 0, 10, 10], 0.7),
+        found(3, 2, [10, 10, 30, 18], 0.5),
+    ]
+    score = average_precision(TRUE, detections)
+    a = (34 + 33 * 2 / 3) / 101
+    assert score.classes["a"] == pytest.approx((a, a), abs=1e-9)
+    assert score.classes["b"] == pytest.approx((0.3, 1.0), abs=1e-9)
+    assert score.map50 == pytest.approx((a + 1) / 2, abs=1e-9)
+    assert score.map50_95 == pytest.approx((a + 0.3) / 2, abs=1e-9)
+    assert score.curves["a"][[0, 33, 34, 66, 67]] == pytest.approx([1, 1, 2 / 3, 2 / 3, 0], abs=1e-9)
+
+
+def test_all_found_is_one_and_nothing_found_is_zero() -> None:
+    perfect = [
+        found(a["image_id"], a["category_id"], a["bbox"], 0.5) | {"segmentation": a["segmentation"]}
+        for a in TRUE["annotations"]
+    ]
+    for kind in ("bbox", "segm"):
+        score = average_precision(TRUE, perfect, iou_type=kind)  # type: ignore[arg-type]
+        assert (score.map50_95, score.map50) == (1.0, 1.0)
+    assert average_precision(TRUE, []).map50_95 == 0.0
+
+
+def test_some_images_are_judged_as_if_there_were_no_others() -> None:
+    rng = np.random.default_rng(0)
+    images = {i: [(int(rng.integers(1, 3)), [*rng.integers(0, 60, 2).tolist(), 20, 20])] for i in range(1, 9)}
+    labelled = truth(images)
+    detections = [
+        found(i, kind, [x + float(rng.normal(0, 3)), y, w, h], float(rng.random()))
+        for i, [(kind, (x, y, w, h))] in images.items()
+        for _ in range(2)
+    ]
+    matches = Matches(labelled, detections)
+    for chosen in ([1, 2, 3], [8, 4], [5]):
+        alone = truth({i: images[i] for i in chosen})
+        expected = average_precision(alone, [d for d in detections if d["image_id"] in chosen])
+        assert matches.average_precision(chosen).classes == expected.classes
+        assert average_precision(labelled, detections, chosen).map50_95 == expected.map50_95
+    assert matches.average_precision().classes == average_precision(labelled, detections).classes
+    # An image that is drawn twice is as two images with the same in them.
+    twice = truth({1: images[1], 2: images[2], 3: images[1]})
+    drawn = [d | {"image_id": n} for n, i in ((1, 1), (2, 2), (3, 1)) for d in detections if d["image_id"] == i]
+    assert matches.average_precision([1, 2, 1]).classes == average_precision(twice, drawn).classes
+    # What was asked before is not changed by it.
+    assert (
+        matches.average_precision([1, 2, 3]).classes
+        == Matches(labelled, detections).average_precision([1, 2, 3]).classes
+    )
+
+
+def test_classes_without_a_label_do_not_count() -> None:
+    score = average_precision(TRUE, [found(3, 2, [10, 10, 30, 30], 0.9)], images=[3])
+    assert list(score.classes) == ["b"]
+    assert (*score.classes["b"], score.map50_95) == pytest.approx((1, 1, 1))
+
+
+def test_what_is_not_labelled_is_refused() -> None:
+    with pytest.raises(InputError, match="got image 9, class 1"):
+        average_precision(TRUE, [found(9, 1, [0, 0, 5, 5], 0.5)])
+    for images in ([], [7]):
+        with pytest.raises(InputError, match="images must be among those that are labelled"):
+            average_precision(TRUE, [], images)
+
+
+def test_the_confusion_matrix_counts_what_was_taken_for_what() -> None:
+    detections = [
+        found(1, 1, [0, 0, 10, 10], 0.9),  # right
+        found(1, 2, [51, 50, 20, 20], 0.6),  # another class
+        found(2, 1, [0, 0, 10, 10], 0.2),  # too low: missed
+        found(3, 2, [10, 10, 30, 30], 0.8),  # right
+        found(3, 1, [10, 10, 30, 29], 0.7),  # taken already: nothing
+    ]
+    confusion = confuse(TRUE, detections)
+    assert confusion.matrix.tolist() == [[1, 1, 1], [0, 1, 0], [1, 0, 0]]
+    assert confusion.errors == {1: (1, 0, 1, 0), 2: (0, 1, 0, 0), 3: (1, 0, 0, 1)}
+
+
+def test_boxes_that_were_taken_are_not_taken_again() -> None:
+    labelled = [[0.0, 0.0, 10.0, 10.0], [4.0, 0.0, 10.0, 10.0]]
+    assert match_boxes([[0, 0, 10, 10], [1, 0, 10, 10]], labelled) == {0: 0, 1: 1}
+    assert match_boxes([[0, 0, 10, 10], [0, 0, 10, 10]], labelled) == {0: 0}
+    assert match_boxes([], labelled) == match_boxes(labelled, []) == {}

@@ -1,0 +1,233 @@
+"""Labelled images as they are read from folders, and what is refused of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from pycocotools import mask as coco_mask
+
+from mitsplat.detector.sets import LabelledSet, check_masks, in_classes, read_set
+from mitsplat.detector.training import read_sets, write_data
+from mitsplat.errors import InputError
+from tests.detector.painted import CLASSES, HEIGHT, WIDTH, paint, write_coco, write_yolo
+
+
+def masks_of(found: LabelledSet) -> list[list[tuple[str, np.ndarray]]]:
+    return [
+        [(found.class_names[i.class_index], coco_mask.decode(i.encoded(s.width, s.height)) > 0) for i in s.instances]
+        for s in found.samples
+    ]
+
+
+@pytest.mark.parametrize("kind", ["mitsplat", "yolo", "polygons", "compressed", "lengths"])
+def test_masks_come_back_from_every_kind_of_folder(tmp_path: Path, kind: str) -> None:
+    if kind in ("mitsplat", "yolo"):
+        write_yolo(tmp_path, {"train": 4}, mitsplat=kind == "mitsplat")
+    else:
+        write_coco(tmp_path, 4, form=kind)
+    found = read_set(tmp_path, "train")
+    assert found.kind == (kind if kind in ("mitsplat", "yolo") else "coco")
+    assert [(s.width, s.height) for s in found.samples] == [(WIDTH, HEIGHT)] * 4
+    for seed, shown in enumerate(masks_of(found)):
+        _, truth = paint(seed)
+        assert [name for name, _ in shown] == [name for name, _ in truth]
+        for (_, mask), (_, expected) in zip(shown, truth, strict=True):
+            iou = np.count_nonzero(mask & expected) / np.count_nonzero(mask | expected)
+            assert iou > 0.98
+
+
+def test_a_split_is_what_was_asked_for(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 3, "val": 2, "test": 1})
+    assert [len(read_set(root, split).samples) for split in ("train", "val", "test", "all")] == [3, 2, 1, 6]  # type: ignore[arg-type]
+    alone = write_yolo(tmp_path / "mitsplat", {"train": 3}, mitsplat=True)
+    assert "val: images/train" in (alone / "data.yaml").read_text()  # for Ultralytics, which wants some
+    with pytest.raises(InputError, match=r"there is no image for val \(it has 3 for train\)"):
+        read_set(alone, "val")
+
+
+def test_a_list_of_images_and_a_path_are_followed(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path / "all", {"train": 3})
+    (root / "chosen.txt").write_text("./images/train/000001.png\n")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "data.yaml").write_text("path: ../all\ntrain: [chosen.txt]\nnames: [disc, box]\n")
+    assert [sample.path.name for sample in read_set(other, "train").samples] == ["000001.png"]
+
+
+def test_coco_files_are_chosen_by_split_and_images_found_below(tmp_path: Path) -> None:
+    root = write_coco(tmp_path, 3)
+    (root / "annotations").mkdir()
+    for split in ("train", "val"):
+        (root / f"annotations/instances_{split}.json").write_bytes((root / "labels.json").read_bytes())
+    (root / "labels.json").unlink()
+    assert len(read_set(root, "val").samples) == 3
+    with pytest.raises(InputError, match="must have test in its name"):
+        read_set(root, "test")
+
+
+def test_classes_are_matched_by_name(tmp_path: Path) -> None:
+    found = read_set(write_coco(tmp_path, 3), "train")
+    assert found.class_names == ("box", "disc")  # by the ids of the file
+    turned = in_classes(found, CLASSES, "out/cell")
+    assert turned.class_names == CLASSES
+    for sample, seed in zip(turned.samples, range(3), strict=True):
+        assert [CLASSES[i.class_index] for i in sample.instances] == [name for name, _ in paint(seed)[1]]
+    with pytest.raises(InputError, match="it also has box and it lacks gear, nut"):
+        in_classes(found, ("disc", "nut", "gear"), "out/cell")
+
+
+@pytest.mark.parametrize("boxes", [False, True])
+def test_what_is_written_for_ultralytics_is_what_was_read(tmp_path: Path, boxes: bool) -> None:
+    write_yolo(tmp_path / "a", {"train": 2}, mitsplat=True, boxes=boxes)
+    write_coco(tmp_path / "b", 2, first=50, form="compressed")
+    sets, real = read_sets([tmp_path / "a"], tmp_path / "b", masks=not boxes)
+    assert real is not None
+    listing = write_data([*sets, real], tmp_path / "data")
+    images = [Path(line) for line in listing.read_text().splitlines()]
+    assert images == sorted(images) and len(images) == 4
+    (tmp_path / "data/data.yaml").write_text("train: images.txt\nnames: [disc, box]\n")
+    again = read_set(tmp_path / "data", "train")
+    for sample, seed in zip(again.samples, (0, 1, 50, 51), strict=True):
+        image, truth = paint(seed)
+        assert np.array_equal(cv2.imread(str(sample.path)), image)
+        for instance, (name, mask) in zip(sample.instances, truth, strict=True):
+            assert CLASSES[instance.class_index] == name
+            x0, y0, w, h = coco_mask.toBbox(coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8)))
+            assert np.abs(np.subtract(instance.box, (x0, y0, x0 + w, y0 + h))).max() < 0.05
+            assert instance.has_mask != boxes
+
+
+def test_masks_are_not_learnt_from_boxes(tmp_path: Path) -> None:
+    found = read_set(write_yolo(tmp_path, {"train": 2}, boxes=True), "train")
+    with pytest.raises(InputError, match=r"images/train/000000.png is labelled by boxes alone: .* such as yolo11n"):
+        check_masks(found)
+    assert check_masks(read_set(write_yolo(tmp_path / "b", {"train": 2}), "train")) is None
+
+
+def test_crowds_are_not_learnt(tmp_path: Path) -> None:
+    found = read_set(write_coco(tmp_path / "c", 1, form="compressed", crowd=True), "train")
+    write_data([found], tmp_path / "data")
+    assert (tmp_path / "data/labels/0000000.txt").read_text() == ""
+
+
+def test_a_turned_photograph_has_the_size_that_is_seen(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 1})
+    exif = Image.Exif()
+    exif[274] = 6
+    Image.fromarray(paint(0)[0]).save(root / "images/train/000000.jpg", exif=exif)
+    (root / "images/train/000000.png").unlink()
+    (sample,) = read_set(root, "train").samples
+    assert (sample.width, sample.height) == (HEIGHT, WIDTH) == cv2.imread(str(sample.path)).shape[1::-1]
+
+
+def _line(text: str) -> Callable[[Path], object]:
+    return lambda root: (root / "labels/train/000001.txt").write_text(text)
+
+
+YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "class": (_line("2 0.1 0.1 0.2 0.1 0.2 0.2\n"), r"000001.txt:1: the class must be 0 to 1 \(got 2\)"),
+    "fraction": (_line("0.5 0.1 0.1 0.2 0.1 0.2 0.2\n"), r"the class must be 0 to 1 \(got 0.5\)"),
+    "beyond": (_line("0 0.1 0.1 0.2 0.1 1.2 0.2\n"), r"must lie in the image, .* \(got 1.2\)"),
+    "nan": (_line("0 0.1 0.1 0.2 nan 0.2 0.2\n"), r"must lie in the image, .* \(got nan\)"),
+    "torn": (_line("0 0.1 0.1 0.2 0.1 0.2\n"), r"000001.txt:1: must be a class and a box .* \(got 6\)"),
+    "word": (_line("0 0.1 0.1 o.2 0.1 0.2 0.2\n"), r"000001.txt:1: must be numbers"),
+    "flat": (_line("0 0.1 0.1 0.2 0.1 0.3 0.1\n"), r"must have a width and a height"),
+    "image": (
+        lambda root: (root / "images/train/000001.png").write_bytes(
+            (root / "images/train/000001.png").read_bytes()[:-20]
+        ),
+        r"000001.png: cannot be read as an image",
+    ),
+    "jpeg": (
+        lambda root: (root / "images/train/000009.jpg").write_bytes(
+            cv2.imencode(".jpg", paint(1)[0])[1].tobytes()[:-9]
+        ),
+        r"000009.jpg: is torn",
+    ),
+    "labels": (lambda root: [path.unlink() for path in root.glob("labels/*/*")], "there is no label of its images"),
+    "names": (lambda root: (root / "data.yaml").write_text("train: images/train\nnames: [a, a]\n"), "names must be"),
+    "yaml": (lambda root: (root / "data.yaml").write_text("train: [\n"), "data.yaml: cannot be read as YAML"),
+    "nothing": (lambda root: [path.write_text("") for path in root.glob("labels/*/*")], "nothing is labelled"),
+}
+
+
+@pytest.mark.parametrize("fault", YOLO_FAULTS)
+def test_what_is_wrong_with_a_yolo_folder_is_one_sentence(tmp_path: Path, fault: str) -> None:
+    root = write_yolo(tmp_path, {"train": 2})
+    spoil, message = YOLO_FAULTS[fault]
+    spoil(root)
+    with pytest.raises(InputError, match=message) as told:
+        read_set(root, "train")
+    assert "\n" not in str(told.value)
+
+
+def test_a_dataset_that_lacks_a_label_is_refused(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 2}, mitsplat=True)
+    (root / "labels/train/000001.txt").unlink()
+    with pytest.raises(InputError, match=r"000001\.txt: is missing, though its image is there"):
+        read_set(root, "train")
+    (root / "labels/train/000000.txt").unlink()
+    (root / "labels/train").rmdir()
+    (root / "labels").rmdir()
+    with pytest.raises(InputError, match=r"add yolo to output\.formats"):
+        read_set(root, "train")
+
+
+COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore[type-arg]
+    "class": (lambda c: c["annotations"][0].update(category_id=9), r"category_id must be in the file \(got 9\)"),
+    "image": (lambda c: c["annotations"][0].update(image_id=9), r"image_id must be in the file \(got 9\)"),
+    "missing": (lambda c: c["images"][0].update(file_name="none.png"), r"none.png must be one image in .* \(got 0\)"),
+    "outside": (lambda c: c["images"][0].update(file_name="../../x.png"), "file_name must be of an image in"),
+    "size": (lambda c: c["images"][0].update(width=64, height=96), r"as large as labels.json says, 64 x 96 px"),
+    "beyond": (lambda c: c["annotations"][0].update(bbox=[0, 0, 200, 10]), r"bbox: must lie in the image"),
+    "bbox": (lambda c: c["annotations"][0].update(bbox=[0, 0, 10]), r"bbox must be x, y, width, height"),
+    "empty": (lambda c: c["annotations"][0].update(bbox=[0, 0, 0, 10]), r"bbox must have a width and a height"),
+    "polygon": (
+        lambda c: c["annotations"][0].update(segmentation=[[1, 2]]),
+        "segmentation must be polygons of 3 points",
+    ),
+    "rle": (
+        lambda c: c["annotations"][0].update(segmentation={"size": [9, 9], "counts": "1"}),
+        "segmentation must be of 64 x 96 px",
+    ),
+    "key": (lambda c: c["annotations"][0].pop("image_id"), "key 'image_id' is missing"),
+    "names": (lambda c: c["categories"][0].update(name="box"), "names of categories must differ"),
+    "nothing": (lambda c: c.update(images=[], annotations=[]), "there is no image"),
+}
+
+
+@pytest.mark.parametrize("fault", COCO_FAULTS)
+def test_what_is_wrong_with_a_coco_folder_is_one_sentence(tmp_path: Path, fault: str) -> None:
+    root = write_coco(tmp_path, 2)
+    content = json.loads((root / "labels.json").read_text())
+    spoil, message = COCO_FAULTS[fault]
+    spoil(content)
+    (root / "labels.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message) as told:
+        read_set(root, "train")
+    assert "\n" not in str(told.value)
+
+
+def test_a_folder_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"must be a dataset of mitsplat \(dataset.json\), a YOLO folder"):
+        read_set(tmp_path, "train")
+    with pytest.raises(InputError, match=r"must be the folder of a dataset \(got nothing\)"):
+        read_set(tmp_path / "none", "train")
+
+
+def test_a_digest_tells_of_every_change(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 2})
+    first = read_set(root, "train").described()
+    assert first == read_set(root, "train").described()
+    assert first["images"] == 2 and sum(first["instances"].values()) == sum(len(paint(seed)[1]) for seed in (0, 1))
+    label = root / "labels/train/000001.txt"
+    label.write_text(
+        label.read_text().replace("0 ", "1 ", 1) if label.read_text()[0] == "0" else "0" + label.read_text()[1:]
+    )
+    assert read_set(root, "train").described()["digest"] != first["digest"]

@@ -133,14 +133,22 @@ def all_clearances(
 def standoff(surface: Surface, pieces: Sequence[trimesh.Trimesh]) -> float:
     """How far convex pieces stand off the mesh that they stand for [m]: the widest gap that they can leave at rest.
 
-    Measured at their vertices, edges and 4000 points of their faces. Which side of a mesh a point is on costs ten times
-    what its distance does: the farthest points are asked first, and none after the first that is outside.
+    Measured at their vertices, edges and 4000 points of their faces.
     """
     samples, _ = trimesh.sample.sample_surface(join_meshes(pieces), _SAMPLES, seed=0)
-    points = np.concatenate([*(contact_points(piece) for piece in pieces), samples])
-    farthest_first = np.argsort(-surface.nearest(points)[2], kind="stable")
-    for start in range(0, len(points), _BATCH):
-        distance = float(surface.signed_distances(points[farthest_first[start : start + _BATCH]]).max())
+    return farthest_outside(surface, np.concatenate([*(contact_points(piece) for piece in pieces), samples]))
+
+
+def farthest_outside(surface: Surface, points: Float64Array, *, least: float = 0.0, batch: int = _BATCH) -> float:
+    """Distance from a mesh of the farthest of points (N, 3) that are outside of it [m]; 0 if none is by ``least``.
+
+    Which side of a mesh a point is on costs ten times what its distance does: the farthest points are asked first, and
+    none after the first ``batch`` of which one is outside.
+    """
+    distances = surface.nearest(points)[2]
+    farthest_first = np.argsort(-distances, kind="stable")[: int((distances >= least).sum())]
+    for start in range(0, len(farthest_first), batch):
+        distance = float(surface.signed_distances(points[farthest_first[start : start + batch]]).max())
         if distance > 0:
             return distance
     return 0.0

@@ -31,8 +31,8 @@ from trimesh.creation import annulus, box, cylinder, torus
 
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
+from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
-from mitsplat.mesh import convex_pieces
 from mitsplat.physics.settle import settle_layout, settle_layouts, warp_settings
 from mitsplat.scene.contents import draw_objects
 from mitsplat.scene.layout import Layout

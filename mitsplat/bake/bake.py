@@ -28,9 +28,9 @@ from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
 from mitsplat.camera import Camera, spiral
 from mitsplat.colour import encode_srgb
+from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
-from mitsplat.mesh import convex_pieces
 from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant
 from mitsplat.spec.lights import LightSpec

@@ -14,8 +14,9 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
+from mitsplat.decomposition import GAP_SHARE, MOST_PIECES, WIDEST_GAP, convex_pieces
 from mitsplat.errors import InputError
-from mitsplat.mesh import convex_pieces, mass_properties, prepare_mesh
+from mitsplat.mesh import mass_properties, prepare_mesh
 from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.placement import Item, draw_poses
@@ -29,8 +30,8 @@ from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
-# What may be wrong with a layout at rest [m]; gaps also as a share of an object's size where that is more.
-_DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _WIDEST_GAP, _SHARE = 3e-4, 5e-4, 1e-3, 0.005
+# What may be wrong with a layout at rest [m], besides gaps.
+_DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT = 3e-4, 5e-4
 _DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scene file says so [m]
 _NEAREST = 5e-4  # what is scattered is farther apart than this [m]
 _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
@@ -239,7 +240,7 @@ class Drop:
             if pieces:
                 stands_off = standoff(surface, pieces)
             else:
-                limit = max(_WIDEST_GAP, _SHARE * float(mesh.extents.max()))
+                limit = max(WIDEST_GAP, GAP_SHARE * float(mesh.extents.max()))
                 for threshold in _THRESHOLDS:
                     pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
                     stands_off = standoff(surface, pieces)
@@ -361,7 +362,7 @@ class Drop:
         """How a layout at rest is not arranged as asked for, or empty."""
         laid = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
-            if pair.second.name.startswith(ENCLOSURE) and pair.distance < _WIDEST_GAP:
+            if pair.second.name.startswith(ENCLOSURE) and pair.distance < WIDEST_GAP:
                 return f"{pair.first.name} rests against the enclosure"
         for pair in clearances:
             if laid[pair.first] == "scatter" and pair.second not in obstacles and pair.distance < _NEAREST:
@@ -400,7 +401,7 @@ def _fault(
         if -pair.distance > (_DEEPEST_IN_COLLIDER if pair.second in obstacles else _DEEPEST_IN_OBJECT):
             return f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
     for item, gap in gaps.items():
-        if gap > max(_WIDEST_GAP, _SHARE * item.size):
+        if gap > max(WIDEST_GAP, GAP_SHARE * item.size):
             return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest"
     return ""
 
@@ -413,4 +414,4 @@ def _pieces(
     mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _THRESHOLDS[0]
 ) -> tuple[trimesh.Trimesh, ...]:
     progress(f"convex pieces of {name}")
-    return convex_pieces(mesh, threshold=threshold)
+    return convex_pieces(mesh, threshold=threshold, most=round(MOST_PIECES * _THRESHOLDS[0] / threshold))

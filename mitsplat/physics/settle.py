@@ -29,6 +29,7 @@ PACKAGE = Path(__file__).parents[1]
 
 _OWN = ("contacts", "drop", "friction", "placement", "rest", "worlds")
 MODULES = (
+    "decomposition",
     "mesh",
     "mesh_distance",
     *(f"physics.{name}" for name in _OWN),

@@ -13,8 +13,8 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
+from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
-from mitsplat.mesh import convex_pieces
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points

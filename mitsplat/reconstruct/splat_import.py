@@ -19,8 +19,8 @@ import trimesh
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera, spiral
+from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
-from mitsplat.mesh import convex_pieces
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import AssetView, Thresholds, iou, is_closed, show_asset
 from mitsplat.reconstruct.registration import measure_offset, surface_points

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from mitsplat.asset import Asset
-from mitsplat.mesh import convex_pieces
+from mitsplat.decomposition import convex_pieces
 from mitsplat.splats import Splats
 
 OUT = Path(__file__).resolve().parents[1] / "assets" / "real"

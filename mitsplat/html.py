@@ -114,7 +114,9 @@ figcaption { font-size: .9rem; padding: .35rem 0; }
 .bar { fill: var(--bar); }
 .axis { stroke: var(--line); }
 .curve { fill: none; stroke: var(--bar); stroke-linejoin: round; }
+.matrix { overflow-x: auto; }
 .matrix td { text-align: right; padding: .2rem .6rem; }
+.matrix thead th + th { writing-mode: vertical-rl; text-align: end; padding: .3rem .4rem; }
 .pair { display: grid; gap: .6rem; grid-template-columns: 1fr 1fr; }
 .frame { fill: none; stroke: var(--line); }
 summary { cursor: pointer; }

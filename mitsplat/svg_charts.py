@@ -81,7 +81,7 @@ def curves(
         ("0", _LEFT - 5, base, "end"),
         ("1", _LEFT - 5, _TOP + 10, "end"),
         (axes[0], _LEFT + width / 2, base + 28, "middle"),
-        (axes[1], _LEFT + 8, _TOP + 16, "start"),
+        (axes[1], _LEFT + 8, base - 8, "start"),
     ):
         marks.append(f'<text x="{left:.1f}" y="{top:.1f}" text-anchor="{anchor}">{html.escape(text)}</text>')
     return _figure(caption, _svg(caption, base + 34, marks), list(numbers.items()))

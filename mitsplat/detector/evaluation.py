@@ -138,6 +138,7 @@ def detect(
             max_det=MOST_DETECTIONS,
             imgsz=size,
             device=device,
+            rect=False,
             retina_masks=True,
             verbose=False,
         )

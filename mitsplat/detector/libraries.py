@@ -167,4 +167,4 @@ def load_weights(path: Path) -> Any:
     try:
         return load_checkpoint(path)[0]
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, pickle.UnpicklingError) as error:
-        raise InputError(f"{path}: cannot be read as weights of Ultralytics ({str(error).splitlines()[0]})") from error
+        raise InputError(f"{path}: cannot be read as weights of Ultralytics ({type(error).__name__})") from error

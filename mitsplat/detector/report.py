@@ -88,7 +88,7 @@ def _classes(scores: Mapping[str, AveragePrecision], results: Mapping[str, Any])
 
 def _charts(scores: Mapping[str, AveragePrecision]) -> str:
     recalls = np.linspace(0, 1, 101)
-    charts = []
+    charts, means = [], []
     for kind, score in scores.items():
         lines = {"mean of the classes": np.mean(list(score.curves.values()), axis=0)} if score.curves else {}
         lines |= score.curves
@@ -100,10 +100,8 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
                 {f"{name}, at recall 0.5 and 0.9": f"{line[50]:.3f}, {line[90]:.3f}" for name, line in lines.items()},
             )
         )
-        charts.append(
-            bars(f"AP50-95 of {_WORDS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()})
-        )
-    return _section("charts", "Charts", f'<div class="charts">{"".join(charts)}</div>')
+        means.append(bars(f"AP50-95 of {_WORDS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()}))
+    return _section("charts", "Charts", f'<div class="charts">{"".join(charts + means)}</div>')
 
 
 def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
@@ -121,8 +119,8 @@ def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
     text = (
         f"What was taken for what, at a score of {CONFIDENCE} or more where boxes overlap by an IoU of {IOU} or more."
     )
-    table = f'<table class="matrix"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
-    return _section("confusion", "Confusion", f"<p>{text}</p>{table}")
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return _section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
 
 
 def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[Detection], confusion: Confusion) -> str:

@@ -324,7 +324,9 @@ def _kept(out: Path, record: dict[str, Any]) -> Run | None:
     if kept is None:
         return None
     was, now = kept.record["settings"], record["settings"]
-    told = [f"{name} {was.get(name)} (got {value})" for name, value in now.items() if was.get(name) != value]
+    told = [
+        f"{name} {str(was.get(name))[:20]} (got {str(now[name])[:20]})" for name in now if was.get(name) != now[name]
+    ]
     told += [f"other images of {name}" for name in _SETS if _digests(kept.record.get(name)) != _digests(record[name])]
     if told:
         raise InputError(f"{out}: was begun with {', '.join(told)}: give another folder, or --overwrite")

@@ -23,6 +23,7 @@ hide_full_gpus()
 _HOME = {
     "Asset": "asset",
     "Camera": "camera",
+    "DetectionMatches": "detector.scores",
     "Frame": "frames.frame",
     "InputError": "errors",
     "Labels": "labels.labels",
@@ -33,7 +34,10 @@ _HOME = {
     "Scene": "scene.scene",
     "SceneSpec": "spec.spec",
     "Splats": "splats",
+    "TrainSettings": "detector.training",
+    "average_precision": "detector.scores",
     "bake_asset": "bake.bake",
+    "evaluate_detector": "detector.evaluation",
     "load_scene": "scene.scene",
     "make_scene": "scene.scene",
     "remake_frame": "dataset.remake",
@@ -41,6 +45,7 @@ _HOME = {
     "render_frames": "frames.sequence",
     "render_splats": "render.layers",
     "settle_layout": "physics.settle",
+    "train_detector": "detector.training",
     "use_device": "device",
     "write_dataset": "dataset.write",
     "write_frames": "dataset.given_frames",
@@ -55,6 +60,11 @@ if TYPE_CHECKING:
     from mitsplat.dataset.given_frames import write_frames as write_frames
     from mitsplat.dataset.remake import remake_frame as remake_frame
     from mitsplat.dataset.write import write_dataset as write_dataset
+    from mitsplat.detector.evaluation import evaluate_detector as evaluate_detector
+    from mitsplat.detector.scores import DetectionMatches as DetectionMatches
+    from mitsplat.detector.scores import average_precision as average_precision
+    from mitsplat.detector.training import TrainSettings as TrainSettings
+    from mitsplat.detector.training import train_detector as train_detector
     from mitsplat.device import use_device as use_device
     from mitsplat.errors import InputError as InputError
     from mitsplat.frames.frame import Frame as Frame

@@ -24,7 +24,20 @@ from sphinx.domains.python import PyObject
 
 ROOT = Path(__file__).parents[2]
 WINGS = (
-    *("spec", "scene", "physics", "render", "labels", "frames", "formats", "dataset", "engine", "audit", "report"),
+    *(
+        "spec",
+        "scene",
+        "physics",
+        "render",
+        "labels",
+        "frames",
+        "formats",
+        "dataset",
+        "engine",
+        "audit",
+        "report",
+        "detector",
+    ),
     *("capture", "fit", "reconstruct", "bake", "checks"),
 )
 

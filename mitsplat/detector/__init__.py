@@ -8,15 +8,15 @@ Training and predicting need the extra ``train``; judging detections that are ke
 from __future__ import annotations
 
 from mitsplat.detector.evaluation import Evaluation, evaluate_detector
-from mitsplat.detector.scores import AveragePrecision, Matches, average_precision
+from mitsplat.detector.scores import AveragePrecision, DetectionMatches, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set
 from mitsplat.detector.training import Run, TrainSettings, open_run, train_detector
 
 __all__ = [
     "AveragePrecision",
+    "DetectionMatches",
     "Evaluation",
     "LabelledSet",
-    "Matches",
     "Run",
     "TrainSettings",
     "average_precision",

@@ -24,7 +24,15 @@ import numpy as np
 from mitsplat.content_hash import file_hash
 from mitsplat.detector.libraries import check_device, check_torchvision, load_libraries, torch_device, versions
 from mitsplat.detector.report import make_report
-from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePrecision, Detection, Matches, confuse
+from mitsplat.detector.scores import (
+    CONFIDENCE,
+    IOU,
+    MOST_DETECTIONS,
+    AveragePrecision,
+    Detection,
+    DetectionMatches,
+    confuse,
+)
 from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_set
 from mitsplat.detector.training import open_run
 from mitsplat.errors import InputError
@@ -203,9 +211,9 @@ def write_evaluation(
         about: What else ``results.json`` is to say: how the detections came to be.
     """
     out, truth = Path(out), truth_of(found, masks=masks)
-    scores = {"box": Matches(truth, detections, "bbox").average_precision()}
+    scores = {"box": DetectionMatches(truth, detections, "bbox").average_precision()}
     if masks:
-        scores["mask"] = Matches(truth, detections, "segm").average_precision()
+        scores["mask"] = DetectionMatches(truth, detections, "segm").average_precision()
     confusion = confuse(truth, detections)
     results = {
         **about,

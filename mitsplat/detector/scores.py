@@ -49,7 +49,7 @@ class AveragePrecision:
     curves: dict[str, Float64Array]
 
 
-class Matches:
+class DetectionMatches:
     """Detections matched to what is labelled in each image, once; any sample of the images is judged from it.
 
     Args:
@@ -114,7 +114,7 @@ def average_precision(
     images: Sequence[int] | None = None,
     iou_type: IouType = "bbox",
 ) -> AveragePrecision:
-    """Average precision of stored detections on some of the images; see :class:`Matches` for many such samples.
+    """Average precision of stored detections on some of the images; for many such draws :class:`DetectionMatches`.
 
     Args:
         truth: What is labelled.
@@ -122,7 +122,7 @@ def average_precision(
         images: Ids of images, which may be named twice; all if None.
         iou_type: Whether boxes or masks must overlap.
     """
-    return Matches(truth, detections, iou_type).average_precision(images)
+    return DetectionMatches(truth, detections, iou_type).average_precision(images)
 
 
 @dataclass(frozen=True, eq=False)

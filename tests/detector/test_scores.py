@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.detector.scores import Matches, average_precision, confuse, match_boxes
+from mitsplat.detector.scores import DetectionMatches, average_precision, confuse, match_boxes
 from mitsplat.errors import InputError
 
 
@@ -77,7 +77,7 @@ def test_some_images_are_judged_as_if_there_were_no_others() -> None:
         for i, [(kind, (x, y, w, h))] in images.items()
         for _ in range(2)
     ]
-    matches = Matches(labelled, detections)
+    matches = DetectionMatches(labelled, detections)
     for chosen in ([1, 2, 3], [8, 4], [5]):
         alone = truth({i: images[i] for i in chosen})
         expected = average_precision(alone, [d for d in detections if d["image_id"] in chosen])
@@ -91,7 +91,7 @@ def test_some_images_are_judged_as_if_there_were_no_others() -> None:
     # What was asked before is not changed by it.
     assert (
         matches.average_precision([1, 2, 3]).classes
-        == Matches(labelled, detections).average_precision([1, 2, 3]).classes
+        == DetectionMatches(labelled, detections).average_precision([1, 2, 3]).classes
     )
 
 

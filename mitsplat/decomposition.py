@@ -16,6 +16,7 @@ import coacd
 import manifold3d
 import numpy as np
 import trimesh
+from scipy.spatial import ConvexHull
 
 from mitsplat.arrays import Float64Array
 from mitsplat.cache import cache_folder, keep_file
@@ -44,10 +45,10 @@ _RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
 _ITERATIONS, _SCAN_ITERATIONS = 150, 20
 # Places where a piece may be cut, along each direction.
 _PLACES = 15
-# Pieces into which a solid is cut before some are joined again, for each that may be left.
-_OVERSHOOT = 1.5
-# Share of a limit that is aimed for, as gaps are measured at points.
-_MARGIN, _SAMPLES, _BATCH = 0.75, 1000, 32
+# Pieces into which a solid is cut before some are joined again, for each that may be left; pairs tried at once.
+_OVERSHOOT, _LIKELY = 2, 32
+# Share of a limit that is aimed for, as gaps are measured at points, and at most how many of them on faces.
+_MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
 
 
 def convex_pieces(
@@ -174,6 +175,7 @@ class _Cutter:
         self._solid = _manifold(thin_solid(part))
         self._surface, self._limit = Surface(part), _MARGIN * limit
         self._least = 1e-6 * self._solid.hull().volume()  # slivers carry no contact that their neighbours lack
+        self._points = _mesh(self._solid).vertices
         self._touching = 1e-4 * part.scale
 
     def pieces(self, most: int) -> list[trimesh.Trimesh]:
@@ -185,7 +187,7 @@ class _Cutter:
             if pieces[worst].gap <= self._limit:
                 break
             piece = pieces.pop(worst)
-            cut = [self._piece(body) for body in _best_cut(piece.body) if body.volume() > self._least]
+            cut = [self._piece(body) for body in _best_cut(piece.body, self._limit) if body.volume() > self._least]
             if len(cut) > 1:
                 pieces += cut
             else:
@@ -199,13 +201,22 @@ class _Cutter:
     def _gap(self, hull: manifold3d.Manifold) -> float:
         """How far a hull stands off the solid [m], or 0 if that is less than the limit."""
         mesh = _mesh(hull)
-        points = np.concatenate([contact_points(mesh), mesh.sample(_SAMPLES, seed=0)])
+        low, high = mesh.bounds
+        inside = self._points[((self._points > low) & (self._points < high)).all(axis=1)]
+        normals, offsets = np.split(ConvexHull(mesh.vertices).equations, [3], axis=1)
+        depths = -(inside @ normals.T + offsets.T)
+        face = depths.argmin(axis=1)
+        depth = depths[np.arange(len(inside)), face][:, None]
+        above = (inside + depth * normals[face])[depth[:, 0] > self._limit]
+        samples = min(_SAMPLES, round(float(mesh.area) / (3 * self._limit) ** 2))
+        points = np.concatenate([above, contact_points(mesh), mesh.sample(samples, seed=0)])
         return farthest_outside(self._surface, points, least=self._limit, batch=_BATCH)
 
     def _joined(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
         """Hulls of one or more pieces: joined where that stands off no more than it may, or if there are too many."""
         hulls: dict[int, manifold3d.Manifold] = {}
         joints: dict[tuple[int, int], tuple[float, manifold3d.Manifold]] = {}
+        gaps: dict[tuple[int, int], float] = {}
 
         def add(new: int, hull: manifold3d.Manifold) -> None:
             low, high = np.reshape(hull.bounding_box(), (2, 3)) + self._touching * np.array([[-1.0], [1.0]])
@@ -213,17 +224,20 @@ class _Cutter:
                 corners = np.reshape(other.bounding_box(), (2, 3))
                 if (low <= corners[1]).all() and (corners[0] <= high).all():
                     joint = manifold3d.Manifold.batch_hull([other, hull])
-                    joints[old, new] = self._gap(joint), joint
+                    joints[old, new] = joint.volume() - other.volume() - hull.volume(), joint
             hulls[new] = hull
 
         numbers = count()
         for piece in pieces:
             add(next(numbers), piece.hull)
         while joints:
-            pair = min(joints, key=lambda pair: (joints[pair][0], pair))
-            gap, joint = joints[pair]
-            if gap > self._limit and len(hulls) <= most:
+            # Gaps take long to measure: only of those that add least empty space.
+            likely = sorted(joints, key=lambda pair: (joints[pair][0], pair))[:_LIKELY]
+            gaps |= {pair: self._gap(joints[pair][1]) for pair in likely if pair not in gaps}
+            pair = min(likely, key=lambda pair: (gaps[pair], pair))
+            if gaps[pair] > self._limit and len(hulls) <= most:
                 break
+            joint = joints[pair][1]
             joints = {other: found for other, found in joints.items() if not {*pair} & {*other}}
             for number in pair:
                 del hulls[number]
@@ -231,27 +245,34 @@ class _Cutter:
         return list(hulls.values())
 
 
-def _best_cut(body: manifold3d.Manifold) -> list[manifold3d.Manifold]:
-    """Connected parts of a body, on both sides of the plane that leaves least in hulls; itself where none helps."""
+def _best_cut(body: manifold3d.Manifold, thinnest: float) -> list[manifold3d.Manifold]:
+    """Connected parts of a body, on both sides of the plane that leaves least in hulls; itself where none helps.
+
+    Args:
+        body: What to cut.
+        thinnest: Distance of the plane from where the body ends [m].
+    """
     mesh = _mesh(body)
     _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
-    best, plane = np.inf, None
+    best, plane = np.inf, (np.zeros(3), 0.0)
 
     def look(normal: Float64Array, low: float, high: float) -> None:
         nonlocal best, plane
         heights = mesh.vertices @ normal
-        for offset in np.linspace(low, high, _PLACES + 2)[1:-1]:
+        low, high = max(low, float(heights.min()) + thinnest), min(high, float(heights.max()) - thinnest)
+        for offset in np.linspace(low, high, _PLACES) if low < high else ():
             emptiness = _emptiness(mesh, heights - offset, offset * normal)
             if emptiness < best:
-                best, plane = emptiness, (normal, float(offset), (high - low) / (_PLACES + 1))
+                best, plane = emptiness, (normal, float(offset))
 
     for normal in (*np.eye(3), *principal.T):
-        look(normal, (mesh.vertices @ normal).min(), (mesh.vertices @ normal).max())
-    if plane is None:
+        look(normal, -np.inf, np.inf)
+    if best == np.inf:
         return [body]
-    normal, offset, step = plane
+    normal, offset = plane
+    step = float(np.ptp(mesh.vertices @ normal)) / _PLACES
     look(normal, offset - step, offset + step)
-    return [part for side in body.split_by_plane(*plane[:2]) for part in side.decompose()]
+    return [part for side in body.split_by_plane(*plane) for part in side.decompose()]
 
 
 def _emptiness(mesh: trimesh.Trimesh, heights: Float64Array, origin: Float64Array) -> float:

@@ -179,3 +179,13 @@ def test_a_scan_is_thinned_to_5000_faces_unless_that_moves_its_surface():
     kept = thin_solid(trimesh.Trimesh(rough, ball.faces, process=False))
     assert len(kept.faces) > 5000
     assert np.abs(Surface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
+
+
+def test_a_small_dent_of_a_large_face_is_not_overlooked():
+    plate, drill = trimesh.creation.box((0.16, 0.12, 0.012)), trimesh.creation.cylinder(0.004, 0.008, sections=32)
+    drill.apply_translation((0.031, 0.017, 0.006))
+    dented = trimesh.boolean.difference([plate.subdivide().subdivide().subdivide(), drill]).subdivide().subdivide()
+    assert len(dented.faces) > 3000
+    pieces = convex_pieces(dented)
+    assert len(pieces) > 1
+    assert standoff(Surface(dented), pieces) < WIDEST_GAP

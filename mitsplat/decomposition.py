@@ -28,7 +28,7 @@ _logger = logging.getLogger(__name__)
 
 MOST_PIECES = 32
 # Gaps between pieces and the mesh that layouts bear [m], or as a share of the size where that is more.
-WIDEST_GAP, GAP_SHARE = 1e-3, 0.005
+_WIDEST_GAP, _GAP_SHARE = 1e-3, 0.005
 _THRESHOLD = 0.02
 # A solid that fills this share of its hull is its hull: what it leaves out is thinner than physics resolves.
 _CONVEX = 0.9995
@@ -49,6 +49,11 @@ _PLACES = 15
 _OVERSHOOT, _LIKELY = 2, 32
 # Share of a limit that is aimed for, as gaps are measured at points, and at most how many of them on faces.
 _MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
+
+
+def widest_gap(size: float) -> float:
+    """How far an object of a longest extent [m] may be from what it rests on, and its pieces from its mesh [m]."""
+    return max(_WIDEST_GAP, _GAP_SHARE * size)
 
 
 def convex_pieces(
@@ -104,7 +109,7 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
         return [hull]
     scan = len(part.faces) > _SCAN_FACES
     if scan and part.is_volume:
-        limit = max(WIDEST_GAP, GAP_SHARE * float(part.extents.max())) * threshold / _THRESHOLD
+        limit = widest_gap(float(part.extents.max())) * threshold / _THRESHOLD
         return _Cutter(part, limit).pieces(most)
     ragged = _valleys(part) > _RAGGED
     if ragged:

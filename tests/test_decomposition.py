@@ -9,7 +9,7 @@ import shapely
 import trimesh
 
 from mitsplat import decomposition
-from mitsplat.decomposition import WIDEST_GAP, convex_pieces, thin_solid
+from mitsplat.decomposition import convex_pieces, thin_solid, widest_gap
 from mitsplat.mesh import simplify_solid
 from mitsplat.mesh_distance import Surface, standoff
 
@@ -145,8 +145,8 @@ def test_pieces_of_a_scan_are_few_and_stand_off_no_more_than_layouts_bear():
     pieces = convex_pieces(can)
     assert len(pieces) <= decomposition.MOST_PIECES
     assert all(piece.is_convex for piece in pieces)
-    assert standoff(Surface(can), pieces) < WIDEST_GAP
-    assert standoff(Surface(can), [can.convex_hull]) > 3 * WIDEST_GAP
+    assert standoff(Surface(can), pieces) < widest_gap(0)
+    assert standoff(Surface(can), [can.convex_hull]) > 3 * widest_gap(0)
 
 
 def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
@@ -188,4 +188,4 @@ def test_a_small_dent_of_a_large_face_is_not_overlooked():
     assert len(dented.faces) > 3000
     pieces = convex_pieces(dented)
     assert len(pieces) > 1
-    assert standoff(Surface(dented), pieces) < WIDEST_GAP
+    assert standoff(Surface(dented), pieces) < widest_gap(0)

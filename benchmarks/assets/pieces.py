@@ -2,8 +2,8 @@
 
     python -m benchmarks.assets.pieces FOLDER [--proxy-faces 10000]
 
-FOLDER holds mesh files in metres; each is thinned as `mitsplat bake` does, of which the pieces are found anew, not taken from
-the cache. In CPU seconds of this process; a first decomposition, which compiles kernels, is not counted.
+FOLDER holds mesh files in metres. Pieces are those of the proxy mesh that `mitsplat bake` makes, found anew and not
+taken from the cache. In CPU seconds of this process; a first decomposition, which compiles kernels, is not counted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from benchmarks.assets.bake import cpu_seconds
 from benchmarks.record import figure, recording
 from mitsplat.bake.parts import read_parts
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.decomposition import GAP_SHARE, WIDEST_GAP, convex_pieces, thin_solid
+from mitsplat.decomposition import convex_pieces, thin_solid, widest_gap
 from mitsplat.mesh_distance import Surface, standoff
 from mitsplat.render.layers import ensure_variant
 
@@ -45,7 +45,7 @@ def main() -> None:
             back = np.concatenate([mesh.vertices, mesh.sample(4000, seed=0)])
             surface = Surface(mesh)
             error = max(surface.nearest(points)[2].max(), Surface(thin).nearest(back)[2].max()) / mesh.scale
-            limit = max(WIDEST_GAP, GAP_SHARE * float(mesh.extents.max()))
+            limit = widest_gap(float(mesh.extents.max()))
             rows.append((len(thin.faces), 100 * error, len(pieces), seconds, 1e3 * standoff(surface, pieces), limit))
             print(f"{path.stem}: {len(mesh.faces)} faces, thinned to %d within %.2f %% of the diagonal, %d pieces in "
                   "%.1f CPU s that stand off by %.2f mm" % rows[-1][:-1], flush=True)  # fmt: skip

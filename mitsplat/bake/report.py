@@ -9,6 +9,7 @@ import numpy as np
 
 from mitsplat.bake.bake import BakeResult
 from mitsplat.bake.verification import BakedView
+from mitsplat.decomposition import widest_gap
 from mitsplat.files import write_text
 from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
 from mitsplat.mesh import mass_properties
@@ -33,7 +34,7 @@ def write_bake_report(folder: Path, result: BakeResult) -> Path:
 
 
 def _figures(result: BakeResult) -> str:
-    asset = result.asset
+    asset, warnings = result.asset, list(result.warnings)
     rows: dict[str, str | None] = {
         "Gaussians": f"{len(asset.splats)}",
         "PSNR on unseen views": figure_of(_known(result.psnr), "{:.2f} dB"),
@@ -47,9 +48,14 @@ def _figures(result: BakeResult) -> str:
             mass = mass_properties(asset.mesh, asset.pieces, density=asset.density, mass=asset.mass)
             rows["Mass"] = f"{mass.mass:.4g} kg at {asset.density:.4g} kg/m^3"
             truth = asset.mesh if result.surface is None else result.surface
-            gap = 1e3 * standoff(Surface(truth), asset.pieces)
-            rows["Convex pieces"] = f"{len(asset.pieces)}, at most {gap:.2f} mm outside of the mesh"
-    told = verdict_of(result.warnings, "Nothing to note.", rows)
+            gap, bearable = standoff(Surface(truth), asset.pieces), widest_gap(float(asset.mesh.extents.max()))
+            rows["Convex pieces"] = f"{len(asset.pieces)}, at most {1e3 * gap:.2f} mm outside of the mesh"
+            if gap > bearable:
+                warnings.append(
+                    f"convex pieces close hollows of the mesh by up to {1e3 * gap:.1f} mm, more than the "
+                    f"{1e3 * bearable:.1f} mm that layouts bear: those in which something rests there are drawn again"
+                )
+    told = verdict_of(warnings, "Nothing to note.", rows)
     return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{told}</section>'
 
 

@@ -14,7 +14,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
-from mitsplat.decomposition import GAP_SHARE, MOST_PIECES, WIDEST_GAP, convex_pieces
+from mitsplat.decomposition import MOST_PIECES, convex_pieces, widest_gap
 from mitsplat.errors import InputError
 from mitsplat.mesh import mass_properties, prepare_mesh
 from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
@@ -240,7 +240,7 @@ class Drop:
             if pieces:
                 stands_off = standoff(surface, pieces)
             else:
-                limit = max(WIDEST_GAP, GAP_SHARE * float(mesh.extents.max()))
+                limit = widest_gap(float(mesh.extents.max()))
                 for threshold in _THRESHOLDS:
                     pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
                     stands_off = standoff(surface, pieces)
@@ -362,7 +362,7 @@ class Drop:
         """How a layout at rest is not arranged as asked for, or empty."""
         laid = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
-            if pair.second.name.startswith(ENCLOSURE) and pair.distance < WIDEST_GAP:
+            if pair.second.name.startswith(ENCLOSURE) and pair.distance < widest_gap(0.0):
                 return f"{pair.first.name} rests against the enclosure"
         for pair in clearances:
             if laid[pair.first] == "scatter" and pair.second not in obstacles and pair.distance < _NEAREST:
@@ -401,7 +401,7 @@ def _fault(
         if -pair.distance > (_DEEPEST_IN_COLLIDER if pair.second in obstacles else _DEEPEST_IN_OBJECT):
             return f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
     for item, gap in gaps.items():
-        if gap > max(WIDEST_GAP, GAP_SHARE * item.size):
+        if gap > widest_gap(item.size):
             return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest"
     return ""
 

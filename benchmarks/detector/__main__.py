@@ -1,0 +1,86 @@
+"""All arms and seeds of the experiment on detectors, side by side, as far as time allows.
+
+    python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
+        [--minutes 20] [--images 900]
+
+Datasets are rendered one after the other, and what learns from one starts when it is there. What was recorded is not
+done again; what was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+
+from benchmarks.detector.experiment import read_arms, write_scene
+from benchmarks.record import RESULTS
+
+
+def main() -> None:
+    """Render, train, judge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--arms", nargs="*", help="all of arms.yaml, in its order, if absent")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--devices", nargs="+", default=["cuda:0"])
+    parser.add_argument("--jobs", type=int, default=4, help="trainings at once on each device")
+    parser.add_argument("--workers", type=int, default=4, help="processes of each training that read images")
+    parser.add_argument("--render-workers", type=int, default=8)
+    parser.add_argument("--render-device", default="auto")
+    parser.add_argument("--minutes", type=float, default=1e9, help="after which nothing is begun")
+    parser.add_argument("--weights", type=Path)
+    options = parser.parse_args()
+    arms = read_arms()["arms"]
+    chosen = options.arms or list(arms)
+    ends = time.monotonic() + 60 * options.minutes
+    logs = options.work / "logs"
+    logs.mkdir(parents=True, exist_ok=True)
+    free: Queue[str] = Queue()
+    for device in options.devices * options.jobs:
+        free.put(device)
+
+    def say(text: str) -> None:
+        print(f"{(time.monotonic() - ends) / 60 + options.minutes:5.1f} min  {text}", flush=True)
+
+    def command(name: str, words: list[str]) -> bool:
+        with (logs / f"{name}.log").open("w") as log:
+            limit = max(ends - time.monotonic(), 1)
+            try:
+                status = subprocess.run(words, stdout=log, stderr=log, timeout=limit).returncode
+            except subprocess.TimeoutExpired:
+                status = -1
+        last = (logs / f"{name}.log").read_text().strip().splitlines()[-1:] or [""]
+        say(f"{name}: {last[0] if status == 0 else f'status {status}: {last[0]}'}")
+        return status == 0
+
+    def train(arm: str, seed: int) -> None:
+        if (RESULTS / f"detector.experiment-{arm}-{seed}.json").exists() or time.monotonic() > ends:
+            return
+        device = free.get()
+        try:
+            words = [sys.executable, "-m", "benchmarks.detector.experiment", str(options.work), arm, str(seed)]
+            words += ["--device", device, "--workers", str(options.workers)]
+            command(f"{arm}-{seed}", words + (["--weights", str(options.weights)] if options.weights else []))
+        finally:
+            free.put(device)
+
+    rendered: set[str] = set()
+    with ThreadPoolExecutor(len(options.devices) * options.jobs) as pool:
+        for arm in sorted(chosen, key=lambda arm: "scenes" in arms[arm]):
+            for scene in arms[arm].get("scenes", []):
+                if scene in rendered or time.monotonic() > ends:
+                    continue
+                rendered.add(scene)
+                words = ["mitsplat", "render", str(write_scene(options.work, scene))]
+                words += ["-o", str(options.work / "data" / scene), "--resume", "--device", options.render_device]
+                command(f"render-{scene}", [*words, "--workers", str(options.render_workers)])
+            for seed in options.seeds:
+                pool.submit(train, arm, seed)
+
+
+main()

@@ -1,0 +1,155 @@
+"""One arm of the experiment on detectors, with one seed: rendered, trained, and judged on photographs.
+
+    python -m benchmarks.detector.experiment WORK ARM SEED [--device cuda:0] [--weights FILE.pt]
+    python -m benchmarks.detector WORK                  # all arms and seeds, side by side
+
+WORK is what ``benchmarks.detector.material`` made; arms stand in ``arms.yaml``. Photographs are those of a few scenes
+under several lights: an arm that learns from photographs is trained once for each fold of scenes, on the other scenes,
+and judged on the fold; detections of all folds are judged together. Precision is also that of samples of scenes,
+drawn with replacement, the same ones for every arm, from which intervals of an arm and of differences follow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import json
+import re
+import shutil
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+
+from benchmarks.record import figure, recording
+from mitsplat.detector import Matches, TrainSettings, evaluate_detector, train_detector
+
+HERE = Path(__file__).parent
+SAMPLES = 200
+"""Draws of scenes with replacement."""
+
+
+def read_arms() -> dict[str, Any]:
+    """What ``arms.yaml`` says."""
+    return dict(YAML(typ="safe").load((HERE / "arms.yaml").read_text()))
+
+
+def write_scene(work: Path, name: str) -> Path:
+    """The scene of a name: ``groceries.yaml`` with its changes, by dotted key; null takes away."""
+    scene, plan = YAML(typ="safe").load((HERE / "groceries.yaml").read_text()), read_arms()
+    for key, value in [row for change in plan["scenes"][name] for row in plan["changes"][change].items()]:
+        *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
+        place = scene
+        for step in way:
+            place = place.setdefault(step, {}) if isinstance(place, dict) else place[step]
+        if value is None:
+            del place[last]
+        elif isinstance(place, list) and last == len(place):
+            place.append(deepcopy(value))
+        else:
+            place[last] = deepcopy(value)
+    path = work / f"{name}.yaml"
+    with path.open("w") as file:
+        YAML(typ="safe").dump(scene, file)
+    return path
+
+
+def scene_of(image: str) -> int:
+    """The scene that a photograph shows, by its name."""
+    found = re.search(r"scene_(\d+)_", image)
+    if found is None:
+        raise SystemExit(f"{image} is not named scene_NNNN_LLLL")
+    return int(found[1])
+
+
+def photographs(work: Path, scenes: set[int], name: str) -> Path:
+    """A COCO folder of the photographs of some scenes."""
+    folder = work / name
+    with (work / "photos" / "labels.json").open() as file:
+        labels = json.load(file)
+    labels["images"] = [image for image in labels["images"] if scene_of(image["file_name"]) in scenes]
+    kept = {image["id"] for image in labels["images"]}
+    labels["annotations"] = [one for one in labels["annotations"] if one["image_id"] in kept]
+    folder.mkdir(exist_ok=True)
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for image in labels["images"]:
+            if not (folder / image["file_name"]).exists():
+                shutil.copy(work / "photos" / image["file_name"], folder)
+        (folder / "labels.json").write_text(json.dumps(labels))
+    return folder
+
+
+def main() -> None:
+    """Train and judge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("arm")
+    parser.add_argument("seed", type=int)
+    parser.add_argument("--weights", type=Path, help="to start from; random ones if absent")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--workers", type=int, default=4)
+    options = parser.parse_args()
+    with recording("detector.experiment", parser, options, ignore=("work", "device", "workers", "weights"), gpu=True):
+        measure(options)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Train what the arm says, and judge it."""
+    plan = read_arms()
+    arm = dict(plan["arms"][options.arm])
+    work: Path = options.work
+    rendered = [work / "data" / scene for scene in arm.pop("scenes", [])]
+    learns_photographs = arm.pop("real", False)
+    settings = TrainSettings(
+        **(plan["train"] | arm),
+        weights=options.weights,
+        seed=options.seed,
+        device=options.device,
+        workers=options.workers,
+    )
+    folds = [set(fold) for fold in plan["folds"]]
+    everything = photographs(work, set().union(*folds), "all_photos")
+    detections, truth = [], {}
+    for number, fold in enumerate(folds if learns_photographs else [set().union(*folds)]):
+        real = photographs(work, set().union(*folds) - fold, f"without_fold_{number}") if learns_photographs else None
+        run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
+        # Without rendered images photographs are what is learnt, not what is mixed in.
+        trained = train_detector(rendered or [real], run, settings, real=real if rendered else None)
+        figure(trained.record["finished"]["seconds"], "s", "training", number)
+        found = evaluate_detector(run, everything, split="all", size=plan["test_size"], device=options.device)
+        truth = json.loads((found.path / "truth.json").read_text())
+        judged = {image["id"] for image in truth["images"] if scene_of(image["file_name"]) in fold}
+        detections += [
+            one for one in json.loads((found.path / "detections.json").read_text()) if one["image_id"] in judged
+        ]
+    out = work / "found" / f"{options.arm}-{options.seed}.json"
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps([one for one in detections if one["score"] >= 0.01]))
+    matches = Matches(truth, detections)
+    whole = matches.average_precision()
+    figure(whole.map50_95, "", "map50_95")
+    figure(whole.map50, "", "map50")
+    for name, (strict, _) in whole.classes.items():
+        figure(strict, "", "class", name)
+    by_scene: dict[int, list[int]] = {}
+    for image in truth["images"]:
+        by_scene.setdefault(scene_of(image["file_name"]), []).append(image["id"])
+    for name, images in by_scene.items():
+        figure(matches.average_precision(images).map50_95, "", "scene", name)
+    rng = np.random.default_rng(0)
+    draws = rng.integers(len(by_scene), size=(SAMPLES, len(by_scene)))
+    scenes = list(by_scene.values())
+    figure(
+        [matches.average_precision([image for i in draw for image in scenes[i]]).map50_95 for draw in draws],
+        "",
+        "samples",
+    )
+    figure("COCO" if options.weights else "random", "", "start")
+    print(f"{options.arm} {options.seed}: mAP50-95 {whole.map50_95:.3f}, mAP50 {whole.map50:.3f}")
+
+
+if __name__ == "__main__":
+    main()

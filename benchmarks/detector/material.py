@@ -1,0 +1,80 @@
+"""Material of the experiment on detectors: assets of scanned objects, packages that no class is, labelled photographs.
+
+    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 30] [--device cuda]
+
+HOPE holds ``meshes/*.glb`` (textured scans [m], y up), ``photos/*.jpg`` named ``scene_NNNN_LLLL``, and ``labels.json``
+(COCO). WORK gets ``groceries/`` and ``packages/``, folders of assets, and ``photos/``, a COCO folder. What is there
+already is kept, so that it goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import trimesh
+
+from benchmarks.detector.packages import make_package
+from benchmarks.record import figure, recording
+from mitsplat.bake.bake import BakeSettings, bake_asset
+from mitsplat.bake.parts import read_parts
+from mitsplat.device import use_device
+
+DENSITY = 600.0
+"""Of packed food with air around it [kg/m^3]."""
+
+
+def bake(
+    mesh: Path | trimesh.Trimesh, out: Path, class_name: str, settings: BakeSettings, up: Literal["y", "z"]
+) -> None:
+    """An asset of small files, unless it is there; its body is its convex hull, which cartons and cans all but fill."""
+    if (out / "asset.yaml").exists():
+        return
+    hull = parts_hull(mesh, up)
+    result = bake_asset(
+        mesh, name=out.name, class_name=class_name, settings=settings, up=up, density=DENSITY, pieces=[hull]
+    )
+    replace(result.asset, mesh=hull).save(out, splats="splats.spz")
+    notes = "".join(f"; {warning}" for warning in result.warnings)
+    figure(result.psnr, "dB", out.name)
+    print(f"{out.name}: {len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB{notes}", flush=True)
+
+
+def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.Trimesh:
+    """The convex hull of all parts of a mesh [m], z up."""
+    parts = read_parts(mesh, metres_per_unit=1.0, up=up, finish=None)
+    return trimesh.util.concatenate([part.mesh for part in parts]).convex_hull
+
+
+def main() -> None:
+    """Read what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("hope", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--gaussians", type=int, default=50000, help="of each scan")
+    parser.add_argument("--packages", type=int, default=30)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    with recording("detector.material", parser, options, ignore=("hope", "work"), gpu=options.device != "cpu"):
+        make(options)
+
+
+def make(options: argparse.Namespace) -> None:
+    """Bake and copy what is not there."""
+    use_device(options.device)
+    photos = options.work / "photos"
+    if not photos.exists():
+        shutil.copytree(options.hope / "photos", photos)
+        shutil.copy(options.hope / "labels.json", photos / "labels.json")
+    for path in sorted((options.hope / "meshes").glob("*.glb")):
+        bake(path, options.work / "groceries" / path.stem, path.stem, BakeSettings(gaussians=options.gaussians), "y")
+    for seed in range(options.packages):
+        settings = BakeSettings(gaussians=25000, verify_views=2)
+        bake(make_package(seed), options.work / "packages" / f"package_{seed:02d}", "package", settings, "z")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""Packages that no class is: boxes, cans and bottles with printed labels, as textured meshes to be baked.
+
+A detector that has never seen another box with words on it takes every box with words for one that it knows. These are
+drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import trimesh
+from PIL import Image, ImageDraw, ImageFont
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
+
+WORDS = re.split(
+    " ",
+    "PEAS CORN BEANS TUNA RICE TEA COFFEE SUGAR FLOUR HONEY MUSTARD MAYO RELISH OLIVES PASTA SPAGHETTI GRANOLA RAISINS "
+    "CHERRIES PEACHES PINEAPPLE CARROTS MUSHROOMS YOGURT CHEESE CRACKERS BISCUITS CEREAL OATS SALT PEPPER VINEGAR OIL "
+    "LEMON APPLE GRAPE SALSA CHILI BROTH NOODLES fresh natural classic organic original best family extra NET WT 340 g",
+)
+FONTS = sorted(Path(matplotlib.get_data_path(), "fonts/ttf").glob("DejaVu*Bold*.ttf"))
+_PIXELS_PER_METRE = 3000.0
+
+
+def make_package(seed: int) -> trimesh.Trimesh:
+    """A closed, convex mesh [m], z up, with a texture."""
+    rng = np.random.default_rng(seed)
+    kind: Callable[[np.random.Generator], trimesh.Trimesh] = (_box, _can, _bottle)[seed % 3]
+    return kind(rng)
+
+
+def _colours(rng: np.random.Generator) -> list[tuple[int, int, int]]:
+    """Background, second colour, and ink, which differ in value."""
+    hues = (rng.random() + np.array([0, rng.uniform(0.1, 0.6), rng.random()])) % 1
+    values = np.clip([rng.uniform(0.2, 1), rng.uniform(0.2, 1), rng.choice([0.05, 0.98])], 0, 1)
+    if abs(values[2] - values[0]) < 0.35:
+        values[2] = 1.03 - values[2]
+    saturations = rng.uniform(0.3, 1, 3) * (rng.random(3) > 0.2) * [1, 1, 0.3]
+    rgb = matplotlib.colors.hsv_to_rgb(np.stack([hues, saturations, values], axis=1))
+    return [tuple(round(255 * v) for v in row) for row in rgb]  # type: ignore[misc]
+
+
+def _label(width: float, height: float, rng: np.random.Generator, colours: list[tuple[int, int, int]]) -> Image.Image:
+    """A printed side of so many metres."""
+    size = max(round(width * _PIXELS_PER_METRE), 8), max(round(height * _PIXELS_PER_METRE), 8)
+    image = Image.new("RGB", size, colours[0])
+    draw = ImageDraw.Draw(image)
+    for _ in range(rng.integers(1, 5)):
+        colour = colours[1] if rng.random() < 0.7 else tuple(int(v) for v in rng.integers(0, 256, 3))
+        x, y = rng.uniform(0, 1, 2) * size
+        w, h = rng.uniform(0.15, 0.8, 2) * size
+        shape = rng.integers(4)
+        if shape == 0:
+            draw.rectangle((0, y, size[0], y + 0.3 * h), fill=colour)
+        elif shape == 1:
+            draw.ellipse((x - w / 2, y - h / 2, x + w / 2, y + h / 2), fill=colour)
+        elif shape == 2:
+            draw.polygon([(x, y), (x + w, y + 0.2 * h), (x + 0.3 * w, y + h)], fill=colour)
+        else:
+            step = max(size[0] / rng.integers(6, 16), 2.0)
+            for left in np.arange(0, size[0], step):
+                draw.rectangle((left, y, left + 0.4 * step, y + 0.4 * h), fill=colour)
+    for line in range(rng.integers(1, 5)):
+        word = str(rng.choice(WORDS))
+        letter = (0.28 if line == 0 else rng.uniform(0.06, 0.15)) * min(size[1], 1.5 * size[0])
+        letter = min(letter, 1.3 * size[0] / len(word))
+        font = ImageFont.truetype(str(FONTS[rng.integers(len(FONTS))]), max(int(letter), 6))
+        x, y = rng.uniform(0.0, 0.35) * size[0], rng.uniform(0.02, 0.85) * size[1]
+        draw.text((x, y), word, font=font, fill=colours[2] if rng.random() < 0.8 else colours[1])
+    return image
+
+
+def _textured(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, image: Image.Image, gloss: float
+) -> trimesh.Trimesh:
+    material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=gloss)
+    return trimesh.Trimesh(vertices, faces, visual=TextureVisuals(uv=uv, material=material), process=False)
+
+
+def _box(rng: np.random.Generator) -> trimesh.Trimesh:
+    extents = np.sort(rng.uniform([0.02, 0.05, 0.08], [0.06, 0.13, 0.24]))
+    colours = _colours(rng)
+    # Six sides in a column of the atlas: the large ones printed alike, front and back.
+    sides = [(0, 1, 2), (0, 1, 2), (2, 0, 1), (2, 0, 1), (1, 2, 0), (1, 2, 0)]
+    images = [_label(extents[a], extents[b], rng, colours) for _, a, b in sides]
+    width, height = max(im.width for im in images), sum(im.height for im in images)
+    atlas = Image.new("RGB", (width, height))
+    vertices, faces, uv, top = [], [], [], 0
+    for number, ((normal, a, b), image) in enumerate(zip(sides, images, strict=True)):
+        atlas.paste(image, (0, top))
+        sign = 1 if number % 2 else -1
+        corners = np.zeros((4, 3))
+        corners[:, normal] = sign * extents[normal] / 2
+        corners[:, a] = np.array([-1, 1, 1, -1]) * extents[a] / 2 * sign
+        corners[:, b] = np.array([-1, -1, 1, 1]) * extents[b] / 2
+        u = np.array([0, 1, 1, 0]) * image.width / width
+        v = 1 - (top + image.height * np.array([1, 1, 0, 0])) / height
+        quad = len(vertices) + np.array([[0, 1, 2], [0, 2, 3]])
+        vertices += list(corners)
+        faces += list(quad)
+        uv += list(np.stack([u, v], axis=1))
+        top += image.height
+    mesh = _textured(np.array(vertices), np.array(faces), np.array(uv), atlas, rng.uniform(0.35, 0.8))
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def _turned(profile: np.ndarray, image: Image.Image, gloss: float, sections: int = 64) -> trimesh.Trimesh:
+    """A solid of revolution about z of (radius, height) points, whose texture's v runs along the profile."""
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    length /= length[-1]
+    angle = np.linspace(0, 2 * np.pi, sections + 1)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    vertices = np.concatenate([np.column_stack([r * ring, np.full(sections + 1, z)]) for r, z in profile])
+    uv = np.concatenate([np.column_stack([angle / (2 * np.pi), np.full(sections + 1, t)]) for t in length])
+    faces = []
+    for row in range(len(profile) - 1):
+        i = row * (sections + 1) + np.arange(sections)
+        faces.append(np.column_stack([i, i + 1, i + sections + 2]))
+        faces.append(np.column_stack([i, i + sections + 2, i + sections + 1]))
+    mesh = _textured(vertices, np.concatenate(faces), uv, image, gloss)
+    mesh.update_faces(mesh.area_faces > 1e-12)
+    return mesh
+
+
+def _round_label(
+    profile: np.ndarray, printed: tuple[int, int], rng: np.random.Generator, plain: tuple[int, int, int]
+) -> Image.Image:
+    """The texture of a turned solid: a label between two points of the profile, plain elsewhere."""
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    around = 2 * np.pi * profile[:, 0].max()
+    colours = _colours(rng)
+    label = _label(around, length[printed[1]] - length[printed[0]], rng, colours)
+    height = max(round(length[-1] * _PIXELS_PER_METRE), label.height)
+    image = Image.new("RGB", (label.width, height), plain)
+    image.paste(label, (0, round(height * (1 - length[printed[1]] / length[-1]))))
+    return image
+
+
+def _can(rng: np.random.Generator) -> trimesh.Trimesh:
+    radius, height = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.14)
+    rim = 0.004
+    profile = np.array([[0, 0], [radius, 0], [radius, rim], [radius, height - rim], [radius, height], [0, height]])
+    grey = int(rng.uniform(150, 210))
+    return _turned(profile, _round_label(profile, (2, 3), rng, (grey, grey, grey)), rng.uniform(0.3, 0.6))
+
+
+def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
+    radius, height = rng.uniform(0.025, 0.042), rng.uniform(0.12, 0.22)
+    shoulder, neck = rng.uniform(0.55, 0.75) * height, rng.uniform(0.35, 0.6) * radius
+    profile = np.array([
+        [0, 0], [0.9 * radius, 0], [radius, 0.1 * height], [radius, shoulder],
+        [neck, 0.85 * height], [neck, height], [0, height],
+    ])  # fmt: skip
+    plain = tuple(
+        int(v) for v in 255 * matplotlib.colors.hsv_to_rgb([rng.random(), rng.uniform(0, 1), rng.uniform(0.3, 1)])
+    )
+    mesh = _turned(profile, _round_label(profile, (2, 3), rng, plain), rng.uniform(0.25, 0.6))  # type: ignore[arg-type]
+    mesh.apply_scale([1, rng.uniform(0.6, 1), 1])
+    return mesh

@@ -29,7 +29,7 @@ import sys
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +38,8 @@ from scipy.special import expit, logit
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.spherical_harmonics import SH_C0
+
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 _CONVERTED = (".ksplat", ".spz", ".sog")
 _PLY_TYPES = {
@@ -88,6 +90,11 @@ class SplatArrays(NamedTuple):
     scales: Float32Array
     opacities: Float32Array
     sh: Float32Array
+
+
+def usual_up(path: Path) -> Axis:
+    """Axis that points up in most files of a format: y in ``.spz``, -y in others, as structure from motion has it."""
+    return "y" if path.suffix.lower() == ".spz" else "-y"
 
 
 def read_splats(path: Path) -> SplatArrays:

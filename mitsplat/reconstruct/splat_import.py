@@ -26,8 +26,9 @@ from mitsplat.reconstruct.evaluation import AssetView, Thresholds, iou, is_close
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
-from mitsplat.reconstruct.upright import USUAL_UP, Axis, Plane, Upright, cut_support, find_up
+from mitsplat.reconstruct.upright import Plane, Upright, cut_support, find_up
 from mitsplat.render.layers import render_splats
+from mitsplat.splat_files import Axis, usual_up
 from mitsplat.splats import Splats
 from mitsplat.variant import one_at_a_time
 
@@ -226,7 +227,7 @@ def import_splats(
     tell("removing floaters")
     cleaner.remove_floaters(kind)
     tell("finding up")
-    upright = find_up(cleaner.splats, kind, USUAL_UP.get(path.suffix.lower(), "-y"), settings.up)
+    upright = find_up(cleaner.splats, kind, usual_up(path), settings.up)
     turn = np.eye(4)
     turn[:3, :3] = upright.rotation
     if settings.without_table:

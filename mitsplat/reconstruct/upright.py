@@ -8,7 +8,7 @@ found by random samples of three points (Fischler and Bolles 1981, RANSAC) and f
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import shapely
@@ -18,12 +18,8 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.reconstruct.segment_splats import visible_area
+from mitsplat.splat_files import Axis
 from mitsplat.splats import Splats
-
-Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
-
-USUAL_UP: dict[str, Axis] = {".spz": "y"}
-"""Axis that points up in files of a format; -y where nothing else is stated, as of structure from motion."""
 
 POINTS = 4000
 """Gaussians that planes are looked for among, drawn by the area that they show."""

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.camera import Camera
+from mitsplat.splat_files import Axis
 from mitsplat.splats import Splats
 from mitsplat.view.guard import Guard, check_address, guarded
 from mitsplat.view.parts import (
@@ -120,10 +121,6 @@ class Page:
         handle.on_update(lambda _: moved(np.asarray(handle.position)))
         return handle
 
-    def set_up(self, axis: str) -> None:
-        """Which axis points up: ``+z``, ``-y`` and so on."""
-        self._server.scene.set_up_direction(axis)
-
     def show(self, parts: Iterable[Part]) -> None:
         """Show these and nothing else; only what differs from what is shown is sent."""
         wanted = {part.name: part for part in parts}
@@ -172,15 +169,23 @@ class Page:
                 client.camera.position, client.camera.look_at = pose[:3, 3], ahead
                 client.camera.up_direction, client.camera.fov = -pose[:3, 1], fov
 
-    def look_around(self) -> None:
-        """Look at all that is shown, from above and aside."""
+    def look_around(self, up: Axis = "z") -> None:
+        """Look at all that is shown, from above and aside; ``up`` is the axis that points up from now on."""
+        above = np.zeros(3)
+        above["xyz".index(up[-1])] = -1 if up.startswith("-") else 1
+        self._server.scene.set_up_direction(above)
+        aside = np.roll(above, 1)
         low, high = bounds_of(self._shown.values())
-        middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-        eye = middle + size * np.array([0.7, -0.9, 0.6])
-        side = 720
-        self.look_through(
-            Camera.look_at(eye, middle, width=side, height=side, fov_x=float(np.degrees(_START_FOV)), near=1e-3)
-        )
+        middle = (low + high) / 2
+        away = [
+            np.linalg.norm(part.pose[:3, 3] - middle)
+            for part in self._shown.values()
+            if isinstance(part.thing, Frustum)
+        ]
+        size = max(float(np.linalg.norm(high - low)), 1.5 * float(max(away, default=0.0)))
+        eye = middle + size * (0.7 * aside - 0.9 * np.cross(above, aside) + 0.6 * above)
+        fov, side = float(np.degrees(_START_FOV)), 720
+        self.look_through(Camera.look_at(eye, middle, up=above, width=side, height=side, fov_x=fov, near=1e-3))
 
     def _distance(self, pose: Float64Array) -> float:
         """How far ahead of a camera that is what the view turns around [m]."""
@@ -229,12 +234,14 @@ class Page:
         return self._add_frustum(part.name, thing, place)
 
     def _add_frustum(self, name: str, thing: Frustum, place: dict[str, Any]) -> Any:
-        camera = thing.camera
+        camera, height = thing.camera, 0.5 * thing.camera.height / thing.camera.fy
+        aspect = camera.width / camera.height
         handle = self._server.scene.add_camera_frustum(
             name,
-            fov=2 * float(np.arctan(0.5 * camera.height / camera.fy)),
-            aspect=camera.width / camera.height,
-            scale=thing.depth,
+            fov=2 * float(np.arctan(height)),
+            aspect=aspect,
+            scale=thing.depth
+            * float(np.cbrt(height * height * aspect / 3)),  # viser takes the edge of a cube of its volume
             thickness=1.5,
             thickness_units="screen",
             color=thing.colour,

@@ -246,7 +246,7 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Pa
     for frame in sorted({*own[:MOST_CAMERAS], *spread.tolist()}):
         camera = view_of(scene, frame, layout if frame in own else None).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
-        yield Part(f"/{group}/{frame}", Frustum(camera, 0.08 * size, colour, frame), camera.world_from_camera)
+        yield Part(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)
 
 
 def bounds_of(parts: Iterable[Part]) -> Float64Array:

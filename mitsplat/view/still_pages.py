@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -11,13 +12,13 @@ from mitsplat.arrays import ByteImage
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.errors import InputError
+from mitsplat.splat_files import Axis, usual_up
 from mitsplat.splats import Splats
 from mitsplat.view.dataset_index import OVERLAYS, DatasetIndex, Filter, OverlayName
 from mitsplat.view.page import Page
 from mitsplat.view.parts import Cloud, Part, asset_parts, capture_parts
 
 _ANY = "any"
-_AXES = ("+z", "-z", "+y", "-y", "+x", "-x")
 _EDGE = 960
 """Longest edge of a photo that is shown [px]."""
 _WIDE = 860
@@ -56,14 +57,15 @@ class AssetPage(StillPage):
 
 
 class SplatsPage(StillPage):
-    """A file of splats, as it is: files say neither which axis points up nor their units."""
+    """A file of splats as it is: it says neither its units nor which axis points up, for which the usual is taken."""
 
     def __init__(self, page: Page, path: Path) -> None:
         splats = Splats.load(path)
         page.show([Part("/splats/file", Cloud(splats))])
-        up = page.gui.add_dropdown("up axis", _AXES)
-        up.on_update(lambda _: page.set_up(up.value) if up.value in _AXES else None)
-        page.look_around()
+        axes = get_args(Axis)
+        up = page.gui.add_dropdown("up axis", axes, initial_value=usual_up(path))
+        up.on_update(lambda _: page.look_around(up.value) if up.value in axes else None)
+        page.look_around(up.value)
         size = " × ".join(f"{side:.3g}" for side in np.ptp(splats.bounds, axis=0)) if len(splats) else "nothing"
         page.caption(
             f"{len(splats)} Gaussians, spherical harmonics of degree {splats.sh_degree}\n\n{size} in units of the file"

@@ -119,6 +119,14 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
     folder = capture.photos[0].file.parents[1]
     shown = CapturePage(page, folder)
     assert sum(part.group == "cameras" for part in page._shown.values()) == len(capture.photos)
+    view, frustum = page._server.initial_camera, page._handles["/cameras/0"]
+    ahead = (view.look_at - view.position) / np.linalg.norm(view.look_at - view.position)
+    for photo in capture.photos:  # all are in the first view
+        offset = photo.camera.centre - view.position
+        assert np.degrees(np.arccos(offset @ ahead / np.linalg.norm(offset))) < 35
+    half = np.tan(frustum.fov / 2)
+    depth = frustum.scale / np.cbrt(half * half * frustum.aspect / 3)  # as viser's client draws it
+    assert depth == pytest.approx(page._shown["/cameras/0"].thing.depth, rel=1e-5)
     shown._clicked(3)
     assert page._caption.content.startswith("03\\.png")
     darkened, whole = (photo_picture(capture.photos[3], masked=masked).astype(int) for masked in (True, False))
@@ -131,6 +139,10 @@ def test_the_page_of_a_file_of_splats(page, tmp_path):
     box_asset("nut").splats.save(tmp_path / "nut.ply")
     SplatsPage(page, tmp_path / "nut.ply")
     assert list(page._shown) == ["/splats/file"]
+    camera = page._server.initial_camera
+    assert camera.up[1] < -0.5 and camera.position[1] < 0  # -y is up in most files, and it is seen from above
+    page.look_around("z")
+    assert camera.up[2] > 0.5 and camera.position[2] > 0
 
 
 def test_viser_gets_covariances_that_half_floats_can_hold():

@@ -388,21 +388,25 @@ def _gunzipped(data: bytes) -> bytes:
 
 
 def _check_zip(data: bytes) -> None:
-    """Refuse an archive whose entries lie outside of it or swell beyond what splats can."""
+    """Refuse an archive whose entries lie outside of it, swell beyond what splats can, or miss their checksums."""
     limit = _swollen(len(data))
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
-    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, struct.error) as error:
+            for entry in entries:
+                if entry.filename.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", entry.filename):
+                    raise InputError(f"an archive must not hold files outside of it (got {entry.filename!r})")
+            size = sum(entry.file_size for entry in entries)
+            if size > limit or len(entries) > _MAX_ENTRIES:
+                within = f"{limit} in {_MAX_ENTRIES} files (got {size} in {len(entries)})"
+                raise InputError(f"{len(data)} bytes must not hold more than {within}")
+            damaged = archive.testzip()  # reads no more of an entry than it states
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, struct.error, zlib.error) as error:
         raise InputError(f"not a valid sog file ({error})") from None
-    for entry in entries:
-        if entry.filename.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", entry.filename):
-            raise InputError(f"an archive must not hold files outside of it (got {entry.filename!r})")
-    size = sum(entry.file_size for entry in entries)
-    if size > limit or len(entries) > _MAX_ENTRIES:
-        raise InputError(
-            f"{len(data)} bytes must not hold more than {limit} in {_MAX_ENTRIES} files (got {size} in {len(entries)})"
-        )
+    if damaged is not None:
+        raise InputError(f"not a valid sog file ({damaged} in it is damaged)")
 
 
 def _swollen(size: int) -> int:

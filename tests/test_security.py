@@ -243,6 +243,14 @@ class TestArchives:
         with pytest.raises(InputError, match=r"a\.sog: an archive must not hold files outside of it"):
             Splats.load(tmp_path / "a.sog")
 
+    def test_a_damaged_entry_of_sog(self, tmp_path):
+        with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+            archive.writestr("meta.json", "{ meant }")
+        data = (tmp_path / "a.sog").read_bytes()
+        (tmp_path / "a.sog").write_bytes(data.replace(b"meant", b"other"))
+        with pytest.raises(InputError, match=r"a\.sog: not a valid sog file \(meta\.json in it is damaged\)"):
+            Splats.load(tmp_path / "a.sog")
+
     def test_a_bomb_of_sog(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("meta.json", bytes(64 << 20))

@@ -381,13 +381,20 @@ def _pieces(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
     return (*split, *(part.convex_hull for part in small))
 
 
-def _on_support(splats: Splats, plane: Plane) -> tuple[Support, Float64Array]:
-    """The horizontal surface of surroundings, and the motion that takes its middle to the origin, its sides to x, y."""
+def _on_support(splats: Splats, plane: Plane) -> tuple[Support | None, Float64Array]:
+    """The horizontal surface of surroundings, and the motion that takes its middle to the origin, its sides to x, y.
+
+    No surface, and no motion, where what lies in the plane spans no area.
+    """
     inside = np.abs(splats.means[:, 2] - plane.height) <= 3 * plane.thickness
     flat = splats.means[inside & (splats.opacities > 0.1), :2].astype(np.float64)
-    low, high = np.quantile(flat, (0.02, 0.98), axis=0)
-    flat = flat[((flat >= low) & (flat <= high)).all(axis=1)]
-    corners = np.array(shapely.oriented_envelope(shapely.MultiPoint(flat)).exterior.coords)[:4]
+    if len(flat):
+        low, high = np.quantile(flat, (0.02, 0.98), axis=0)
+        flat = flat[((flat >= low) & (flat <= high)).all(axis=1)]
+    envelope = shapely.oriented_envelope(shapely.MultiPoint(flat))
+    if not envelope.area > 0:
+        return None, np.eye(4)
+    corners = np.array(envelope.exterior.coords)[:4]
     along = corners[1] - corners[0]
     across = corners[2] - corners[1]
     if np.abs(along[0]) < np.abs(along[1]):  # the smaller turn

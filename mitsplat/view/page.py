@@ -33,6 +33,8 @@ from mitsplat.view.parts import (
 
 _HALF_MAX = 200.0
 """Longest standard deviation that is sent: viser holds covariances as half floats, of which 65504 is the largest."""
+_VISERS_START = (3.0, 3.0, 3.0)
+"""Where viser's camera is until a browser has been told of ours."""
 _START_FOV = 0.9
 """Vertical field of view of a page that shows no camera's view [rad]."""
 
@@ -111,7 +113,12 @@ class Page:
 
     def on_move(self, moved: Callable[[Any], object]) -> None:
         """Whom to tell viser's camera when someone moves theirs."""
-        self._server.on_client_connect(lambda client: client.camera.on_update(moved))
+
+        def tell(camera: Any) -> None:
+            if not np.allclose(camera.position, _VISERS_START):  # before a browser knows where to look
+                moved(camera)
+
+        self._server.on_client_connect(lambda client: client.camera.on_update(tell))
 
     def add_handle(self, moved: Callable[[Float64Array], object]) -> Any:
         """Viser's handle to drag something by, hidden until it is needed; ``moved`` is told where to [m]."""

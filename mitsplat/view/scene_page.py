@@ -30,6 +30,7 @@ _INTERVAL = 0.04
 """Between the moments of a drop that is played [s]."""
 _WIDTHS = ("320", "480", "640", "960", "1280")
 _NO_LIGHT = "none"
+_PLAIN = "Appearances and materials that are drawn are in the render alone; beside it, objects and shapes are plain."
 
 
 class ScenePage:
@@ -99,6 +100,7 @@ class ScenePage:
         self._frame.value = self._index
         self._seed.value = seed_line(scene.spec.seed)
         self._light.options = self._light_names()
+        self._plain.visible = _draws_looks(scene)
         self._ask()
 
     # What the browser asks for
@@ -115,6 +117,7 @@ class ScenePage:
             self._layer = gui.add_dropdown("layer", LAYERS)
             self._finest = gui.add_dropdown("sharpen to", tuple(PRESETS), initial_value="exact")
             self._width = gui.add_dropdown("width [px]", _WIDTHS, initial_value="640")
+            self._plain = gui.add_markdown(_PLAIN, visible=_draws_looks(scene))
         with gui.add_folder("Camera", expand_by_default=False):
             back = gui.add_button("Back to the frame's camera")
             self._camera_yaml = gui.add_text("YAML", "", multiline=True)
@@ -321,6 +324,12 @@ def reseeded(scene: Scene, seed: int) -> Scene:
     if any(entry.pool == PRIMITIVES for entry in scene.spec.objects):
         return load_scene(scene.path, overrides={"seed": seed}, allow_outside=True)
     return replace(scene, spec=scene.spec.model_copy(update={"seed": seed}))
+
+
+def _draws_looks(scene: Scene) -> bool:
+    """Whether layouts differ in how objects or shapes look, which splats and meshes in the browser do not show."""
+    drawn = any(entry.appearance is not None for entry in scene.spec.objects)
+    return drawn or any(shape.materials for shape in scene.spec.shapes)
 
 
 def changed_light(light: LightSpec, *, position: Any = None, target: Any = None, strength: Any = None) -> LightSpec:

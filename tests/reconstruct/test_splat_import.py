@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import gaussforge
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mitsplat.asset import Asset
@@ -188,6 +190,59 @@ def test_surroundings_get_a_surface_to_drop_on(tmp_path: Path) -> None:
     scene = load_scene(tmp_path / "cell.yaml")
     assert scene.environments[0].name == "cell"
     assert scene.spec.region.max[0] <= 0.3
+
+
+SMALL = ImportSettings(
+    up="-y", units=0.1, views=8, view_size=64, surface=SurfaceSettings(voxels=24, faces=500, blur=1.0)
+)
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Imported]:
+    """A hundred Gaussians on a block as .ply, and what becomes of them: surroundings, to do without convex pieces."""
+    path = tmp_path_factory.mktemp("block") / "block.ply"
+    splats_on(trimesh.creation.box((1.0, 0.8, 0.5)), 100).save(path)
+    return path, import_splats(path, name="block", kind="environment", settings=SMALL)
+
+
+@pytest.mark.parametrize(
+    ("form", "precision"), [("spz", 2e-4), ("sog", 1e-4), ("ksplat", 1e-6), ("compressed.ply", 1e-3)]
+)
+def test_other_formats_become_what_a_ply_becomes(
+    block: tuple[Path, Imported], tmp_path: Path, form: str, precision: float
+) -> None:
+    source, one = block
+    path = tmp_path / f"block.{form}"
+    path.write_bytes(gaussforge.GaussForge().convert(source.read_bytes(), "ply", form)["data"])
+    other = import_splats(path, name="block", kind="environment", settings=SMALL)
+    assert other.found == one.found and other.removed == one.removed
+    splats, expected = other.asset.splats, one.asset.splats
+    means, expected_means = (each.means - each.means.mean(axis=0) for each in (splats, expected))  # each on its mesh
+    away, nearest = cKDTree(means).query(expected_means)  # some formats sort them
+    assert sorted(nearest) == list(range(len(expected)))
+    assert away.max() < 0.1 * precision
+    assert np.abs(splats.opacities[nearest] - expected.opacities).max() < 0.005
+    assert one.support is not None and other.support is not None
+    assert other.support.size == pytest.approx(one.support.size, abs=0.1 * precision * 4)
+
+
+def test_surroundings_without_anything_flat_are_imported_with_a_warning(tmp_path: Path) -> None:
+    splats_on(trimesh.creation.icosphere(3, 0.5), 100).save(tmp_path / "ball.ply")
+    found = import_splats(tmp_path / "ball.ply", name="ball", kind="environment", settings=SMALL)
+    assert found.support is None
+    assert any(miss.startswith("no horizontal surface was found") for miss in found.misses)
+
+
+@pytest.mark.parametrize("form", ["spz", "sog", "ksplat", "compressed.ply"])
+def test_what_is_left_of_a_torn_file_is_refused_in_one_sentence(tmp_path: Path, form: str) -> None:
+    splats_on(trimesh.creation.icosphere(2, 0.5), 100).save(tmp_path / "a.ply")
+    data = gaussforge.GaussForge().convert((tmp_path / "a.ply").read_bytes(), "ply", form)["data"]
+    path = tmp_path / f"torn.{form}"
+    for torn in (b"", data[:30], data[: len(data) // 2], b"\0" * len(data)):
+        path.write_bytes(torn)
+        with pytest.raises(InputError, match=f"torn.{form}: ") as raised:
+            import_splats(path, name="a")
+        assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,8 @@ def use_page(browser: Any, scene_file: Path) -> None:
     until(lambda: redness(screen(browser)[:, 490:770]) > 0.005)  # of the splats
     first = render(browser)
     assert redness(first) > 0.005
+    written = [area.get_attribute("value") for area in browser.find_elements(By.TAG_NAME, "textarea")]
+    assert not [text for text in written if "camera:" in text]  # nobody has moved it yet
 
     browser.find_element(By.CSS_SELECTOR, "[role=slider]").send_keys(Keys.ARROW_RIGHT)  # the next frame
     until(lambda: changed(first))

@@ -179,9 +179,13 @@ def test_the_file_is_read_again_and_a_fault_keeps_the_last_good_scene(shown):
     assert sentence.startswith(str(shown.path))
     assert "must be above min along z (got -1, min is 0.02)" in sentence
     kept = set(shown.page._shown)
-    data["shapes"].append({"name": "post", "box": {"size": [0.1, 0.1, 0.5]}, "visible": True})
+    assert not shown.scene_page._plain.visible
+    drawn = [{"kind": "checker"}, {"kind": "noise"}]
+    post = {"name": "post", "box": {"size": [0.1, 0.1, 0.5]}, "visible": True, "materials": drawn}
+    data["shapes"].append(post)
     write(shown.path, data)
     shown.wait(lambda: "/shapes/post" in shown.page._shown)
+    assert shown.scene_page._plain.visible  # which of them the browser does not show
     assert shown.told.alerts[-1] is None
     assert "/shapes/table" in kept
     shown.picture()

@@ -90,3 +90,13 @@ def test_wheel_ships_package_and_plugins(tmp_path: Path) -> None:
     assert expected <= names
     assert {"mitsplat/plugins/splats.py", "mitsplat/plugins/splat_proxy.py", "mitsplat/cli/__init__.py"} <= expected
     assert not any(name.startswith(("tests/", "plugins/", "scenes/", "benchmarks/")) for name in names)
+
+
+@pytest.mark.parametrize("first", ["mitsplat", "mitsuba"])
+def test_plugins_are_there_whichever_is_imported_first(first: str) -> None:
+    """``import mitsplat`` waits for Mitsuba, whose variant may be chosen before and after."""
+    chosen = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')"
+    lines = {"mitsplat": f"import mitsplat\n{chosen}", "mitsuba": f"{chosen}\nimport mitsplat"}[first]
+    code = f"{lines}\nprint(type(mi.load_dict({{'type': 'splat_proxy'}})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("<class 'mitsplat.plugins.splat_proxy."), done.stderr

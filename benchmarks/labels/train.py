@@ -1,11 +1,10 @@
 """A dataset read by Ultralytics as it is, compared with the manifest, and one epoch trained on it.
 
-    pip install ultralytics
+    pip install '.[train]'
     python -m benchmarks.labels.train DATASET [--size 320] [--batch 6]
 
-Ultralytics is no dependency of mitsplat; 8.4 is what this was written for. The masks are those that its loader hands
-to the loss, at the images' own size, so what is measured is the whole way: text, resampling, letterbox and filling. The
-network starts without weights, on the CPU, and nothing is downloaded.
+The masks are those that its loader hands to the loss, at the images' own size, so what is measured is the whole way:
+text, resampling, letterbox and filling. The network starts without weights, on the CPU, and nothing is downloaded.
 """
 
 from __future__ import annotations

@@ -36,6 +36,9 @@ from mitsplat.asset import Asset, read_mesh
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import given_masks
 from mitsplat.capture.photos import Prepared
+from mitsplat.detector.evaluation import truth_of
+from mitsplat.detector.sets import read_set
+from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene.scene import load_scene
@@ -170,6 +173,32 @@ def make_samples(folder: Path) -> None:
     (folder / "model/cameras.txt").write_text("1 PINHOLE 32 24 40 40 16 12\n")
     (folder / "model/images.txt").write_text("1 1 0 0 0 0 0 1 1 a.png\n5 6 1\n2 1 0 0 0 0.1 0 1 1 b.png\n5 6 1\n")
     (folder / "model/points3D.txt").write_text("1 0 0 1 9 9 9 0.1 1 0 2 0\n")
+    _labelled(folder, rng)
+
+
+def _labelled(folder: Path, rng: np.random.Generator) -> None:
+    """A YOLO and a COCO folder."""
+    for name in ("yolo/images", "yolo/labels", "coco"):
+        (folder / name).mkdir(parents=True)
+    for name in ("yolo/images/a.png", "coco/a.png"):
+        Image.fromarray(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)).save(folder / name)
+    (folder / "yolo/data.yaml").write_text("train: images\nval: images\nnames:\n  0: nut\n  1: bolt\n")
+    (folder / "yolo/labels/a.txt").write_text("0 0.1 0.2 0.5 0.2 0.4 0.6\n1 0.5 0.5 0.9 0.5 0.7 0.9\n")
+    runs = {"size": [24, 32], "counts": [100, 5, 19, 5, 639]}
+    given = [[[4, 4, 12, 4, 8, 12]], runs, {"size": [24, 32], "counts": "T35c00\\c0"}]
+    annotations = [
+        {"id": i, "image_id": 5, "category_id": 2, "bbox": [4, 4, 8, 8], "iscrowd": 0, "segmentation": segmentation}
+        for i, segmentation in enumerate(given)
+    ]
+    images = [{"id": 5, "file_name": "a.png", "width": 32, "height": 24}]
+    content = {"images": images, "annotations": annotations, "categories": [{"id": 2, "name": "nut"}]}
+    (folder / "coco/labels.json").write_text(json.dumps(content))
+
+
+def _read_labelled(folder: Path) -> None:
+    """Read a set and all that is made of it."""
+    truth_of(read_set(folder, "train"), masks=True)
+    write_data([read_set(folder, "train")], folder.parent / "data")
 
 
 def _transforms(folder: Path) -> None:
@@ -213,6 +242,10 @@ READERS: Mapping[str, Reader] = {
     "COLMAP cameras": Reader("model/cameras.txt", _colmap, slow=True),
     "COLMAP images": Reader("model/images.txt", _colmap, slow=True),
     "mask": Reader("masks/a.png.png", _masks),
+    "YOLO data.yaml": Reader("yolo/data.yaml", lambda folder: _read_labelled(folder / "yolo")),
+    "YOLO labels": Reader("yolo/labels/a.txt", lambda folder: _read_labelled(folder / "yolo")),
+    "YOLO image": Reader("yolo/images/a.png", lambda folder: _read_labelled(folder / "yolo")),
+    "COCO labels": Reader("coco/labels.json", lambda folder: _read_labelled(folder / "coco")),
 }
 
 

@@ -222,7 +222,7 @@ def _text(rle: dict[str, Any]) -> dict[str, Any]:
 def _yaml(path: Path) -> dict[str, Any]:
     try:
         content = YAML(typ="safe", pure=True).load(path)
-    except (OSError, ValueError, YAMLError) as error:
+    except (OSError, ValueError, RecursionError, YAMLError) as error:
         raise InputError(f"{path}: cannot be read as YAML ({str(error).splitlines()[0]})") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: must name the images and classes of a YOLO dataset")
@@ -231,7 +231,7 @@ def _yaml(path: Path) -> dict[str, Any]:
 
 def _class_names(content: dict[str, Any], path: Path) -> tuple[str, ...]:
     names = content.get("names")
-    if isinstance(names, dict) and sorted(names) == list(range(len(names))):
+    if isinstance(names, dict) and names.keys() == set(range(len(names))):
         names = [names[i] for i in range(len(names))]
     if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
         raise InputError(f"{path}: names must be different classes, numbered from 0 (got {str(names)[:80]})")
@@ -451,11 +451,11 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                 rle = coco_mask.frPyObjects(given, height, width)
             else:
                 rle = {"size": [height, width], "counts": str(given["counts"]).encode("ascii")}
-            if int(coco_mask.area(rle)) == 0:
+            if not coco_mask.decode(rle).any():  # which refuses run lengths that are not of as many pixels
                 raise InputError(f"{place}: segmentation must cover a pixel")
         except InputError:
             raise
-        except (KeyError, TypeError, ValueError, IndexError, UnicodeError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
             raise InputError(f"{place}: segmentation must be polygons or run lengths ({error})") from error
     crowd = bool(annotation.get("iscrowd"))
     return Instance(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), crowd)

@@ -151,6 +151,13 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         r"000009.jpg: is torn",
     ),
     "labels": (lambda root: [path.unlink() for path in root.glob("labels/*/*")], "there is no label of its images"),
+    "listed": (
+        lambda root: (
+            (root / "data.yaml").write_text("train: some.txt\nnames: [disc, box]\n"),
+            (root / "some.txt").write_text("./images/train/000000.png\n./images/train/none.png\n"),
+        ),
+        r"images/train/none.png: cannot be read \(No such file",
+    ),
     "names": (lambda root: (root / "data.yaml").write_text("train: images/train\nnames: [a, a]\n"), "names must be"),
     "yaml": (lambda root: (root / "data.yaml").write_text("train: [\n"), "data.yaml: cannot be read as YAML"),
     "nothing": (lambda root: [path.write_text("") for path in root.glob("labels/*/*")], "nothing is labelled"),

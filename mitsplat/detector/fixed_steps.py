@@ -24,9 +24,11 @@ from ultralytics.data.augment import Mosaic
 from ultralytics.data.build import InfiniteDataLoader, seed_worker
 from ultralytics.models.yolo.detect.train import DetectionTrainer
 from ultralytics.models.yolo.segment.train import SegmentationTrainer
+from ultralytics.nn.tasks import torch_safe_load
 from ultralytics.utils.torch_utils import strip_optimizer
 
 from mitsplat.arrays import Int64Array
+from mitsplat.detector.libraries import UNREADABLE
 from mitsplat.errors import InputError, MissingResourceError
 
 EPOCH = 50
@@ -153,9 +155,11 @@ def epochs_done(run: Path) -> int:
         InputError: If it cannot be read.
     """
     try:
-        return int(torch.load(run / LAST, map_location="cpu", weights_only=False)["epoch"]) + 1
-    except Exception as error:
-        raise InputError(f"{run / LAST}: cannot be read ({error}): begin anew with --overwrite") from error
+        return int(torch_safe_load(run / LAST)[0]["epoch"]) + 1
+    except UNREADABLE as error:
+        raise InputError(
+            f"{run / LAST}: cannot be read ({type(error).__name__}): begin anew with --overwrite"
+        ) from error
 
 
 class _Plan(Sampler[int]):

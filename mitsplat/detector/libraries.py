@@ -13,9 +13,16 @@ import shutil
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 from mitsplat.errors import InputError, MissingResourceError
+
+UNREADABLE = (
+    *(OSError, EOFError, UnpicklingError, RuntimeError),
+    *(ValueError, LookupError, TypeError, AttributeError),
+)
+"""What reading a damaged file of weights raises."""
 
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,2})?")
 
@@ -158,13 +165,11 @@ def load_weights(path: Path) -> Any:
     Raises:
         InputError: If it is none of Ultralytics.
     """
-    import pickle
-
     from ultralytics.nn.tasks import load_checkpoint
 
     if not path.is_file() or path.suffix != ".pt":
         raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {path})")
     try:
         return load_checkpoint(path)[0]
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, pickle.UnpicklingError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read as weights of Ultralytics ({type(error).__name__})") from error

@@ -160,7 +160,7 @@ def train_detector(
         check_weights(settings.weights, network, masks=masks)
     device, device_name = torch_device(settings.device)
     record = {
-        "settings": settings.decisive(),
+        "settings": settings.decisive() | ({} if photographs else {"share": None}),
         "masks": masks,
         "classes": list(sets[0].class_names),
         "datasets": [found.described() for found in sets],

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mitsplat.content_hash import file_hash
@@ -133,7 +134,7 @@ def test_a_run_is_not_gone_on_with_by_other_means(no_libraries: list[dict[str, A
     ):
         with pytest.raises(InputError, match=message):
             train_detector([cell], tmp_path / "run", _other(**changes))
-    assert train_detector([cell], tmp_path / "run", _other(workers=3, device="auto")).was_finished
+    assert train_detector([cell], tmp_path / "run", _other(workers=3, device="auto", share=0.9)).was_finished
     write_yolo(cell, {"train": 6})
     with pytest.raises(InputError, match="was begun with other images of datasets"):
         train_detector([cell], tmp_path / "run", TINY)
@@ -330,6 +331,17 @@ def test_an_interrupted_run_goes_on_to_the_same_number_of_steps(
     (tmp_path / "torn/weights/last.pt").write_bytes(b"torn")
     with pytest.raises(InputError, match=r"last\.pt: cannot be read .*: begin anew with --overwrite"):
         train("torn")
+
+
+@needs_ultralytics
+def test_a_step_is_not_made_smaller_where_memory_has_run_out(torchvision: None) -> None:
+    from mitsplat.detector import fixed_steps
+
+    trainer = SimpleNamespace(
+        train_loader=None, job=SimpleNamespace(plan=np.zeros((3, 16))), args=SimpleNamespace(imgsz=640)
+    )
+    with pytest.raises(MissingResourceError, match="run out with 16 images of 640 px a step: give a smaller --batch"):
+        fixed_steps._FixedSteps.get_dataloader(trainer, "images.txt")
 
 
 @needs_ultralytics

@@ -102,13 +102,13 @@ def evaluate(
 
     with command_log(json_log, "evaluate") as progress_bars, progress_bars() as progress:
         found = evaluate_detector(run, data, out, split=split, size=size, device=device, progress=progress)
-    for kind, words in (("box", "boxes"), ("mask", "masks")):
-        if kind in found.results:
-            typer.echo(f"{words}: {_scores(found.results[kind])}")
+    kinds = {kind: words for kind, words in (("box", "boxes"), ("mask", "masks")) if kind in found.results}
+    for kind, words in kinds.items():
+        typer.echo(f"{words}: {_scores(found.results[kind])}")
     for name, count in found.results["data"]["instances"].items():
-        scores = [found.results[kind]["classes"].get(name) for kind in ("box", "mask") if kind in found.results]
-        told = [f"{score['ap50_95']:.3f}" for score in scores if score]
-        typer.echo(f"  {name}: {count} labelled, AP50-95 {' of boxes, '.join(told) or 'unknown'}")
+        scores = {words: found.results[kind]["classes"].get(name) for kind, words in kinds.items()}
+        told = [f"{score['ap50_95']:.3f} ({words})" for words, score in scores.items() if score]
+        typer.echo(f"  {name}: {count} labelled" + (f", AP50-95 {', '.join(told)}" if told else ""))
     typer.echo(f"report: {found.page}")
 
 

@@ -56,7 +56,9 @@ def load_libraries() -> None:
         folder = tempfile.mkdtemp(prefix="mitsplat-ultralytics-")
         os.environ["YOLO_CONFIG_DIR"] = folder
         atexit.register(_remove, folder, os.getpid())
-    import ultralytics  # noqa: F401 - reads these variables as it is imported
+    from ultralytics.utils.events import events  # reads these variables as it is imported, if it was not before
+
+    events.enabled = False
 
 
 def check_torchvision() -> None:

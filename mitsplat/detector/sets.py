@@ -290,8 +290,8 @@ def _images(root: Path, entry: str) -> list[Path]:
 
 def _label_of(image: Path) -> Path:
     """The label of an image, for which Ultralytics takes ``labels`` for the last ``images`` of its path."""
-    before, found, after = str(image).rpartition("/images/")
-    return Path(f"{before}/labels/{after}" if found else str(image)).with_suffix(".txt")
+    before, found, after = f"/{image}".rpartition("/images/")
+    return Path(f"{before}/labels/{after}"[1:] if found else image).with_suffix(".txt")
 
 
 def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, int]) -> Iterator[Instance]:

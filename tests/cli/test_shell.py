@@ -195,9 +195,8 @@ def test_detectors_learn_as_documented(desk: Path) -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
 def test_python_examples_run_as_they_stand(desk: Path, page: Path) -> None:
     """Each page's in one process, after the commands above, which have made the datasets that some read."""
-    known = blocks(page, "python")
-    if not find_spec("torch"):
-        known = [text for text in known if "import torch" not in text and "from torch" not in text]
+    # A loop over endless frames, with a detector of the reader's, is for tests/frames/test_torch_dataset.py.
+    known = [text for text in blocks(page, "python") if "import torch" not in text and "from torch" not in text]
     if not (desk / "runs").is_dir():
         known = [text for text in known if "runs/" not in text]
     code = "\n".join(known)

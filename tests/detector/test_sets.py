@@ -51,6 +51,12 @@ def test_a_split_is_what_was_asked_for(tmp_path: Path) -> None:
         read_set(alone, "val")
 
 
+def test_the_folder_that_one_is_in_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_yolo(tmp_path, {"train": 2})
+    monkeypatch.chdir(tmp_path)
+    assert [sample.name for sample in read_set(".", "train").samples] == [f"images/train/00000{i}.png" for i in (0, 1)]
+
+
 def test_a_list_of_images_and_a_path_are_followed(tmp_path: Path) -> None:
     root = write_yolo(tmp_path / "all", {"train": 3})
     (root / "chosen.txt").write_text("./images/train/000001.png\n")

@@ -61,6 +61,10 @@ class SceneReader:
                 (one["id"], one["asset"], one["label"]) == (label.id, asset, True) for one in drawn
             ):
                 yield f"{label.name} is none of the objects that were drawn"
+        left_out = {one["id"] for one in frame.record.get("left_out", ())}
+        for label in frame.instances:
+            if label.id in left_out:
+                yield f"{label.name} is labelled, though its layout lacks it"
         if frame.record.get("empty") and frame.instances:
             yield f"has {len(frame.instances)} labels, though its layout is an empty one"
 

@@ -226,6 +226,9 @@ def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
     typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
+    if summary.incomplete:
+        lack = f"{summary.incomplete} layouts lack objects that did not come to rest"
+        typer.echo(f"left out: {_counts(summary.left_out)}; {lack}")
     typer.echo(f"contact sheet: {summary.contact_sheet}")
     if summary.unlabelled and whole:
         raise PartialResultError(

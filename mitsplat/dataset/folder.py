@@ -326,7 +326,8 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
         "device": device,
         "mitsplat": __version__,
-        "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}}),  # frames may be added
+        # Frames may be added, and what a run bears changes none.
+        "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}, "settle": {"incomplete"}}),
         "classes": list(scene.class_names),
         "keypoints": [list(names) for names in catalogue.keypoint_names],
         "assets": list(catalogue.assets),

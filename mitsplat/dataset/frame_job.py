@@ -19,7 +19,7 @@ from mitsplat.errors import PartialResultError
 from mitsplat.files import Record, link_file, storage_errors, write_file, write_text
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
-from mitsplat.scene.layout import Layout
+from mitsplat.scene.layout import Layout, NothingRests
 from mitsplat.scene.scene import Scene, layout_of
 
 if TYPE_CHECKING:
@@ -62,7 +62,10 @@ class FrameMaker:
     def settled(self, index: int, note: Note) -> str:
         """A layout as JSON."""
         note(f"settling layout {index}")
-        layout = self.settle(self.scene, index, progress=lambda text: note(f"layout {index}: {text}"))
+        try:
+            layout = self.settle(self.scene, index, progress=lambda text: note(f"layout {index}: {text}"))
+        except NothingRests as nothing:
+            layout = nothing.layout
         return json.dumps(layout.to_json())
 
     def _layout(self, index: int, note: Note) -> Layout:

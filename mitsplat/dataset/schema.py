@@ -205,6 +205,13 @@ class _Place(_Stored):
     background: _Backing | None = None
 
 
+class _LeftOut(_Stored):
+    id: Annotated[int, Field(ge=1, le=65535)]
+    asset: Count
+    name: str
+    reason: str
+
+
 class _Record(_Stored):
     index: Count
     layout: Count
@@ -222,6 +229,7 @@ class _Record(_Stored):
     viewpoint: _Viewpoint | None = None
     place: _Place | None = None
     empty: bool = False
+    left_out: list[_LeftOut] = []
     order_error: _OrderError | None = None
 
 

@@ -19,9 +19,10 @@ Shards are datasets of their own that share everything but their frames; :mod:`m
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Generator
-from contextlib import closing
+from collections.abc import Generator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,6 +41,7 @@ from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note, Progress
+from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, layout_of
 
 
@@ -56,6 +58,8 @@ class DatasetSummary:
         dropped: What was not labelled, by the reasons of :class:`mitsplat.labels.labels.Labels`.
         marked: Labelled instances below a threshold, by the marks of :class:`mitsplat.labels.labels.InstanceLabel`.
         contact_sheet: Picture of some frames with their labels drawn.
+        incomplete: Layouts that lack objects, because no draw with them came to rest.
+        left_out: Those objects by name.
         unlabelled: Whether there are objects, but no image has a label.
     """
 
@@ -67,6 +71,8 @@ class DatasetSummary:
     dropped: dict[str, int]
     marked: dict[str, int]
     contact_sheet: Path
+    incomplete: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
     unlabelled: bool = False
 
 
@@ -112,7 +118,8 @@ def write_dataset(
     Raises:
         InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
             :mod:`mitsplat.dataset.prospects`), the folder cannot be written, is in use, holds something else, or holds
-            a dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else.
+            a dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else, or
+            more layouts lack objects than ``settle.incomplete`` says.
         MissingResourceError: If the disk is full, the device is not here, or memory does not suffice for one frame.
         PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
     """
@@ -152,12 +159,16 @@ def write_dataset(
             note(f"device {chosen}: {chosen.reason}")
         if layouts:
             append_run(out, workers, chosen.kind, [gpu.name for gpu in chosen.gpus])
+        shortfall = Shortfall(scene, -(-count // scene.spec.output.views))
+        for layout in sorted({layout_of(scene, index) for index in wanted}):
+            shortfall.read(out / f"layouts/{layout:04d}.json")
         make = FrameMaker(scene, catalogue, out, render or render_frame, settle or settle_layout)
         with closing(_results(make, layouts, workers, cluster, chosen, note)) as results:
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
                 note(f"frame {record['index']}")
+                shortfall.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
         return counts.summary(out, rendered=sum(map(len, layouts.values())))
@@ -183,6 +194,44 @@ def _results(
                 yield parcel.unpack(make.out), parcel.seconds
 
 
+class Shortfall:
+    """Refuses a dataset of which more layouts lack objects than the scene bears.
+
+    Args:
+        scene: With its ``settle.incomplete``.
+        layouts: Of the whole dataset, all its shards together.
+    """
+
+    def __init__(self, scene: Scene, layouts: int) -> None:
+        self._scene, self._layouts = scene, layouts
+        self._lacking: dict[int, Sequence[tuple[str, str]]] = {}
+
+    def read(self, path: Path) -> None:
+        """Count a layout that an earlier run settled, if it did."""
+        with suppress(FileNotFoundError):
+            layout = Layout.from_json(json.loads(path.read_bytes()))
+            self.add(layout.index, [(self._scene.assets[one.asset].name, one.reason) for one in layout.left_out])
+
+    def add(self, layout: int, left_out: Sequence[tuple[str, str]]) -> None:
+        """Count a layout that lacks objects of these names, for these reasons.
+
+        Raises:
+            InputError: If too many do.
+        """
+        if not left_out:
+            return
+        self._lacking[layout] = left_out
+        share = self._scene.spec.settle.incomplete
+        if len(self._lacking) > share * self._layouts:
+            told = Counter(f"{name}: {reason}" for objects in self._lacking.values() for name, reason in objects)
+            often = "; ".join(f"{count} x {text}" for text, count in told.most_common(3))
+            raise InputError(
+                f"{self._scene.path}: at most a share of settle.incomplete = {share:g} of the {self._layouts} layouts "
+                f"may lack objects that do not come to rest (got {len(self._lacking)}, among them {often}); "
+                "`mitsplat check` tries each object alone"
+            )
+
+
 @dataclass
 class FrameCounts:
     """What is counted while a dataset's records are read once."""
@@ -191,6 +240,7 @@ class FrameCounts:
     instances: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     marked: Counter[str] = field(default_factory=Counter)
+    left_out: dict[int, Counter[str]] = field(default_factory=dict)
     placed: bool = False
 
     def add(self, record: Record) -> None:
@@ -201,6 +251,8 @@ class FrameCounts:
         self.dropped.update(labels["dropped"])
         self.placed |= bool(labels["instances"] or any(labels["dropped"].values()))
         self.marked.update(mark for label in labels["instances"] for mark in label["marks"])
+        if record.get("left_out"):
+            self.left_out[record["layout"]] = Counter(one["name"] for one in record["left_out"])
 
     def summary(self, out: Path, rendered: int) -> DatasetSummary:
         """What is in a finished dataset, ``rendered`` frames of it new."""
@@ -212,6 +264,8 @@ class FrameCounts:
             instances=dict(sorted(self.instances.items())),
             dropped=dict(self.dropped),
             marked=dict(sorted(self.marked.items())),
+            incomplete=len(self.left_out),
+            left_out=dict(sorted(sum(self.left_out.values(), Counter[str]()).items())),
             contact_sheet=out / SHEET,
             unlabelled=self.placed and not self.instances,
         )

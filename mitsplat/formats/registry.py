@@ -94,8 +94,13 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
         record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
         if spec.regions and not given:
             regions = draw_regions(spec, plan.layout)
-            for drawn, region in zip(record["objects"], regions, strict=True):
-                drawn["region"] = spec.region_names[region]
+            for drawn in record["objects"]:
+                drawn["region"] = spec.region_names[regions[drawn["id"] - 1]]
+    if frame.layout.left_out:
+        record["left_out"] = [
+            {"id": one.id, "asset": one.asset, "name": catalogue.assets[one.asset], "reason": one.reason}
+            for one in frame.layout.left_out
+        ]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
     if place := draw_place(spec, frame.index, frame.layout.index).to_json(spec):

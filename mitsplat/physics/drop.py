@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -24,14 +24,14 @@ from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.contents import draw_environment, draw_objects, draw_regions
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, RestCertificate
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, LeftOut, NothingRests, RestCertificate
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
 
 _REACH = 5e-3  # gaps beyond this are not measured [m]
-# What may be wrong with a layout at rest [m], besides gaps.
-_DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT = 3e-4, 5e-4
+# How deep objects at rest may be in others [m], or as a share of their size where that is more: a scan's pieces err so.
+_DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _DEEPEST_SHARE = 3e-4, 5e-4, 0.003
 _DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scene file says so [m]
 _NEAREST = 5e-4  # what is scattered is farther apart than this [m]
 _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
@@ -64,6 +64,29 @@ class _Ground:
     obstacles: tuple[PlacedSurface, ...]
     contact_finder: ContactFinder
     bounds: tuple[Float64Array, Float64Array]
+
+
+@dataclass(frozen=True, eq=False)
+class _Dealt:
+    """An object that is drawn for a layout, the pose that the file gives it if any, and the region it starts in."""
+
+    id: int
+    asset: int
+    given: Float64Array | None
+    region: int
+
+
+_Fault = tuple[str, set[PlacedSurface]]
+"""What is wrong with objects at rest, and with which of them."""
+
+
+@dataclass(frozen=True)
+class _Refusal:
+    """Why a draw cannot be used, the positions of the objects whose fault that is, and a sentence if there is more."""
+
+    reason: str
+    blamed: Sequence[int]
+    sentence: str = ""
 
 
 @dataclass(frozen=True)
@@ -107,67 +130,105 @@ class Drop:
     def settle(self, index: int) -> Layout:
         """Draw poses until a layout holds.
 
+        After ``settle.attempts`` draws what was at fault in all of them is left out, or else what was most often, and
+        the others are drawn anew.
+
         Raises:
-            InputError: If objects find no room, or no draw holds.
+            InputError: If objects find no room, though each of them would alone.
+            NothingRests: If no draw holds, of however few objects.
         """
-        spec, refused, capacity = self.scene.spec, [], 1.0
-        assets, given = draw_objects(self.scene, index)
-        if not assets:
+        dealt = self._dealt(index)
+        if not dealt:
             return Layout(index, (), NOTHING_TO_REST)
-        frictions, number = self._draw_frictions(index), self._ground_of(index)
-        regions = draw_regions(spec, index)
-        obstacles = self._grounds[number].obstacles
-        for attempt in range(spec.settle.attempts):
-            start = self.draw_poses(
-                assets, random_stream(spec.seed, "object poses", index, attempt), given, number, regions
-            )
-            world = self._world(assets, frictions, capacity, number)
-            world.reset(start)
-            outcome = self._run(world, number, regions, given)
-            reason = outcome.refused
-            if reason == OVERFLOW:
-                capacity *= 2
-            if not reason:
-                resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
-                clearances = all_clearances(resting, obstacles, reach=_REACH)
-                gaps = _support_gaps(resting, clearances)
-                reason = _fault(clearances, gaps, obstacles) or self._disarray(
-                    resting, clearances, obstacles, start, outcome.poses, given, regions
-                )
-            if reason:
-                refused.append(reason)
-                continue
-            certificate = RestCertificate(
-                rested=True,
-                inside=True,
-                overflow=False,
-                time_to_rest=outcome.time,
-                max_speed=outcome.max_speed,
-                max_spin=outcome.max_spin,
-                surface_motion=outcome.surface_motion,
-                collider_penetration=_deepest(pair for pair in clearances if pair.second in obstacles),
-                pair_penetration=_deepest(pair for pair in clearances if pair.second not in obstacles),
-                support_gap=max(gaps.values()),
-                standoff=max(self._objects[asset].standoff for asset in assets),
-                attempts=attempt + 1,
-                refused=tuple(refused),
-            )
-            return Layout(index, self._instances(assets, outcome.poses), certificate)
-        reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused).items())
-        raise InputError(
-            f"{self.scene.path}: layout {index} must come to rest in settle.attempts = {spec.settle.attempts} "
-            f"draws (got {reasons})"
+        attempts = self.scene.spec.settle.attempts
+        refused: list[str] = []
+        left_out: list[LeftOut] = []
+        sentence = ""
+        while dealt:
+            faults: dict[int, list[str]] = {one.id: [] for one in dealt}
+            for _ in range(attempts):
+                found = self._try(index, dealt, refused)
+                if isinstance(found, Layout):
+                    return replace(found, left_out=tuple(left_out))
+                refused.append(found.reason)
+                sentence = found.sentence
+                for position in found.blamed:
+                    faults[dealt[position].id].append(found.reason)
+            gone = [one for one in dealt if len(faults[one.id]) == attempts]
+            for one in gone or [max(dealt, key=lambda one: (len(faults[one.id]), one.id))]:
+                reason, times = Counter(faults[one.id] or refused[-attempts:]).most_common(1)[0]
+                left_out.append(LeftOut(one.id, one.asset, f"{reason} in {times} of {attempts} draws"))
+                dealt.remove(one)
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused[:attempts]).items())
+        must = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
+        nothing = replace(NOTHING_TO_REST, attempts=len(refused), refused=tuple(refused))
+        raise NothingRests(sentence or f"{self.scene.path}: {must}", Layout(index, (), nothing, tuple(left_out)))
+
+    def _dealt(self, index: int) -> list[_Dealt]:
+        """What is drawn for a layout."""
+        assets, given = draw_objects(self.scene, index)
+        rows = zip(assets, given, draw_regions(self.scene.spec, index), strict=True)
+        return [_Dealt(number, *row) for number, row in enumerate(rows, start=1)]
+
+    def _try(self, index: int, dealt: Sequence[_Dealt], refused: Sequence[str]) -> Layout | _Refusal:
+        """Drop what was dealt from poses that are drawn for the next time."""
+        number = self._ground_of(index)
+        assets, given = tuple(one.asset for one in dealt), [one.given for one in dealt]
+        regions, obstacles = [one.region for one in dealt], self._grounds[number].obstacles
+        rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
+        try:
+            start = self.draw_poses(assets, rng, given, number, regions)
+        except InputError as error:
+            # An object that is too large for its region leaves the others room.
+            alone = [
+                draw_poses([item], obstacles, self.scene.spec.all_regions, rng) is None
+                for item in self._items(assets, given, regions)
+            ]
+            if not any(alone):
+                raise
+            return _Refusal("no room for it", np.flatnonzero(alone).tolist(), str(error))
+        world = self._world(assets, self._draw_frictions(index), 2.0 ** refused.count(OVERFLOW), number)
+        world.reset(start)
+        outcome = self._run(world, number, regions, given)
+        if outcome.refused:
+            return _Refusal(outcome.refused, outcome.blamed)
+        resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
+        clearances = all_clearances(resting, obstacles, reach=_REACH)
+        gaps = _support_gaps(resting, clearances)
+        fault = _fault(clearances, gaps, obstacles) or self._disarray(
+            resting, clearances, obstacles, start, outcome.poses, given, regions
         )
+        if fault is not None:
+            reason, blamed = fault
+            return _Refusal(reason, [position for position, item in enumerate(resting) if item in blamed])
+        certificate = RestCertificate(
+            rested=True,
+            inside=True,
+            overflow=False,
+            time_to_rest=outcome.time,
+            max_speed=outcome.max_speed,
+            max_spin=outcome.max_spin,
+            surface_motion=outcome.surface_motion,
+            collider_penetration=_deepest(pair for pair in clearances if pair.second in obstacles),
+            pair_penetration=_deepest(pair for pair in clearances if pair.second not in obstacles),
+            support_gap=max(gaps.values()),
+            standoff=max(self._objects[asset].standoff for asset in assets),
+            attempts=len(refused) + 1,
+            refused=tuple(refused),
+        )
+        return Layout(index, self._instances(dealt, outcome.poses), certificate)
 
     def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
         """Poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
-        assets, given = draw_objects(self.scene, layout.index)
-        if not assets:
+        there = {instance.id for instance in layout.instances}
+        dealt = [one for one in self._dealt(layout.index) if one.id in there]
+        if not dealt:
             return
+        assets, given = tuple(one.asset for one in dealt), [one.given for one in dealt]
         certificate = layout.certificate
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
-        number, regions = self._ground_of(layout.index), draw_regions(self.scene.spec, layout.index)
+        number, regions = self._ground_of(layout.index), [one.region for one in dealt]
         world = self._world(assets, self._draw_frictions(layout.index), capacity, number)
         world.reset(self.draw_poses(assets, rng, given, number, regions))
         moments = [world.poses]
@@ -314,16 +375,7 @@ class Drop:
         Raises:
             InputError: If objects find no room.
         """
-        items = [
-            Item(
-                asset,
-                self._objects[asset].surface,
-                self._objects[asset].body.outline,
-                given[i] if given else None,
-                regions[i] if regions else 0,
-            )
-            for i, asset in enumerate(assets)
-        ]
+        items = self._items(assets, given, regions)
         region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
         obstacles = self._grounds[ground].obstacles
         poses = draw_poses(items, obstacles, self.scene.spec.all_regions, rng)
@@ -342,6 +394,20 @@ class Drop:
             f"{self._in_way(obstacles)}, settle.arrangement {arrangement})"
         )
 
+    def _items(
+        self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None
+    ) -> list[Item]:
+        return [
+            Item(
+                asset,
+                self._objects[asset].surface,
+                self._objects[asset].body.outline,
+                given[i] if given else None,
+                regions[i] if regions else 0,
+            )
+            for i, asset in enumerate(assets)
+        ]
+
     def _in_way(self, obstacles: Sequence[PlacedSurface]) -> str:
         """Of what takes most of the region: how much, and its name; empty if nothing takes a tenth."""
         points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
@@ -358,30 +424,31 @@ class Drop:
         end: Float64Array,
         given: Sequence[Float64Array | None],
         regions: Sequence[int],
-    ) -> str:
-        """How a layout at rest is not arranged as asked for, or empty."""
+    ) -> _Fault | None:
+        """How a layout at rest is not arranged as asked for, if it is not."""
         laid = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < widest_gap(0.0):
-                return f"{pair.first.name} rests against the enclosure"
+                return f"{pair.first.name} rests against the enclosure", {pair.first}
         for pair in clearances:
             if laid[pair.first] == "scatter" and pair.second not in obstacles and pair.distance < _NEAREST:
-                return f"{pair.first.name} and {pair.second.name} touch"
+                return f"{pair.first.name} and {pair.second.name} touch", {pair.first, pair.second}
         # Angle between the world's vertical, carried along by the object, and the vertical.
         tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
-        for item, tilt, pose in zip(resting, tilts, given, strict=True):
-            if laid[item] in ("stack", "upright") and pose is None and tilt > _FALLEN:
-                return f"{item.name} fell over"
-        return ""
+        fallen = [
+            item
+            for item, tilt, pose in zip(resting, tilts, given, strict=True)
+            if laid[item] in ("stack", "upright") and pose is None and tilt > _FALLEN
+        ]
+        return (f"{fallen[0].name} fell over", set(fallen)) if fallen else None
 
     def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:
         return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
 
-    def _instances(self, assets: Sequence[int], poses: Float64Array) -> tuple[Instance, ...]:
-        classes = map(self.scene.class_index, assets)
+    def _instances(self, dealt: Sequence[_Dealt], poses: Float64Array) -> tuple[Instance, ...]:
         return tuple(
-            Instance(number + 1, asset, class_index, pose)
-            for number, (asset, class_index, pose) in enumerate(zip(assets, classes, poses, strict=True))
+            Instance(one.id, one.asset, self.scene.class_index(one.asset), pose)
+            for one, pose in zip(dealt, poses, strict=True)
         )
 
 
@@ -395,15 +462,20 @@ def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearan
 
 def _fault(
     clearances: Sequence[Clearance], gaps: Mapping[PlacedSurface, float], obstacles: Sequence[PlacedSurface]
-) -> str:
-    """Why objects at rest are not where they could be, or empty."""
+) -> _Fault | None:
+    """Why objects at rest are not where they could be, if they are not."""
     for pair in sorted(clearances, key=lambda pair: pair.distance):
-        if -pair.distance > (_DEEPEST_IN_COLLIDER if pair.second in obstacles else _DEEPEST_IN_OBJECT):
-            return f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
+        if pair.second in obstacles:
+            deepest = max(_DEEPEST_IN_COLLIDER, _DEEPEST_SHARE * pair.first.size)
+        else:
+            deepest = max(_DEEPEST_IN_OBJECT, _DEEPEST_SHARE * max(pair.first.size, pair.second.size))
+        if -pair.distance > deepest:
+            reason = f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
+            return reason, {pair.first, pair.second}
     for item, gap in gaps.items():
         if gap > widest_gap(item.size):
-            return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest"
-    return ""
+            return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest", {item}
+    return None
 
 
 def _deepest(pairs: Iterable[Clearance]) -> float:

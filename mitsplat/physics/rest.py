@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
 from mitsplat.physics.worlds import Body, ContactOverflow, World
@@ -31,6 +32,7 @@ class Outcome:
         surface_motion: Farthest that a point of any body moved in the second after that [m]; infinite if refused.
         max_speed, max_spin: Of the fastest body at the end of that second [m/s, rad/s].
         poses: World-from-body transforms then, shape (N, 4, 4).
+        blamed: Positions of the bodies for which it is refused.
     """
 
     refused: str
@@ -39,6 +41,7 @@ class Outcome:
     max_spin: float
     surface_motion: float
     poses: Float64Array = field(repr=False)
+    blamed: tuple[int, ...] = ()
 
 
 def run_to_rest(
@@ -64,14 +67,18 @@ def run_to_rest(
     try:
         return _run_to_rest(world, max_time, bounds, fastest, observe)
     except ContactOverflow:
-        reason = OVERFLOW
-    except _Refused as refused:
-        reason = str(refused)
-    return Outcome(reason, world.time, np.inf, np.inf, np.inf, world.poses)
+        refused = _Refused(OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
+    except _Refused as error:
+        refused = error
+    return Outcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses, refused.blamed)
 
 
 class _Refused(Exception):
-    """Why a drop cannot be used."""
+    """Why a drop cannot be used, and for which bodies."""
+
+    def __init__(self, reason: str, bodies: npt.ArrayLike) -> None:
+        super().__init__(reason)
+        self.blamed = tuple(np.flatnonzero(bodies).tolist())
 
 
 def _run_to_rest(
@@ -83,19 +90,22 @@ def _run_to_rest(
 ) -> Outcome:
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
-    since, rest, motion = 0.0, world.poses, 0.0
+    since, rest = 0.0, world.poses
+    motion = np.zeros(len(world.bodies))
     while world.time - since < _WATCH_TIME:
         world.let_roll(world.time - since >= _QUIET_TIME)
         poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)
-        motion = max(motion, _surface_motion(world.bodies, rest, poses))
-        if motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _MOTION):
-            since, rest, motion = world.time, poses, 0.0
+        motion = np.maximum(motion, _surface_motion(world.bodies, rest, poses))
+        moving = motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _MOTION)
+        if moving.any():
+            since, rest = world.time, poses
+            motion = np.zeros(len(world.bodies))
         if since >= max_time:
-            raise _Refused(f"not at rest within {max_time:g} s")
+            raise _Refused(f"not at rest within {max_time:g} s", moving)
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
-    return Outcome("", since, speed, spin, motion, world.poses)
+    return Outcome("", since, speed, spin, float(motion.max()), world.poses)
 
 
 def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fastest: float) -> Float64Array:
@@ -103,7 +113,7 @@ def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fas
     world.advance()
     poses, velocities = world.poses, world.velocities
     if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
-        raise _Refused("the simulation diverged")
+        raise _Refused("the simulation diverged", ~np.isfinite(poses).all(axis=(1, 2)))
     speeds = np.linalg.norm(velocities[:, 0], axis=1)
     if speeds.max() > fastest:
         velocities[:, 0] *= np.minimum(1.0, fastest / np.maximum(speeds, fastest))[:, None]
@@ -111,7 +121,7 @@ def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fas
     centres = _centres(world.bodies, poses)
     outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
     if outside.any():
-        raise _Refused(f"{int(outside.sum())} left the enclosure")
+        raise _Refused(f"{int(outside.sum())} left the enclosure", outside)
     return poses
 
 
@@ -132,10 +142,13 @@ def _mean_speeds(
     return float(way.max()) / seconds, float(turn.max()) / seconds
 
 
-def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> float:
-    """Farthest that a point of any body is displaced between two sets of poses [m]."""
+def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> Float64Array:
+    """Farthest that a point of each body is displaced between two sets of poses [m], shape (N,)."""
     moved = after - before
-    return max(
-        float(np.linalg.norm(body.outline @ change[:3, :3].T + change[:3, 3], axis=1).max())
-        for body, change in zip(bodies, moved, strict=True)
+    return np.array(
+        [
+            np.linalg.norm(body.outline @ change[:3, :3].T + change[:3, 3], axis=1).max()
+            for body, change in zip(bodies, moved, strict=True)
+        ],
+        dtype=np.float64,
     )

@@ -89,13 +89,29 @@ NOTHING_TO_REST = RestCertificate(
 """Of a layout that physics had no part in: one without objects, or one whose poses are made up."""
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """An object that was drawn for a layout and is not in it, because no draw with it came to rest.
+
+    Attributes:
+        id: Instance id that it would have, and that nothing else has.
+        asset: Index into the scene's assets.
+        reason: What became of it, and how often.
+    """
+
+    id: int
+    asset: int
+    reason: str
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the objects of one layout lie."""
+    """Where the objects of one layout lie, and which of those that were drawn are not there."""
 
     index: int
     instances: tuple[Instance, ...]
     certificate: RestCertificate
+    left_out: tuple[LeftOut, ...] = ()
 
     @classmethod
     def of_poses(
@@ -144,6 +160,7 @@ class Layout:
                 for instance in self.instances
             ],
             "certificate": self.certificate.to_json(),
+            **({"left_out": [dict(vars(one)) for one in self.left_out]} if self.left_out else {}),
         }
 
     @classmethod
@@ -158,4 +175,21 @@ class Layout:
             certificate=RestCertificate(
                 **{**stored["certificate"], "refused": tuple(stored["certificate"]["refused"])}
             ),
+            left_out=tuple(LeftOut(**one) for one in stored.get("left_out", ())),
         )
+
+
+class NothingRests(InputError):
+    """No object of a layout came to rest.
+
+    Attributes:
+        layout: The layout without any of them, with which a dataset goes on.
+    """
+
+    def __init__(self, text: str, layout: Layout) -> None:
+        super().__init__(text)
+        self.layout = layout
+
+    def __reduce__(self) -> tuple[type[NothingRests], tuple[str, Layout]]:
+        """For the way from a worker process."""
+        return type(self), (str(self), self.layout)

@@ -12,6 +12,7 @@ from mitsplat.spec_types import (
     Positive,
     Scale,
     StrictModel,
+    Unit,
     UnitRange,
     Vec3,
     check_weights,
@@ -192,7 +193,16 @@ class Settle(StrictModel):
 
     arrangement: Arrangement = Field("drop", description="Random drop, pile, sparse scatter, stacks or upright.")
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
-    attempts: int = Field(5, ge=1, description="Redraws before a layout is given up.")
+    attempts: int = Field(
+        5, ge=1, description="Draws of poses before what does not come to rest is left out of a layout."
+    )
+    # Not shown, because layouts do not depend on it.
+    incomplete: Unit = Field(
+        0.2,
+        repr=False,
+        description="Share of layouts that may lack objects because they did not come to rest; a dataset of which more "
+        "do ends with an error.",
+    )
     timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
     stepper: Literal["warp", "mujoco"] = Field(
         "warp", description="Newton's MuJoCo solver on Warp, or MuJoCo in C: double precision and nothing to compile."

@@ -154,7 +154,7 @@ def test_code_that_decides_layouts_is_hashed():
     types = {
         *("arrays.BoolArray", "arrays.Float32Array", "arrays.Float64Array", "arrays.Int64Array", "progress.Note"),
         *("asset.Asset", "errors.InputError", "scene.scene.Scene"),
-        *(f"scene.layout.{name}" for name in ("Instance", "Layout", "RestCertificate")),
+        *(f"scene.layout.{name}" for name in ("Instance", "Layout", "LeftOut", "NothingRests", "RestCertificate")),
         *(f"spec.objects.{name}" for name in ("Arrangement", "ObjectPose")),
         *(f"spec.shapes.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
         *("spec.spec.SceneSpec", "spec_types.Vec3"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
 from mitsplat.mesh import mass_properties
-from mitsplat.physics.settle import warp_settings
+from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.scene.scene import Scene, load_scene, plan_frame
@@ -160,6 +161,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         yield Finding("formats", False, str(error), "change output.formats, or what they need")
     faults = list(run_faults(scene))
     yield from faults or doubts(scene)
+    if not faults:
+        yield from _rest(scene)
     assets = {
         id(asset.splats): asset for asset in (*scene.environments, *scene.assets)
     }.values()  # several may have one name
@@ -189,6 +192,25 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     yield Finding(
         "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
     )
+
+
+def _rest(scene: Scene) -> Iterator[Finding]:
+    """Which objects do not come to rest even alone."""
+    rested = set()
+    try:
+        for name, arrangement, refused in try_alone(scene):
+            if not refused:
+                rested.add(name)
+                continue
+            reason, times = Counter(refused).most_common(1)[0]
+            said = f"it{reason.removeprefix(name)}" if reason.startswith(f"{name} ") else reason
+            text = f"{name} cannot take arrangement {arrangement}: {said} in {times} of {len(refused)} tries"
+            remedy = "choose another settle.arrangement, mend its mesh or its up axis, or leave it out of objects"
+            yield Finding("rest", False, text, remedy)
+    except InputError as error:
+        yield Finding("rest", False, str(error), "change what objects rest on, or their region")
+    if rested:
+        yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
 
 
 def _sight(scene: Scene, extent: Float64Array) -> Finding:

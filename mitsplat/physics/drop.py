@@ -157,7 +157,8 @@ class Drop:
             gone = [one for one in dealt if len(faults[one.id]) == attempts]
             for one in gone or [max(dealt, key=lambda one: (len(faults[one.id]), one.id))]:
                 reason, times = Counter(faults[one.id] or refused[-attempts:]).most_common(1)[0]
-                left_out.append(LeftOut(one.id, one.asset, f"{reason} in {times} of {attempts} draws"))
+                said = reason.removeprefix(f"{self.scene.assets[one.asset].name} ")
+                left_out.append(LeftOut(one.id, one.asset, f"{said} in {times} of {attempts} draws"))
                 dealt.remove(one)
         reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused[:attempts]).items())
         must = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
@@ -217,6 +218,16 @@ class Drop:
             refused=tuple(refused),
         )
         return Layout(index, self._instances(dealt, outcome.poses), certificate)
+
+    def try_alone(self, asset: int, region: int, tries: int) -> list[str]:
+        """Why an object alone does not come to rest as a region's arrangement asks for, for each try; [] if it does."""
+        refused: list[str] = []
+        while len(refused) < tries:
+            found = self._try(0, [_Dealt(1, asset, None, region)], refused)
+            if isinstance(found, Layout):
+                return []
+            refused.append(found.reason)
+        return refused
 
     def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
         """Poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""

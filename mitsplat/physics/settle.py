@@ -22,6 +22,7 @@ from mitsplat.errors import InputError
 from mitsplat.progress import Note
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, whole
+from mitsplat.spec.objects import Arrangement
 from mitsplat.variant import one_at_a_time
 from mitsplat.warp_start import quiet_warp
 
@@ -96,6 +97,31 @@ def settle_layouts(
     """
     layouts = {index: [index] for index in indices}
     return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
+
+
+def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangement, list[str]]]:
+    """Drop each object alone, until it rests: its asset, the arrangement, and why each try failed if all did.
+
+    Of an asset's sizes one is tried. MuJoCo in C steps, whatever the scene asks for: it has nothing to compile.
+
+    Raises:
+        InputError: If there is nothing to rest on.
+    """
+    settle = scene.spec.settle.model_copy(update={"stepper": "mujoco"})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"settle": settle}))
+    tried = set()
+    with warp_settings():
+        from mitsplat.physics.drop import drop_of  # Newton compiles as these settings say
+
+        drop = drop_of(scene, lambda text: None)
+        for entry, pool in zip(scene.spec.objects, scene.pools, strict=True):
+            for region in () if entry.poses else scene.spec.regions_of(entry):
+                arrangement = scene.spec.all_regions[region][1]
+                for asset in pool:
+                    name = scene.assets[asset].name
+                    if (name, region) not in tried:
+                        tried.add((name, region))
+                        yield name, arrangement, drop.try_alone(asset, region, tries)
 
 
 def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:

@@ -46,6 +46,7 @@ class _Statistics:
         self.images, self.classes, self.per_image = Counter[str](), Counter[str](), Counter[int]()
         self.shares = {key: Histogram((0, 1)) for key in _SHARES}
         self.order_errors: list[tuple[float, float]] = []
+        self.left_out: dict[int, list[str]] = {}
         cells = 24, max(2, round(24 * size[1] / size[0]))
         self.places, self.sizes = HeatMap(size, cells), HeatMap(size, cells)
 
@@ -56,6 +57,8 @@ class _Statistics:
         self.classes.update(label["class"] for label in labels["instances"])
         if error := record.get("order_error"):
             self.order_errors.append((error["largest"], error["mean"]))
+        if record.get("left_out"):
+            self.left_out[record["layout"]] = [f"{one['name']} ({one['reason']})" for one in record["left_out"]]
         boxes = np.array([label["box"] for label in labels["instances"]], dtype=np.float64).reshape(-1, 4)
         self.places.add((boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2)
         self.sizes.add(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
@@ -108,6 +111,7 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
         "Instances": str(sum(counted.classes.values())),
         "Not labelled": _counts(audit.dropped),
         "Marked": _counts(audit.marked),
+        **({"Left out": _left_out(counted)} if counted.left_out else {}),
         "Error of the order of blending, estimated": _order_error(counted),
         "Labels from": content["scene"]["labels"]["source"],
         "Formats": ", ".join(content["scene"]["output"]["formats"]),
@@ -118,6 +122,13 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
     }
     lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
     return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2><table>{lines}</table></section>'
+
+
+def _left_out(counted: _Statistics) -> str:
+    """What did not come to rest, most frequent first."""
+    told = Counter(text for objects in counted.left_out.values() for text in objects).most_common(5)
+    often = ", ".join(f"{count} {text}" for text, count in told)
+    return f"{len(counted.left_out)} layouts lack objects that did not come to rest: {often}"
 
 
 def _order_error(counted: _Statistics) -> str:

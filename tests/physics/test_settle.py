@@ -6,6 +6,7 @@ import ast
 import gc
 import hashlib
 import json
+import pickle
 import re
 import shutil
 import subprocess
@@ -23,12 +24,13 @@ from scipy.stats import kstest
 
 from mitsplat.dataset.prospects import layout_faults
 from mitsplat.errors import InputError
-from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
+from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts, try_alone
 from mitsplat.render.places import draw_place
 from mitsplat.scene.contents import draw_regions
-from mitsplat.scene.layout import Layout
+from mitsplat.scene.layout import Layout, NothingRests
 from mitsplat.scene.scene import load_scene
 from tests.bodies import STEPPERS, lowest, pose_at
+from tests.conftest import box_asset
 
 pytestmark = pytest.mark.usefixtures("physics")
 
@@ -278,6 +280,81 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
     scene_data["settle"] = {"max_time": 0.05, "attempts": 3}
     with pytest.raises(InputError, match=r"layout 0 must come to rest .*3 x not at rest within 0\.05 s"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+
+
+@pytest.fixture
+def needle_scene(scene_data, write_scene, tmp_path):
+    """Nuts beside a needle on its point, its weight beside that."""
+    cone = trimesh.creation.cone(0.004, 0.08, sections=16)
+    cone.vertices[:, 2] = 0.08 - cone.vertices[:, 2]
+    cone.vertices[:, 0] += 0.2 * cone.vertices[:, 2]
+    cone.invert()
+    replace(box_asset("needle"), mesh=cone, pieces=()).save(tmp_path / "assets/needle")
+    scene_data["objects"] = [{"asset": "assets/needle"}, {"asset": "assets/nut", "count": 2}]
+    scene_data["settle"] = {"arrangement": "upright", "attempts": 2, "stepper": "mujoco"}
+    return write_scene
+
+
+def test_what_cannot_stand_is_left_out_and_the_others_keep_their_numbers(needle_scene, scene_data):
+    scene = load_scene(needle_scene(scene_data))
+    layout = settle_layout(scene, 0, cached=False)
+    assert [(one.id, scene.assets[one.asset].name) for one in layout.instances] == [(2, "nut"), (3, "nut")]
+    (gone,) = layout.left_out
+    assert (gone.id, scene.assets[gone.asset].name) == (1, "needle")
+    assert gone.reason == "fell over in 2 of 2 draws"
+    assert layout.certificate.refused == ("needle fell over",) * 2
+    assert layout.certificate.attempts == 3
+    assert Layout.from_json(json.loads(json.dumps(layout.to_json()))).left_out == layout.left_out
+    *moments, _ = replay_layout(scene, layout, interval=0.04)
+    start = np.array([one.world_from_object[:3, 3] for one in moments[0].instances])
+    resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
+    assert start.shape == (2, 3)
+    assert np.abs(start - resting).max() < 2e-3  # they were put down where they lie
+
+
+def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(needle_scene, scene_data):
+    scene_data["objects"] = [{"asset": "assets/needle", "count": 2}]
+    scene = load_scene(needle_scene(scene_data))
+    with pytest.raises(NothingRests, match=r"layout 1 must come to rest .*[(]got 2 x needle fell over[)]") as error:
+        settle_layout(scene, 1, cached=False)
+    again = pickle.loads(pickle.dumps(error.value))
+    assert again.layout.instances == ()
+    assert {one.id for one in again.layout.left_out} == {1, 2}
+    assert str(again) == str(error.value)
+
+
+def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, write_scene, tmp_path, monkeypatch):
+    from mitsplat.physics import placement
+
+    monkeypatch.setattr(placement, "_DRAWS", 2)
+    box_asset("plank", (0.02, 0.02, 0.3)).save(tmp_path / "assets/plank")
+    scene_data["objects"] = [{"asset": "assets/nut"}, {"asset": "assets/plank"}]
+    scene_data["settle"] = {"arrangement": "upright", "attempts": 1, "stepper": "mujoco"}
+    scene = load_scene(write_scene(scene_data))
+    layout = settle_layout(scene, 0, cached=False)
+    assert [one.id for one in layout.instances] == [1]
+    assert [(one.id, one.reason) for one in layout.left_out] == [(2, "no room for it in 1 of 1 draws")]
+    scene_data["objects"] = [{"asset": "assets/plank"}]
+    with pytest.raises(NothingRests, match="region must be large enough"):
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+
+
+def test_each_object_is_tried_alone(needle_scene, scene_data):
+    tried = list(try_alone(load_scene(needle_scene(scene_data))))
+    assert tried == [("needle", "upright", ["needle fell over"] * 3), ("nut", "upright", [])]
+    scene_data["settle"]["arrangement"] = "drop"
+    assert not any(refused for _, _, refused in try_alone(load_scene(needle_scene(scene_data))))
+
+
+@pytest.mark.parametrize(("size", "depth", "refused"), [(0.05, 3.5e-4, True), (0.2, 3.5e-4, False), (0.2, 7e-4, True)])
+def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
+    """0.3 mm, or 0.3 % of its size: 0.6 mm of 200."""
+    from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface
+    from mitsplat.physics.drop import _fault
+
+    item, table = (PlacedSurface(name, Surface(trimesh.creation.box((size,) * 3))) for name in ("part", "table"))
+    fault = _fault([Clearance(item, table, -depth)], {item: 0.0}, [table])
+    assert (fault is not None) == refused
 
 
 def test_a_region_too_small_is_an_error(scene_data, write_scene):

@@ -161,8 +161,6 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         yield Finding("formats", False, str(error), "change output.formats, or what they need")
     faults = list(run_faults(scene))
     yield from faults or doubts(scene)
-    if not faults:
-        yield from _rest(scene)
     assets = {
         id(asset.splats): asset for asset in (*scene.environments, *scene.assets)
     }.values()  # several may have one name
@@ -187,6 +185,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     support |= spec.environment_collides and bool(scene.environments)
     text = "objects have something to lie on" if support else "nothing collides with objects"
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
+    if support and not faults:
+        yield from _rest(scene)
     yield _sight(scene, extent)
     lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in assets)
     yield Finding(

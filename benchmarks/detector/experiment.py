@@ -24,7 +24,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from benchmarks.record import figure, recording
-from mitsplat.detector import Matches, TrainSettings, evaluate_detector, train_detector
+from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
 
 HERE = Path(__file__).parent
 SAMPLES = 200
@@ -128,7 +128,7 @@ def measure(options: argparse.Namespace) -> None:
     out = work / "found" / f"{options.arm}-{options.seed}.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps([one for one in detections if one["score"] >= 0.01]))
-    matches = Matches(truth, detections)
+    matches = DetectionMatches(truth, detections)
     whole = matches.average_precision()
     figure(whole.map50_95, "", "map50_95")
     figure(whole.map50, "", "map50")

@@ -110,10 +110,13 @@ def write_scene(folder: Path, meshes: Mapping[str, trimesh.Trimesh], count: int,
 
 def try_settle(scene: Scene, index: int) -> Layout | None:
     try:
-        return settle_layout(scene, index, cached=False)
+        layout = settle_layout(scene, index, cached=False)
     except InputError as error:
         print(f"  given up: {error}")
         return None
+    for one in layout.left_out:
+        print(f"  given up: {scene.assets[one.asset].name} {one.reason}")
+    return None if layout.left_out else layout
 
 
 def show(name: str, layouts: list[Layout], given_up: int, seconds: float) -> None:

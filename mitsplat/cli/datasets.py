@@ -227,8 +227,9 @@ def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
     typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
     if summary.incomplete:
-        lack = f"{summary.incomplete} layouts lack objects that did not come to rest"
-        typer.echo(f"left out: {_counts(summary.left_out)}; {lack}")
+        typer.echo(
+            f"layouts that lack objects which did not come to rest: {summary.incomplete} ({_counts(summary.left_out)})"
+        )
     typer.echo(f"contact sheet: {summary.contact_sheet}")
     if summary.unlabelled and whole:
         raise PartialResultError(
@@ -436,6 +437,9 @@ def settle(
         settled = sorted(found, key=lambda layout: layout.index)
     # In 80 columns, as where output goes to a file, its headings would be cut to a letter or two.
     Console(width=max(Console().width, 120)).print(certificate_table(settled))
+    for layout in settled:
+        for one in layout.left_out:
+            typer.echo(f"left out of layout {layout.index}: {loaded.assets[one.asset].name} ({one.reason})")
     if preview:
         pictures = write_preview(loaded, settled[0], out)
         typer.echo(f"drop: {out} ({pictures} pictures)")

@@ -20,7 +20,7 @@ from mitsplat.content_hash import ContentHash
 from mitsplat.engine.pool import run_frames
 from mitsplat.errors import InputError
 from mitsplat.progress import Note
-from mitsplat.scene.layout import Layout
+from mitsplat.scene.layout import Layout, NothingRests
 from mitsplat.scene.scene import Scene, whole
 from mitsplat.spec.objects import Arrangement
 from mitsplat.variant import one_at_a_time
@@ -57,8 +57,8 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
         cached: Whether a layout that was settled before is taken from the cache, and this one kept there.
 
     Raises:
-        InputError: If the index is no layout's, the region is too small for the objects, or no draw of poses comes to
-            rest within the limits.
+        InputError: If the index is no layout's, the region is too small for the objects, or none of them comes to rest
+            within the limits.
     """
     index = whole(index, "layout")
     if index < 0:
@@ -84,13 +84,18 @@ class _SettleOne:
     cached: bool
 
     def __call__(self, index: int, note: Note, /) -> Layout:
-        return settle_layout(self.scene, index, progress=note, cached=self.cached)
+        try:
+            return settle_layout(self.scene, index, progress=note, cached=self.cached)
+        except NothingRests as nothing:
+            return nothing.layout
 
 
 def settle_layouts(
     scene: Scene, indices: Iterable[int], *, workers: int = 1, progress: Note | None = None, cached: bool = True
 ) -> Iterator[Layout]:
     """Settle many layouts over processes, in the order in which they are finished; see :func:`settle_layout`.
+
+    One of which nothing comes to rest has no objects, and names those that it lacks.
 
     Several layouts in one simulation (Newton's worlds) cost about as much each as one alone on a CPU, and would wait
     for the slowest (``python -m benchmarks.physics.settle worlds``).

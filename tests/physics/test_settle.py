@@ -321,6 +321,8 @@ def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(n
     assert again.layout.instances == ()
     assert {one.id for one in again.layout.left_out} == {1, 2}
     assert str(again) == str(error.value)
+    (layout,) = settle_layouts(scene, [1], cached=False)
+    assert layout.to_json() == again.layout.to_json()
 
 
 def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, write_scene, tmp_path, monkeypatch):

@@ -40,6 +40,9 @@ MIN_AGREEMENT = 0.7
 _WORK_EDGE = 480
 """Longer edge at which GrabCut works [px]."""
 
+_FAR_OFF = 100
+"""Sizes of the image within which a point must be projected to count."""
+
 _ROUNDS = 3
 _EXTENSIONS = 4
 _RING = 0.1
@@ -164,8 +167,9 @@ def geometric_masks(points: Float64Array, bare: Bare | None = None) -> MaskMaker
     def make(photo: Photo) -> BoolArray:
         camera, bgr, _ = _reduced(photo)
         pixels, _ = camera.project(points)
-        free = _free(bare, camera, bgr)
-        return _enlarged(_grab(bgr, pixels[np.isfinite(pixels).all(axis=1)], free), photo.camera)
+        # A point that all but lies in the camera's plane may be at any number of pixels, more than an integer holds.
+        near = (np.abs(pixels) < _FAR_OFF * max(camera.width, camera.height)).all(axis=1)
+        return _enlarged(_grab(bgr, pixels[near], _free(bare, camera, bgr)), photo.camera)
 
     return make
 

@@ -276,6 +276,18 @@ def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> Non
     assert not behind(capture.photos[1]).any()
 
 
+def test_a_point_beside_the_camera_changes_no_mask(captured: tuple[Path, Path, CaptureResult]) -> None:
+    """It is projected to more pixels than an integer holds."""
+    capture = captured[2].capture
+    photo, points = capture.photos[1], object_points(capture)
+    right, _, forward, centre = photo.camera.world_from_camera[:3].T
+    beside = centre + right + 1e-12 * forward
+    assert np.nanmax(np.abs(photo.camera.project(beside)[0])) > 2**31
+    mask = geometric_masks(points)(photo)
+    assert mask.any()
+    np.testing.assert_array_equal(geometric_masks(np.concatenate([points, beside[None]]))(photo), mask)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int) -> None:
     folder = tmp_path / "photos"

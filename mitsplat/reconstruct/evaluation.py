@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import mitsuba as mi
 import numpy as np
@@ -125,6 +125,7 @@ class Verdict:
         watertight: Whether the mesh encloses a volume.
         solid: Whether it must, as that of an object.
         refinement: What came of refining the mesh, as one clause, or None where that was not asked for.
+        causes: What was measured of the photos, one clause each, by the threshold that it makes an asset miss.
     """
 
     photos: int
@@ -143,6 +144,7 @@ class Verdict:
     watertight: bool
     solid: bool
     refinement: str | None = None
+    causes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def registered(self) -> float:
@@ -168,10 +170,14 @@ class Verdict:
                 value, limit = getattr(self, name), getattr(thresholds, name)
                 if value is not None and sign * value < sign * limit:
                     rule = "at least" if sign > 0 else "at most"
-                    found.append(f"{sentence} ({rule} {limit:g} is wanted): {_ADVICE[name]}")
+                    found.append(f"{sentence} ({rule} {limit:g} is wanted): {self._advice(name)}")
         if self.solid and not self.watertight:
-            found.append(f"the mesh is open (a closed one is wanted): {_ADVICE['watertight']}")
+            found.append(f"the mesh is open (a closed one is wanted): {self._advice('watertight')}")
         return tuple(found)
+
+    def _advice(self, name: str) -> str:
+        """What would help, behind what was measured."""
+        return "; ".join(filter(None, [self.causes.get(name), _ADVICE[name]]))
 
 
 def show_held_out(
@@ -222,6 +228,7 @@ def judge(
     isolation: Isolation | None,
     psnr: float | None,
     refinement: RefinedMesh | None = None,
+    causes: Mapping[str, str] | None = None,
 ) -> Verdict:
     """Figures from held-out views of splats and mesh."""
     masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
@@ -246,6 +253,7 @@ def judge(
         watertight=mesh is not None and is_closed(mesh),
         solid=isolation is not None,
         refinement=None if refinement is None else str(refinement),
+        causes=causes or {},
     )
 
 

@@ -16,6 +16,7 @@ from mitsplat.capture.capture import Capture
 from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
+from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
@@ -135,7 +136,13 @@ def reconstruct_asset(
     if progress is not None:
         progress(0, 1, "judging by held-out photos")
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
-    verdict = judge(capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement)
+    causes = None
+    if kind == "object":
+        seen = [sized_photo(photo, settings.view_size) for photo in capture.photos]
+        causes = find_causes(capture, seen)
+    verdict = judge(
+        capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes
+    )
     asset = Asset(
         name=name,
         class_name=class_name or name,

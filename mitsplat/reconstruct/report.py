@@ -14,6 +14,7 @@ from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.files import write_text
 from mitsplat.html import REPORT_FILE, eight_bit, figure_of, make_page, shrunk_image, verdict_of
+from mitsplat.reconstruct.causes import views_from
 from mitsplat.reconstruct.evaluation import HeldOutView, sized_photo
 from mitsplat.reconstruct.reconstruct import Reconstruction
 
@@ -140,10 +141,35 @@ def _cameras(capture: Capture) -> str:
             f'<figure><svg role="img" aria-label="cameras {caption}" viewBox="0 0 {_PLOT_WIDTH} {_PLOT_HEIGHT}">'
             f"{dots}{frusta}</svg><figcaption>{caption}</figcaption></figure>"
         )
+    if capture.up == "z":
+        figures.append(_directions(capture))
     return (
         f'<section aria-labelledby="cameras"><h2 id="cameras">Cameras</h2>'
         f"<p>{len(capture.photos)} cameras, {len(capture.points)} points.</p>"
         f'<div class="charts">{"".join(figures)}</div></section>'
+    )
+
+
+def _directions(capture: Capture) -> str:
+    """From where the object was photographed: straight above in the middle, the horizon around, below it beyond."""
+    offsets = views_from([photo.camera for photo in capture.photos])
+    heights = np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1)))
+    middle, reach = (_PLOT_WIDTH / 2, _PLOT_HEIGHT / 2), _PLOT_HEIGHT / 2 - 30
+    rings = "".join(
+        f'<circle cx="{middle[0]}" cy="{middle[1]}" r="{radius:.1f}" fill="none" stroke="#999"/>'
+        f'<text x="{middle[0] + 3}" y="{middle[1] - radius - 2:.1f}" font-size="11">{height}°</text>'
+        for height in (0, 20, 45)
+        for radius in (reach * (90 - height) / 90,)
+    )
+    flat = offsets[:, :2] / np.maximum(np.linalg.norm(offsets[:, :2], axis=1, keepdims=True), 1e-12)
+    places = np.array(middle) + reach * (90 - heights[:, None]) / 90 * flat * (1, -1)
+    dots = "".join(
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5"><title>{html.escape(photo.name)}</title></circle>'
+        for (x, y), photo in zip(places.tolist(), capture.photos, strict=True)
+    )
+    return (
+        f'<figure><svg role="img" aria-label="directions of the photos" viewBox="0 0 {_PLOT_WIDTH} {_PLOT_HEIGHT}">'
+        f"{rings}{dots}</svg><figcaption>directions, by height above the object</figcaption></figure>"
     )
 
 

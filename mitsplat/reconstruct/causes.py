@@ -1,0 +1,104 @@
+"""What in the photographs of an object keeps an asset from being better: measured, with what would change it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture
+
+Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
+"""Of each photo its camera, colours (H, W, 3) and mask (H, W), all of the same longest edge."""
+
+_BLURRED = 0.5
+_NAMED = 5
+_BANDS = ((0.0, 20.0), (20.0, 45.0), (45.0, 90.0))
+"""Heights above the horizon of the object's middle [degrees]; of the last, whose circle is small, one photo will do."""
+_SECTOR = 30.0
+_WIDEST_SECTORS = 3
+"""Of a band: neighbouring sectors [degrees] without a camera that are worth a word."""
+
+
+def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
+    """Causes by the name of the threshold that they make an asset miss, one clause each.
+
+    Args:
+        capture: The photos.
+        pictures: Of ``capture.photos``, in their order.
+    """
+    found = {}
+    if blurred := blurred_photos([photo.name for photo in capture.photos], pictures):
+        named = ", ".join(blurred[:_NAMED]) + (f" and {len(blurred) - _NAMED} more" if len(blurred) > _NAMED else "")
+        found["psnr"] = f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({named})"
+    if capture.up == "z" and (gaps := missing_views(views_from([photo.camera for photo in capture.photos]))):
+        found["mesh_iou"] = found["watertight"] = f"no photo is from {'; from '.join(gaps)}"
+    return found
+
+
+def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:
+    """Photos of which the object is less than half as sharp as of the median photo, the worst first.
+
+    Sharpness is the energy of the Laplacian relative to that of the gradient, which hardly depends on what is seen.
+    """
+    values = []
+    for _, rgb, mask in pictures:
+        grey = cv2.cvtColor(np.ascontiguousarray(rgb, dtype=np.float32), cv2.COLOR_RGB2GRAY)
+        # A photo's outline is as sharp as its mask: only what is inside of it counts.
+        seen = _inner(np.ones(grey.shape, dtype=bool) if mask is None else mask >= 0.5)
+        slopes = cv2.Sobel(grey, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_32F, 0, 1) ** 2
+        curvature = cv2.Laplacian(grey, cv2.CV_32F) ** 2
+        energy = float(slopes[seen].mean()) if seen.any() else 0.0
+        values.append(float(curvature[seen].mean()) / energy if energy > 0 else np.nan)
+    usual = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+    order = np.argsort(values, kind="stable")
+    return [names[i] for i in order if values[i] < _BLURRED * usual]
+
+
+def views_from(cameras: Sequence[Camera]) -> Float64Array:
+    """Centres (N, 3) of cameras, from the point that is nearest to all their axes."""
+    centres = np.array([camera.centre for camera in cameras])
+    axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+    return np.asarray(centres - middle)
+
+
+def missing_views(offsets: Float64Array) -> list[str]:
+    """Directions that no camera has, of cameras at ``offsets`` (N, 3) from an object, z up, in words."""
+    heights = np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1)))
+    turns = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360
+    sectors = round(360 / _SECTOR)
+    found = []
+    for low, high in _BANDS:
+        where = f"{low:.0f} to {high:.0f} degrees above it"
+        inside = (heights >= low) & (heights < high)
+        if not inside.any():
+            found.append(where)
+            continue
+        taken = np.bincount((turns[inside] // _SECTOR).astype(int), minlength=sectors) > 0
+        start, length = _longest_gap(taken)
+        if low < _BANDS[-1][0] and length >= _WIDEST_SECTORS:
+            turn = start * _SECTOR
+            found.append(f"{where}, {turn:.0f} to {(turn + length * _SECTOR) % 360:.0f} degrees around it")
+    return found
+
+
+def _longest_gap(taken: BoolArray) -> tuple[int, int]:
+    """First position and length of the longest run of False in a ring that is not all False."""
+    start = int(np.argmax(taken))
+    best, length = (0, 0), 0
+    for step in range(1, len(taken) + 1):
+        position = (start + step) % len(taken)
+        length = 0 if taken[position] else length + 1
+        if length > best[1]:
+            best = ((position - length + 1) % len(taken), length)
+    return best
+
+
+def _inner(mask: BoolArray) -> BoolArray:
+    """A mask without its border of three pixels."""
+    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((7, 7), dtype=np.uint8)) > 0)

@@ -13,10 +13,10 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.causes import find_causes
 from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object

@@ -162,14 +162,16 @@ def _directions(capture: Capture) -> str:
         for radius in (reach * (90 - height) / 90,)
     )
     flat = offsets[:, :2] / np.maximum(np.linalg.norm(offsets[:, :2], axis=1, keepdims=True), 1e-12)
-    places = np.array(middle) + reach * (90 - heights[:, None]) / 90 * flat * (1, -1)
+    beyond = reach * (90 - np.maximum(heights, -15)) / 90  # no farther below the horizon than the drawing reaches
+    places = np.array(middle) + beyond[:, None] * flat * (1, -1)
     dots = "".join(
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5"><title>{html.escape(photo.name)}</title></circle>'
         for (x, y), photo in zip(places.tolist(), capture.photos, strict=True)
     )
     return (
         f'<figure><svg role="img" aria-label="directions of the photos" viewBox="0 0 {_PLOT_WIDTH} {_PLOT_HEIGHT}">'
-        f"{rings}{dots}</svg><figcaption>directions, by height above the object</figcaption></figure>"
+        f'<g fill="currentColor">{rings}{dots}</g></svg>'
+        "<figcaption>directions, by height above the object</figcaption></figure>"
     )
 
 

@@ -12,6 +12,8 @@ import pytest
 import trimesh
 
 from mitsplat.asset import Asset
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.pipeline import CaptureResult, CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
@@ -19,6 +21,7 @@ from mitsplat.mesh_distance import Surface
 from mitsplat.reconstruct.evaluation import Verdict
 from mitsplat.reconstruct.pipeline import AssetJob, AssetResult, make_asset, make_photo_asset, read_fit
 from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
+from mitsplat.reconstruct.report import _directions
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.scene import load_scene
 from tests.conftest import KnownObject
@@ -236,3 +239,17 @@ def test_fits_that_are_not_there_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not the record of a fit"):
         read_fit(tmp_path)
     assert read_fit(tmp_path / "one.ply") == (tmp_path / "one.ply", None)
+
+
+def test_directions_of_photos_lie_in_their_drawing_straight_above_in_its_middle() -> None:
+    offsets = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 0.0, -1.0]])
+    cameras = [Camera.look_at(o, (0, 0, 0), up=(0.1, 0.2, 0.3), width=8, height=8, fov_x=40) for o in offsets]
+    photos = tuple(Photo(f"{number}.jpg", Path("none"), camera) for number, camera in enumerate(cameras))
+    capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8), up="z")
+    found = re.findall(r'<circle cx="([0-9.]+)" cy="([0-9.]+)" r="3.5"><title>', _directions(capture))
+    places = np.array(found, dtype=float)
+    middle = places[0]
+    assert ((places > 0) & (places < 2 * middle)).all()
+    right, below = places[1] - middle, places[3] - middle
+    np.testing.assert_allclose(2 * right, places[2] - middle, atol=0.2)  # 45 degrees are half of 90
+    assert right[0] > 0 and below[1] < 0  # y points up on the page

@@ -6,6 +6,7 @@ import argparse
 import copy
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 
@@ -168,6 +169,15 @@ def test_every_benchmark_keeps_its_figures() -> None:
     scripts = [path for path in record.ROOT.glob("benchmarks/*/*.py") if "__main__" in path.read_text()]
     assert len(scripts) > 25
     assert [path.name for path in scripts if "with recording(" not in path.read_text()] == []
+
+
+def test_every_benchmark_can_be_imported() -> None:
+    """What they take of the package is there, under that name; a process of its own, as some change the environment."""
+    modules = [path for path in record.ROOT.glob("benchmarks/*/*.py") if path.name != "__main__.py"]
+    names = sorted(".".join(path.relative_to(record.ROOT).with_suffix("").parts) for path in modules)
+    script = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)"
+    ended = subprocess.run([sys.executable, "-c", script, *names], cwd=record.ROOT, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_the_doctor_asks_for_what_was_measured() -> None:

@@ -1,0 +1,101 @@
+"""The experiment on detectors: its arms, the photographs that each run may see, and what is judged."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from benchmarks import record
+from benchmarks.detector import experiment
+from benchmarks.detector.packages import make_package
+from mitsplat.spec.spec import SceneSpec
+
+PLAN = experiment.read_arms()
+
+
+@pytest.mark.parametrize("name", PLAN["scenes"])
+def test_scenes_of_arms_may_be_written_so(tmp_path, name):
+    written = YAML(typ="safe").load(experiment.write_scene(tmp_path, name))
+    assert SceneSpec.model_validate(written).name == "groceries"
+
+
+def test_arms_learn_from_scenes_that_there_are():
+    assert all(set(arm.get("scenes", ())) <= set(PLAN["scenes"]) for arm in PLAN["arms"].values())
+    assert {change for changes in PLAN["scenes"].values() for change in changes} == set(PLAN["changes"])
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Path:
+    """Two photographs of each of five scenes, each with one object."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    images = []
+    for scene in (0, 1, 2, 3, 6):
+        for light in range(2):
+            name = f"scene_{scene:04d}_{light:04d}.jpg"
+            cv2.imwrite(str(folder / name), np.full((48, 64, 3), 90, dtype=np.uint8))
+            images.append({"id": len(images) + 1, "file_name": name, "width": 64, "height": 48})
+    labels = {
+        "images": images,
+        "annotations": [
+            {"id": i["id"], "image_id": i["id"], "category_id": 1, "bbox": [8, 8, 20, 20], "area": 400, "iscrowd": 0}
+            for i in images
+        ],
+        "categories": [{"id": 1, "name": "tin"}],
+    }
+    (folder / "labels.json").write_text(json.dumps(labels))
+    return tmp_path
+
+
+@pytest.mark.parametrize("arm", ["real", "hybrid", "synthetic"])
+def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm):
+    """A detector that finds what it has not learnt from, and nothing else: only leaving out scenes lets it see all."""
+    seen: dict[str, set[str]] = {}
+
+    def train(datasets: list[Path], run: Path, settings: Any, real: Path | None) -> Any:
+        learnt = datasets + ([real] if real else [])
+        seen[str(run)] = {path.name for folder in learnt for path in folder.glob("*.jpg")}
+        return SimpleNamespace(record={"finished": {"seconds": 1.0}})
+
+    def evaluate(run: Path, data: Path, **_: Any) -> Any:
+        truth = json.loads((data / "labels.json").read_text())
+        hidden = {"scene_0000_0000.jpg"} if arm == "synthetic" else seen[str(run)]
+        names = {image["id"]: image["file_name"] for image in truth["images"]}
+        found = [
+            {"image_id": a["image_id"], "category_id": 1, "bbox": a["bbox"], "score": 0.9}
+            for a in truth["annotations"]
+            if names[a["image_id"]] not in hidden
+        ]
+        run.mkdir(parents=True)
+        (run / "truth.json").write_text(json.dumps(truth))
+        (run / "detections.json").write_text(json.dumps(found))
+        return SimpleNamespace(path=run)
+
+    monkeypatch.setattr(experiment, "train_detector", train)
+    monkeypatch.setattr(experiment, "evaluate_detector", evaluate)
+    monkeypatch.setattr(record, "_open", [{}])
+    experiment.measure(argparse.Namespace(work=work, arm=arm, seed=0, weights=None, device="cpu", workers=0))
+    figures = {name: value for name, (value, _) in record._open[0].items()}
+    assert len(seen) == (1 if arm == "synthetic" else 2)
+    assert all(len(names) in (0, 4, 6) for names in seen.values())
+    assert figures["map50_95"] == pytest.approx(1.0 if arm != "synthetic" else 0.9, abs=0.01)
+    assert (figures["scene.1"], figures["scene.0"] < 1) == (pytest.approx(1.0), arm == "synthetic")
+    assert len(figures["samples"]) == experiment.SAMPLES
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_packages_are_closed_and_printed(seed):
+    package = make_package(seed)
+    assert np.ptp(np.asarray(package.visual.material.baseColorTexture).reshape(-1, 3), axis=0).max() > 60
+    assert (package.extents > 0.015).all() and (package.extents < 0.26).all()
+    package.merge_vertices(merge_tex=True, merge_norm=True)
+    assert package.is_watertight and package.volume > 0
+    assert package.visual.uv.min() >= 0 and package.visual.uv.max() <= 1

@@ -2,13 +2,13 @@
 
 Conventions (frames, units, colour) are stated in :mod:`mitsplat.splats`. Importing this package points Dr.Jit at a
 usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the current and any
-later variant, once Mitsuba is imported; heavy modules, Mitsuba among them, load when a name that needs them is first
-used.
+later variant, once Mitsuba is imported; heavy modules, Mitsuba among them, load when a name is first used.
 """
 
 from __future__ import annotations
 
 import importlib
+import threading
 from typing import TYPE_CHECKING, Any
 
 from mitsplat.gpu_memory import hide_full_gpus
@@ -20,6 +20,7 @@ from mitsplat.version import __version__ as __version__
 use_bundled_llvm()
 hide_full_gpus()
 
+_importing = threading.Lock()
 _HOME = {
     "Asset": "asset",
     "Camera": "camera",
@@ -86,6 +87,10 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
+        if not _HOME[name].startswith("detector."):
+            # Whole before several threads ask for it: Mitsuba puts another module in its place as it is imported.
+            with _importing:
+                importlib.import_module("mitsuba")
         return getattr(importlib.import_module(f"mitsplat.{_HOME[name]}"), name)
     raise AttributeError(f"module 'mitsplat' has no attribute {name!r}")
 
@@ -97,10 +102,15 @@ def __dir__() -> list[str]:
 def _register_plugins() -> None:
     import mitsuba as mi  # which is imported: this is what follows
 
-    from mitsplat.variant import register_plugins  # imports Mitsuba
+    def register(variant: str) -> None:
+        from mitsplat.variant import register_plugins  # imports Mitsuba
 
-    mi.detail.add_variant_callback(lambda _old, new: register_plugins(new))
-    register_plugins(mi.variant())
+        register_plugins(variant)
+
+    # Another thread may be importing what imports Mitsuba, and wait: nothing is imported before a variant is chosen.
+    mi.detail.add_variant_callback(lambda _old, new: register(new))
+    if mi.variant():
+        register(mi.variant())
 
 
 after_mitsuba(_register_plugins)

@@ -33,8 +33,6 @@ from mitsplat.view.parts import (
 
 _HALF_MAX = 200.0
 """Longest standard deviation that is sent: viser holds covariances as half floats, of which 65504 is the largest."""
-_VISERS_START = (3.0, 3.0, 3.0)
-"""Where viser's camera is until a browser has been told of ours."""
 _START_FOV = 0.9
 """Vertical field of view of a page that shows no camera's view [rad]."""
 
@@ -112,13 +110,20 @@ class Page:
         self._clicked = clicked
 
     def on_move(self, moved: Callable[[Any], object]) -> None:
-        """Whom to tell viser's camera when someone moves theirs."""
+        """Whom to tell viser's camera when someone moves theirs, once it has been where the page looks from."""
 
-        def tell(camera: Any) -> None:
-            if not np.allclose(camera.position, _VISERS_START):  # before a browser knows where to look
-                moved(camera)
+        def listen(client: Any) -> None:
+            begun = False
 
-        self._server.on_client_connect(lambda client: client.camera.on_update(tell))
+            def tell(camera: Any) -> None:
+                nonlocal begun
+                begun = begun or np.allclose(camera.position, self._server.initial_camera.position, atol=1e-4)
+                if begun:
+                    moved(camera)
+
+            client.camera.on_update(tell)
+
+        self._server.on_client_connect(listen)
 
     def add_handle(self, moved: Callable[[Float64Array], object]) -> Any:
         """Viser's handle to drag something by, hidden until it is needed; ``moved`` is told where to [m]."""

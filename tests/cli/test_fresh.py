@@ -47,6 +47,7 @@ def fresh(
 CALLS = {
     "Asset": "ms.Asset.load('assets/nut')",
     "Camera": "camera.project(np.zeros((1, 3)))",
+    "DetectionMatches": "assert np.isnan(ms.DetectionMatches(truth, []).average_precision().map50)",
     "Frame": "ms.Frame",
     "InputError": "ms.InputError('x')",
     "Labels": "ms.Labels",
@@ -56,7 +57,10 @@ CALLS = {
     "Scene": "ms.Scene",
     "SceneSpec": "ms.SceneSpec.model_json_schema()",
     "Splats": "ms.Splats.load('assets/nut/splats.ply')",
+    "TrainSettings": "assert ms.TrainSettings().steps",
+    "average_precision": "assert np.isnan(ms.average_precision(truth, []).map50_95)",
     "bake_asset": "assert len(bake('part.stl').asset.splats)",
+    "evaluate_detector": "refused(lambda: ms.evaluate_detector('no_run', 'no_data'))",
     "Renderer": "assert ms.Renderer(ms.load_scene('scene.yaml')).render(0).image.any()",
     "load_scene": "ms.load_scene('scene.yaml')",
     "make_scene": "ms.make_scene(ms.load_scene('scene.yaml').spec)",
@@ -65,6 +69,7 @@ CALLS = {
     "render_frame": "assert ms.render_frame(ms.load_scene('scene.yaml'), 0).image.any()",
     "render_splats": "assert ms.render_splats(ball(), camera).alpha.any()",
     "settle_layout": "assert ms.settle_layout(ms.load_scene('scene.yaml'), 0).certificate.rested",
+    "train_detector": "refused(lambda: ms.train_detector(['no_data'], 'run'))",
     "use_device": "assert ms.use_device('cpu').kind == 'cpu' and mitsuba.variant() == 'llvm_ad_rgb'",
     "write_dataset": "assert ms.write_dataset(ms.load_scene('scene.yaml'), 'out', frames=1, workers=1).frames == 1",
     "write_frames": "scene = ms.load_scene('scene.yaml'); ms.write_frames(scene, 'own', ms.render_frames(scene, 1))",
@@ -91,6 +96,17 @@ def bake(file, **options):
         gaussians=30, sh_degree=0, directions=4, samples=1, bounces=1, fit_steps=0, verify_views=0, sharpening=0
     )
     return ms.bake_asset(file, name="part", kind="environment", settings=few, **options)
+
+truth = {"images": [{"id": 1}], "annotations": [], "categories": [{"id": 1, "name": "tin"}]}
+
+def refused(call):
+    from mitsplat.errors import MissingResourceError
+
+    try:
+        call()
+    except (ms.InputError, MissingResourceError):  # the extra may be missing
+        return
+    raise AssertionError("nothing was refused")
 
 failed = {}
 for name, call in json.loads(sys.argv[1]).items():

@@ -28,11 +28,12 @@ from pycocotools import mask as coco_mask
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.arrays import Float64Array
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, SPLITS, is_inside
 from mitsplat.labels.polygons import fill_polygon, outline
+from mitsplat.masks import encode_mask
 from mitsplat.progress import Progress
 
 Split = Literal["train", "val", "test", "all"]
@@ -76,7 +77,8 @@ class Instance:
         if self.rle is not None:
             return self.rle
         if self.polygon is not None:
-            return encode(fill_polygon(self.polygon, width, height))
+            mask = fill_polygon(self.polygon, width, height)
+            return {"size": [height, width], "counts": encode_mask(mask, (0, 0, width, height), (width, height))}
         x0, y0, x1, y1 = self.box
         corners = [[x0, y0, x1, y0, x1, y1, x0, y1]]
         return _text(coco_mask.merge(coco_mask.frPyObjects(corners, height, width)))
@@ -210,11 +212,6 @@ def check_masks(found: LabelledSet) -> None:
             )
 
 
-def encode(mask: BoolArray) -> dict[str, Any]:
-    """COCO's compressed run-length code of a mask (height, width)."""
-    return _text(coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8)))
-
-
 def _text(rle: dict[str, Any]) -> dict[str, Any]:
     return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
 
@@ -263,7 +260,8 @@ def _yolo(
         else:
             text = ""
         instances = tuple(_yolo_instances(text, label, len(classes), (width, height)))
-        return Sample(image, _below(root, image), width, height, instances, content.add_text(text))
+        content.add(text)
+        return Sample(image, _below(root, image), width, height, instances, content.hexdigest())
 
     return LabelledSet(root, kind, split, classes, _all(read, images, root, progress))
 
@@ -332,8 +330,7 @@ def _clipped(points: Float64Array, size: tuple[int, int], place: str) -> Float64
 
 
 def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
-    path = _coco_file(root, split)
-    content = _coco_content(path)
+    path, content = _coco_file(root, split)
     try:
         categories = sorted(content["categories"], key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
@@ -356,7 +353,7 @@ def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
 
     def read(image: dict[str, Any]) -> Sample:
         file = find(str(image.get("file_name")))
-        width, height, digest = _look(file)
+        width, height, shown = _look(file)
         if (image.get("width"), image.get("height")) != (width, height):
             raise InputError(
                 f"{file}: must be as large as {path.name} says, {image.get('width')} x {image.get('height')} px, "
@@ -364,20 +361,25 @@ def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
             )
         found = by_image[image["id"]]
         instances = tuple(_coco_instance(a, index[a["category_id"]], (width, height), path) for a in found)
-        labels = json.dumps([names, found], sort_keys=True)
-        return Sample(file, _below(root, file), width, height, instances, digest.add_text(labels))
+        shown.add_json([names, found])
+        return Sample(file, _below(root, file), width, height, instances, shown.hexdigest())
 
     images = sorted(content["images"], key=lambda image: str(image.get("file_name")))
     return LabelledSet(root, "coco", split, names, _all(read, images, root, progress))
 
 
-def _coco_file(root: Path, split: Split) -> Path:
-    files = [path for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))]
-    files = [path for path in files if {"images", "annotations", "categories"} <= _keys(path)]
+def _coco_file(root: Path, split: Split) -> tuple[Path, dict[str, Any]]:
+    """The file of a folder that labels a split, and what it says."""
+    files = {path: _json(path) for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))}
+    files = {
+        path: content
+        for path, content in files.items()
+        if isinstance(content, dict) and {"images", "annotations", "categories"} <= content.keys()
+    }
     if len(files) > 1:
-        files = [path for path in files if split in path.stem] or files
+        files = {path: content for path, content in files.items() if split in path.stem} or files
     if len(files) == 1:
-        return files[0]
+        return next(iter(files.items()))
     if files:
         raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {_names(files)})")
     raise InputError(
@@ -390,12 +392,7 @@ def _names(files: Iterable[Path]) -> str:
     return ", ".join(path.name for path in files)
 
 
-def _keys(path: Path) -> set[str]:
-    content = _coco_content(path)
-    return set(content) if isinstance(content, dict) else set()
-
-
-def _coco_content(path: Path) -> Any:
+def _json(path: Path) -> Any:
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -461,19 +458,8 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
     return Instance(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), crowd)
 
 
-class _Content:
-    """SHA-256 of an image, to which the text of its label is added."""
-
-    def __init__(self, data: bytes) -> None:
-        self._sha = ContentHash(data)
-
-    def add_text(self, text: str) -> str:
-        self._sha.add(text)
-        return self._sha.hexdigest()
-
-
-def _look(path: Path) -> tuple[int, int, _Content]:
-    """Width and height of an image as it is shown [px], and its content, which must be whole."""
+def _look(path: Path) -> tuple[int, int, ContentHash]:
+    """Width and height of an image as it is shown [px], and the hash of its content, which must be whole."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -491,7 +477,7 @@ def _look(path: Path) -> tuple[int, int, _Content]:
         raise InputError(f"{path}: is torn: a JPEG file must end with its end marker")
     if min(width, height) < _SMALLEST:
         raise InputError(f"{path}: an image must have sides of {_SMALLEST} px or more (got {width} x {height})")
-    return (height, width, _Content(data)) if turned else (width, height, _Content(data))
+    return (height, width, ContentHash(data)) if turned else (width, height, ContentHash(data))
 
 
 def _below(root: Path, path: Path) -> str:

@@ -1,18 +1,21 @@
 """How the time of the splat renderer grows, how far its march is from the machine's peak, and Mitsuba's own path.
 
-    python -m benchmarks.render.splats [--volprim] [--captures FOLDER]
+    python -m benchmarks.render.splats [--volprim] [--captures FOLDER] [--names plant boot_100k ...]
 
-Seconds are processor seconds of all threads, which other load on the machine changes little; the fastest of two.
-The peak is that of fused multiply-adds in a loop without memory, which the same compiler made.
+Seconds are processor seconds of all threads, which other load on the machine changes little; the fastest of two, or,
+for single captures, the median of five, and of one for what takes seconds. The peak is that of fused multiply-adds in a
+loop without memory, which the same compiler made.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ import numpy as np
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.camera import Camera
+from mitsplat.frames.speed_accuracy import look_around, picture_of
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
@@ -35,15 +39,21 @@ FMA_PER_EVALUATION = 20
 """Fused multiply-adds, or operations that cost as much, of one Gaussian on one ray: response, blending, ids."""
 
 
+VIEWS = 3
+"""Of every capture, evenly around it."""
+
+
 def fastest(run: Callable[[], object], repeats: int = 2) -> float:
     """Processor seconds of the fastest of ``repeats`` calls, after one that warms up."""
-    times = []
-    for _ in range(repeats + 1):
-        start = time.process_time()
-        run()
-        dr.sync_thread()
-        times.append(time.process_time() - start)
-    return min(times[1:])
+    return min([timed(run) for _ in range(repeats + 1)][1:])
+
+
+def timed(run: Callable[[], object]) -> float:
+    """Processor seconds of a call."""
+    start = time.process_time()
+    run()
+    dr.sync_thread()
+    return time.process_time() - start
 
 
 def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, float, int]:
@@ -141,17 +151,48 @@ def print_volprim(captures: Path) -> None:
         print(f"  render_splats {preset:10s}{ours:7.2f} s, ratio {theirs / ours:.0f}")
 
 
+def print_captures(captures: Path, names: list[str]) -> None:
+    """Every view of every capture: times as fast as Mitsuba's own path, and errors against ``exact``."""
+    for file in sorted(captures.glob("*.splat")):
+        if names and file.stem not in names:
+            continue
+        splats = Splats.load(file)
+        found: dict[str, list[tuple[float, float, float]]] = {preset: [] for preset in PRESETS}
+        for i in range(VIEWS):
+            camera = look_around(splats, i, VIEWS, width=CAMERA.width, height=CAMERA.height)
+            theirs = timed(partial(render_volprim, volprim_scene(splats, camera)))
+            exact = picture_of(render_splats(splats, camera, quality="exact"))
+            for preset, rows in found.items():
+                show = partial(render_splats, splats, camera, quality=preset)
+                difference = (picture_of(show()) - exact).astype(np.float64)
+                ours = statistics.median(timed(show) for _ in range(1 if preset == "exact" else 5))
+                psnr = -10 * np.log10(max(float(np.mean(difference**2)), 1e-30))
+                rows.append((theirs / ours, psnr, float(np.abs(difference).max())))
+        print(f"{file.stem}, {len(splats)} Gaussians, {VIEWS} views of {CAMERA.width}x{CAMERA.height}", flush=True)
+        for preset, rows in found.items():
+            ratio, psnr, largest = zip(*rows, strict=True)
+            figure([min(ratio), max(ratio)], "", file.stem, preset, "ratio")
+            line = f"  {preset:10s}{min(ratio):5.0f} to {max(ratio):3.0f} times as fast"
+            if preset != "exact":
+                figure([min(psnr), max(psnr)], "dB", file.stem, preset, "psnr")
+                figure(max(largest), "", file.stem, preset, "largest")
+                line += f", {min(psnr):.1f} to {max(psnr):.1f} dB, largest error {max(largest):.3f}"
+            print(line, flush=True)
+
+
 def main() -> None:
     """Parse the command line and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--volprim", action="store_true", help="only the comparison with Mitsuba's own path")
     parser.add_argument("--captures", type=Path, default=CAPTURES)
+    parser.add_argument("--names", nargs="*", default=[], help="of single captures to compare; all by default")
     options = parser.parse_args()
     ensure_variant()
     print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
     with recording("render.splats", parser, options, ignore=("captures",)):
         if options.volprim:
             print_volprim(options.captures)
+            print_captures(options.captures, options.names)
             return
         print_growth()
         print_peak()

@@ -32,7 +32,7 @@ from mitsplat.frames.frame import render_frame
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.progress import Progress
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.render.layers import ensure_variant, render_splats
+from mitsplat.render.layers import Layers, ensure_variant, render_splats
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
 
@@ -265,11 +265,15 @@ def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[s
         start = time.perf_counter()
         layers = render_splats(splats, camera, quality=quality)
         seconds = time.perf_counter() - start
-        colour = layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]
-        picture = np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1)
-        return picture.astype(np.float32), layers.instance, seconds, _largest(layers.order_error)
+        return picture_of(layers), layers.instance, seconds, _largest(layers.order_error)
 
     return shoot
+
+
+def picture_of(layers: Layers) -> Float32Array:
+    """Display-encoded colours over black, (H, W, 3) in [0, 1]: blended encoded, as captures of splats are."""
+    colour = layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]
+    return np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1).astype(np.float32)
 
 
 def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:

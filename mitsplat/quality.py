@@ -101,7 +101,7 @@ class Quality:
 
 PRESETS: dict[PresetName, Quality] = {
     "fast": Quality(alpha_min=2e-3, transmittance_min=1e-2, sh_degree=2),
-    "balanced": Quality(tolerance=5e-3, alpha_min=7e-4, transmittance_min=1e-4),
+    "balanced": Quality(tolerance=1e-2, alpha_min=1e-3, transmittance_min=1e-3),
     "exact": Quality(tolerance=0.0, alpha_min=1e-5, transmittance_min=1e-6),
 }
 

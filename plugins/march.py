@@ -19,14 +19,17 @@ forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of the
 sums counts what lies behind the late peak, if they reach evenly from the deepest peak to as far in front of their mean.
 Those are seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
 
-Tiles of pixels in which the estimate exceeds the tolerance are walked again, in the order of each ray.
+Most tiles need no more than their own order, and one walk in that, several rays to a lane, tells which: where the
+estimate exceeds the tolerance, it ends. Such tiles are walked in a window, and those of them in which an estimate still
+exceeds the tolerance in the order of each ray.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import partial, reduce
+from operator import or_
 from typing import Any
 
 import drjit as dr
@@ -36,9 +39,9 @@ import numpy as np
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, View
 from mitsplat.plugins.shares import add_to_tally, new_tally, settle_instances, winner_of_tally
-from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, in_ray_order
+from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, in_ray_order, some_tiles
 from mitsplat.plugins.walk import Lanes, Pixel, Rays, largest, walk
-from mitsplat.quality import Quality
+from mitsplat.quality import Order, Quality
 
 
 @dataclass(eq=False)
@@ -200,36 +203,65 @@ def march(
         z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
         slopes: Those of the rays, where they are known already; for one sample per pixel.
     """
-    lanes = Lanes(lists, view, TILE_HEIGHT if quality.order == "tile" else 1)
+    if quality.order != "window" or not lists.pairs:
+        return _march(lists, view, quality, quality.order, z_max, slopes)[0]
+    image, chosen = _march(lists, view, quality, "tile", z_max, estimated=True)
+    if dr.width(chosen) == 0:
+        return image
+    some = some_tiles(lists, chosen)
+    part, chosen = _march(some, view, quality, "window", z_max, estimated=True)
+    if dr.width(chosen):
+        again = in_ray_order(some, chosen, view)
+        part = part.with_tiles(march(again, view, replace(quality, tolerance=0.0), z_max=z_max), again, view)
+    return image.with_tiles(part, some, view)
+
+
+def _march(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    order: Order,
+    z_max: Any | None,
+    slopes: tuple[list[Any], list[Any]] | None = None,
+    estimated: bool = False,
+) -> tuple[Image, Any]:
+    """The image of one march, and the places of the tiles whose errors are ``estimated`` above the tolerance."""
+    lanes = Lanes(lists, view, TILE_HEIGHT if order == "tile" else 1)
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
         for p, m in zip(lanes.pixel, lanes.inside, strict=True)
     ]
-    if quality.order == "ray":
+    if order == "ray":
         dr.eval(lists.nearest)
-    several, estimated = lists.instance is None, quality.order == "window" and lists.pairs > 0
+    several = lists.instance is None
+    tolerance = dr.opaque(mi.Float, quality.tolerance) if estimated else None
+    gives_up = estimated and order == "tile"
+
+    def right(pixels: list[Pixel]) -> Any:
+        """Whether lanes have no ray whose error exceeds the tolerance."""
+        return largest([pixel[ERROR] for pixel in pixels]) <= tolerance
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
         """States of the rays at a place in the pixels, and estimates of their errors."""
         state = {"several": labelled and several, "estimated": estimated}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
-        found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
+        found = walk(rays, order, partial(_fresh, **state), partial(_blend, **state), right if gives_up else None)
         return ([pixel[:-ESTIMATE] for pixel in found], [pixel[ERROR] for pixel in found]) if estimated else (found, [])
 
     found, errors = pixels(0.5, 0.5, labelled=True)
     image, unsure = _collect(found, lanes, lists.instance)
+    if gives_up and several:
+        unsure &= lanes.image(mi.Bool, [largest(errors) <= tolerance] * lanes.rows)
     if quality.order != "tile":
         image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
     if estimated:
         dr.eval(image, unsure, errors)  # in one kernel
     # One bit is soon read on a CPU, and mostly saves the launch; a GPU would have to be waited for.
     if several and (dr.backend_v(unsure) == dr.JitBackend.CUDA or dr.any(unsure)):
-        image.instance = settle_instances(image.instance, unsure, lists, view, quality, z_max)
-    if view.samples == 1:
-        return _repaired(image, errors, lists, view, quality, z_max) if estimated else image
+        image.instance = settle_instances(image.instance, unsure, lists, view, quality, order, z_max)
     n, colours = view.samples, []
-    for y, x in np.ndindex(n, n):
+    for y, x in np.ndindex(n, n) if n > 1 else ():
         if (2 * x + 1, 2 * y + 1) == (n, n):  # the centre is one of an odd number of samples
             colours.append([*image.rgb, image.alpha])
         else:
@@ -237,11 +269,19 @@ def march(
             colours.append([*_picture(found, lanes)])
             errors = [dr.maximum(a, b) for a, b in zip(errors, also, strict=True)]
         dr.eval(colours[-1], errors)
-    *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
-    if not estimated:
-        return image
-    image.error = lanes.image(mi.Float, errors)
-    return _repaired(image, errors, lists, view, quality, z_max)
+    if n > 1:
+        *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
+        if estimated:
+            image.error = lanes.image(mi.Float, errors)
+    return image, _tiles_of(largest(errors) > tolerance, lanes) if estimated else None
+
+
+def _tiles_of(flags: Any, lanes: Lanes) -> Any:
+    """Places of the tiles that have flagged lanes."""
+    dr.eval(flags)
+    per_tile = TILE_PIXELS // lanes.rows
+    lane = dr.arange(mi.UInt32, dr.width(flags) // per_tile) * per_tile
+    return dr.compress(reduce(or_, [dr.gather(mi.Bool, flags, lane + k) for k in range(per_tile)]))
 
 
 def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | None = None) -> Image:
@@ -261,28 +301,6 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
     image, _ = _collect(found, lanes, lists.instance)
     dr.eval(image)
     return image
-
-
-def _too_wrong(errors: list[Any], quality: Quality) -> Any:
-    """Whether estimates of the errors of a lane's rays exceed the tolerance."""
-    return largest(errors) > dr.opaque(mi.Float, quality.tolerance)
-
-
-def _repaired(
-    image: Image, errors: list[Any], lists: TileLists, view: View, quality: Quality, z_max: Any | None
-) -> Image:
-    """The image with the tiles in which estimates exceed the tolerance, by lanes, in the order of each ray."""
-    wrong = _too_wrong(errors, quality)
-    dr.eval(wrong)
-    lane = dr.arange(mi.UInt32, dr.width(wrong) // TILE_PIXELS) * TILE_PIXELS
-    flags = dr.gather(mi.Bool, wrong, lane)
-    for k in range(1, TILE_PIXELS):
-        flags |= dr.gather(mi.Bool, wrong, lane + k)
-    chosen = dr.compress(flags)
-    if dr.width(chosen) == 0:
-        return image
-    again = in_ray_order(lists, chosen, view)
-    return image.with_tiles(march(again, view, replace(quality, tolerance=0.0), z_max=z_max), again, view)
 
 
 def _picture(pixels: list[Pixel], lanes: Lanes) -> list[Any]:

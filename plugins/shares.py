@@ -16,7 +16,7 @@ import mitsuba as mi
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import TileLists
 from mitsplat.plugins.walk import Lanes, Pixel, Rays, walk
-from mitsplat.quality import Quality
+from mitsplat.quality import Order, Quality
 
 FIRST = 3
 """Instances that the first walk tells apart."""
@@ -59,12 +59,12 @@ def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
 
 
 def settle_instances(
-    instance: Any, unsure: Any, lists: TileLists, view: View, quality: Quality, z_max: Any | None
+    instance: Any, unsure: Any, lists: TileLists, view: View, quality: Quality, order: Order, z_max: Any | None
 ) -> Any:
     """The instance image (UInt32, row-major) with the right ids where it is ``unsure`` (Bool).
 
-    Other rays are not walked, but their lanes are launched, so that nothing has to be read from the device. The other
-    arguments are those of :func:`mitsplat.plugins.march.march`.
+    Rays are walked in the ``order`` of the picture. Other rays are not walked, but their lanes are launched, so that
+    nothing has to be read from the device. The other arguments are those of :func:`mitsplat.plugins.march.march`.
     """
     lanes = Lanes(lists, view, rows=1)
     (pixel,), (inside,) = lanes.pixel, lanes.inside
@@ -77,7 +77,7 @@ def settle_instances(
             lists, view, quality, slopes, [far], lanes.start, dr.select(active, lanes.stop, lanes.start)
         )
         ((transmittance, own, left, *slots),) = walk(
-            rays, quality.order, _nothing, lambda pixel, weight, record, _: _count(pixel, weight, record[15], last)
+            rays, order, _nothing, lambda pixel, weight, record, _: _count(pixel, weight, record[15], last)
         )
         # The same in every walk, and 0 at first: what the ray shows of the environment.
         most = dr.maximum(most, own + transmittance)

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import drjit as dr
@@ -221,6 +221,14 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
     near = first.near if near is None else near
     least = concatenated([first.least, second.least])
     return _listed(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
+
+
+def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
+    """The lists of some tiles by their places, as they are."""
+    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
+    start, stop = dr.gather(mi.UInt32, lists.start, chosen), dr.gather(mi.UInt32, lists.stop, chosen)
+    dr.eval(tiles, start, stop)
+    return replace(lists, start=start, stop=stop, tiles=tiles)
 
 
 def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:

@@ -152,7 +152,13 @@ class Rays:
         return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
 
 
-def walk(rays: Rays, order: Order, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
+def walk(
+    rays: Rays,
+    order: Order,
+    fresh: Callable[[], Pixel],
+    blend: Blend,
+    going: Callable[[list[Pixel]], Any] | None = None,
+) -> list[Pixel]:
     """States of the rays at their ends, in the order of their tile's list, of their own peaks, or between the two.
 
     Args:
@@ -160,9 +166,11 @@ def walk(rays: Rays, order: Order, fresh: Callable[[], Pixel], blend: Blend) -> 
         order: As of :class:`mitsplat.quality.Quality`.
         fresh: Makes the state of a ray that has met nothing.
         blend: What Gaussians add to it.
+        going: Whether lanes go on, by the states of their rays; for the order of the tile's list.
     """
-    ways = {"tile": _walk_in_tile_order, "window": _walk_in_window, "ray": _walk_in_ray_order}
-    return ways[order](rays, fresh, blend)
+    if order == "tile":
+        return _walk_in_tile_order(rays, fresh, blend, going)
+    return (_walk_in_window if order == "window" else _walk_in_ray_order)(rays, fresh, blend)
 
 
 def largest(values: Sequence[Any]) -> Any:
@@ -218,7 +226,9 @@ def respond_along(
     return list(zip(log_alphas, result[1::2], strict=True))
 
 
-def _walk_in_tile_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
+def _walk_in_tile_order(
+    rays: Rays, fresh: Callable[[], Pixel], blend: Blend, going: Callable[[list[Pixel]], Any] | None
+) -> list[Pixel]:
     """Blend in the order of the tile's list: that of the peaks along one of its rays."""
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
@@ -235,12 +245,11 @@ def _walk_in_tile_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) ->
             blended.append(blend(pixel, weight, record, z))
         return i + 1, blended
 
-    _, pixels = dr.while_loop(
-        (rays.start, [fresh() for _ in far]),
-        lambda i, pixels: (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end),
-        body,
-        label="march",
-    )
+    def alive(i: Any, pixels: list[Pixel]) -> Any:
+        unfinished = (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
+        return unfinished if going is None else unfinished & going(pixels)
+
+    _, pixels = dr.while_loop((rays.start, [fresh() for _ in far]), alive, body, label="march")
     return pixels
 
 

@@ -50,8 +50,8 @@ class Quality:
             dilate and limit opacity as those trainers do.
         tolerance: Error of a display-encoded colour that the order of blending may make. Infinite: Gaussians are
             blended in the order of their peaks along one ray of every tile of 8 x 4 pixels. 0: along every pixel's own
-            ray. Between: nearly so, with an estimate of the error, and along every ray of the tiles where that exceeds
-            the tolerance; a few pixels err by more.
+            ray. Between: along one ray with an estimate of the error, nearly along every ray in tiles where that
+            exceeds the tolerance, and quite so where it still does; a few pixels err by more.
         alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
         transmittance_min: A ray ends when less than this share of the light behind would still be seen.
         sh_degree: Highest spherical-harmonic band that is evaluated.

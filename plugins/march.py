@@ -239,7 +239,7 @@ def _march(
 
     def right(pixels: list[Pixel]) -> Any:
         """Whether lanes have no ray whose error exceeds the tolerance."""
-        return largest([pixel[ERROR] for pixel in pixels]) <= tolerance
+        return ~_too_wrong([pixel[ERROR] for pixel in pixels], tolerance)
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
         """States of the rays at a place in the pixels, and estimates of their errors."""
@@ -252,7 +252,7 @@ def _march(
     found, errors = pixels(0.5, 0.5, labelled=True)
     image, unsure = _collect(found, lanes, lists.instance)
     if gives_up and several:
-        unsure &= lanes.image(mi.Bool, [largest(errors) <= tolerance] * lanes.rows)
+        unsure &= lanes.image(mi.Bool, [~_too_wrong(errors, tolerance)] * lanes.rows)
     if quality.order != "tile":
         image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
     if estimated:
@@ -273,7 +273,12 @@ def _march(
         *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
         if estimated:
             image.error = lanes.image(mi.Float, errors)
-    return image, _tiles_of(largest(errors) > tolerance, lanes) if estimated else None
+    return image, _tiles_of(_too_wrong(errors, tolerance), lanes) if estimated else None
+
+
+def _too_wrong(errors: list[Any], tolerance: Any) -> Any:
+    """Whether the estimate for any of a lane's rays exceeds the tolerance."""
+    return largest(errors) > tolerance
 
 
 def _tiles_of(flags: Any, lanes: Lanes) -> Any:

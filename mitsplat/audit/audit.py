@@ -127,7 +127,7 @@ def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
         "bop": lambda: [BopReader(root, content)],
         "colmap": lambda: [ColmapReader(root)],
     }
-    readers: list[Reader] = [SceneReader(content), LayoutReader(root), LayersReader(content), SightReader()]
+    readers: list[Reader] = [SceneReader(content), LayoutReader(root, content), LayersReader(content), SightReader()]
     readers.append(YoloReader(root, content))
     for name in make:
         if name in content["scene"]["output"]["formats"]:

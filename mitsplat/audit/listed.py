@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from scipy.spatial.transform import Rotation
 
 from mitsplat.audit.described import Cursor, is_close
 from mitsplat.audit.owned import YOLO_FOLDERS
@@ -23,6 +25,8 @@ from mitsplat.files import SPLITS, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""
+_BELT = 1e-3
+"""How far below a belt's upper side an object's origin may be that it carries [m]."""
 _PIXEL = 1e-6
 """Difference that OpenCV's and COLMAP's arithmetic makes [px]."""
 
@@ -186,10 +190,11 @@ class ColmapReader:
 
 
 class LayoutReader:
-    """``layouts/``: where the objects came to rest, which the labels' poses must be."""
+    """``layouts/``: where the objects came to rest, which the labels' poses must be, or a belt carried them from."""
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
+        self._root, self._scene = root, content["scene"]
+        self._carried = not content.get("given", False) and "conveyor" in self._scene
         self._index, self._found = -1, dict[int, Any]()
 
     def check(self, frame: TrueFrame) -> Violations:
@@ -216,7 +221,7 @@ class LayoutReader:
                 yield where, f"{label.name} is not in {file}"
             elif (entry.get("asset"), entry.get("class_index")) != (label.entry["asset"], label.kind):
                 yield where, f"{label.name} is of another asset or class than in {file}"
-            elif not is_close(entry.get("world_from_object"), label.pose, 1e-12):
+            elif not is_close(self._at_moment(entry.get("world_from_object"), frame), label.pose, 1e-12):
                 yield where, f"{label.name} has another pose than in {file}"
         dropped = Counter(frame.record["labels"]["dropped"])
         del dropped["fragments"]
@@ -228,6 +233,23 @@ class LayoutReader:
             (number, entry.get("asset")) for number, entry in self._found.items()
         ]:
             yield where, f"its objects are not those of {file}"
+
+    def _at_moment(self, stored: Any, frame: TrueFrame) -> Any:
+        """A pose as the scene's conveyor has it at the moment of a frame: above the belt, it has moved with that."""
+        if not self._carried or np.shape(stored) != (4, 4):
+            return stored
+        conveyor, output = self._scene["conveyor"], self._scene["output"]
+        box = next(shape["box"] for shape in self._scene["shapes"] if shape["name"] == conveyor["belt"])
+        cameras = (self._scene["camera"], *self._scene.get("cameras", ()))
+        seats = sum(2 if camera.get("stereo") else 1 for camera in cameras)
+        last = math.ceil(output["views"] / seats) - 1
+        time = conveyor["interval"] * (frame.record["view"] // seats - last / 2)
+        turn = Rotation.from_euler("xyz", box["rotate"], degrees=True)
+        pose = np.array(stored, dtype=np.float64)
+        place, half = turn.inv().apply(pose[:3, 3] - box["position"]), np.array(box["size"]) / 2
+        if (abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _BELT:
+            pose[:3, 3] += time * conveyor["speed"] * turn.apply((1.0, 0.0, 0.0))
+        return pose
 
     def finish(self) -> Violations:
         """Files of layouts that no frame shows belong to no frame."""

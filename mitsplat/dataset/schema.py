@@ -205,6 +205,10 @@ class _Place(_Stored):
     background: _Backing | None = None
 
 
+class _Conveyor(_Stored):
+    time: float
+
+
 class _LeftOut(_Stored):
     id: Annotated[int, Field(ge=1, le=65535)]
     asset: Count
@@ -228,6 +232,7 @@ class _Record(_Stored):
     appearance: list[_Appearance] | None = None
     viewpoint: _Viewpoint | None = None
     place: _Place | None = None
+    conveyor: _Conveyor | None = None
     empty: bool = False
     left_out: list[_LeftOut] = []
     order_error: _OrderError | None = None

@@ -103,6 +103,8 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
         ]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
+    if plan.belt is not None and not given:
+        record["conveyor"] = {"time": plan.belt.time}
     if place := draw_place(spec, frame.index, frame.layout.index).to_json(spec):
         record["place"] = place
     if any(entry.appearance for entry in spec.objects):

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.camera import Camera
+from mitsplat.scene.conveyor import Belt
 from mitsplat.scene.layout import Layout
 
 UNKNOWN_FLOW = 1e10
@@ -22,6 +23,7 @@ def optical_flow(
     following: Camera,
     ids: npt.NDArray[np.integer[Any]] | None = None,
     motions: Mapping[int, Float64Array | None] | None = None,
+    belt: Belt | None = None,
 ) -> Float32Array:
     """Motion of every pixel to the next image [px], (H, W, 2).
 
@@ -35,6 +37,7 @@ def optical_flow(
         ids: Instance of every pixel, (H, W); needed where objects move.
         motions: Of each instance that moves, the transform (4, 4) of the world that takes it to its place in the next
             image; None if it is not there any more. What is not named stays where it is.
+        belt: A conveyor's belt, whose surface moves too where no instance is; needs ``ids``.
     """
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -49,6 +52,8 @@ def optical_flow(
             known &= ~shown
         else:
             points[shown] = points[shown] @ motion[:3, :3].T + motion[:3, 3]
+    if belt is not None:
+        points[np.ravel(ids == 0) & belt.shows(points)] += belt.interval * belt.velocity
     moved, ahead = following.project(points)
     known &= ahead > following.near
     flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
@@ -56,7 +61,10 @@ def optical_flow(
 
 
 def swept_by(
-    depth: npt.NDArray[np.floating[Any]], camera: Camera, motion: Mapping[str, Any]
+    depth: npt.NDArray[np.floating[Any]],
+    camera: Camera,
+    motion: Mapping[str, Any],
+    moving: tuple[Belt, BoolArray] | None = None,
 ) -> tuple[Float32Array, Float32Array]:
     """How far every pixel moves to the right and down [px] while the shutter is open, each (H, W).
 
@@ -67,6 +75,8 @@ def swept_by(
         depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
         camera: Where it is in the middle of the exposure.
         motion: As :class:`mitsplat.scene.viewpoints.View` has it.
+        moving: A conveyor's belt, and which pixels show what it carries (H, W); those that show its surface follow
+            from their depth.
     """
     height, width = depth.shape
     columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
@@ -79,6 +89,14 @@ def swept_by(
         y = ((rows - camera.cy) / camera.fy).astype(np.float32)[:, None]
     near = np.divide(1, depth, where=depth > 0, out=np.zeros(depth.shape, dtype=np.float32))
     vx, vy, vz = np.multiply(motion["exposure"], motion["velocity"]).astype(np.float32)
+    if moving is not None:
+        belt, carried = moving
+        rotation, centre = camera.world_from_camera[:3, :3], camera.centre
+        seen = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
+        runs = carried | belt.shows(seen.reshape(-1, 3)).reshape(height, width)
+        # What counts is the camera's motion relative to what a pixel shows.
+        own = motion["exposure"] * (rotation.T @ belt.velocity)
+        vx, vy, vz = (np.float32(v) - np.float32(w) * runs for v, w in zip((vx, vy, vz), own, strict=True))
     wx, wy, wz = np.radians(np.multiply(motion["exposure"], motion["rotation"])).astype(np.float32)
     u = near * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
     v = near * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb
@@ -40,9 +40,10 @@ from mitsplat.render.layers import (
     render_layers,
     render_silhouettes,
 )
-from mitsplat.render.places import Backing, Place, draw_place, environment_at
+from mitsplat.render.places import Backing, Finish, Place, draw_place, environment_at
 from mitsplat.render.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.scene.appearance import Appearance, draw_appearances
+from mitsplat.scene.conveyor import Belt, carried, carried_instances
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
@@ -140,7 +141,9 @@ class Frame(Deferred):
         if self.plan.next_camera is None:
             return None
         motions = {} if self.next_layout is None else motions_of(self.layout, self.next_layout)
-        return optical_flow(self.depth, self.camera, self.plan.next_camera, self.instance if motions else None, motions)
+        belt = self.plan.belt
+        ids = self.instance if motions or belt is not None else None
+        return optical_flow(self.depth, self.camera, self.plan.next_camera, ids, motions, belt)
 
     def _repr_png_(self) -> bytes:
         """The image and, beside it, its labels drawn over it."""
@@ -231,6 +234,7 @@ class Renderer:
         self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self._static: tuple[Place, dict[str, Any]] | None = None
+        self._pattern: tuple[int, Finish, ByteImage, Any] | None = None  # of a belt
         self._behind: tuple[Backing, Any] | None = None
         self._placed: tuple[Layout, dict[str, Any]] | None = None
         self._settled: dict[int, Layout] = {}
@@ -241,6 +245,7 @@ class Renderer:
 
     def __exit__(self, *_: object) -> None:
         self.integrator, self._static, self._placed, self._sky, self._behind = None, None, None, None, None
+        self._pattern = None
         self._settled.clear()
 
     @one_at_a_time
@@ -267,6 +272,8 @@ class Renderer:
         if layout is None:
             with _timed(seconds, "settle"):
                 layout = self._settle(layout_of(self.scene, index))
+        layout, following = self._at_moment(layout, index)
+        next_layout = following if next_layout is None else next_layout
         with _timed(seconds, "place"):
             plan = plan_frame(
                 self.scene,
@@ -278,7 +285,9 @@ class Renderer:
                 lights=lights,
             )
             # Its few parts are made sooner than threads are woken.
-            mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights, lights is not None), parallel=False)
+            mitsuba_scene = mi.load_dict(
+                self.describe(layout, plan.lights, lights is not None, plan.belt), parallel=False
+            )
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
@@ -293,7 +302,7 @@ class Renderer:
                 tone=composite.tone,
                 sensor=composite.sensor,
                 seed=plan.seed,
-                swept=None if motion is None else swept_by(layers.depth, plan.camera, motion),
+                swept=None if motion is None else self._swept(layers, plan, layout, motion),
             )
         with _timed(seconds, "silhouettes"):
             source = self.scene.spec.labels.source
@@ -306,6 +315,23 @@ class Renderer:
         made["order_error"] = layers.order_error
         made["appearances"] = draw_appearances(self.scene, layout)
         return Frame.later({"rgb": partial(host_array, linear, shape)}, **made, next_layout=next_layout)
+
+    def _swept(
+        self, layers: Layers, plan: FramePlan, layout: Layout, motion: Mapping[str, Any]
+    ) -> tuple[Float32Array, Float32Array]:
+        """How far every pixel moves while the shutter is open, by the camera's motion and a belt's."""
+        moving = None
+        if plan.belt is not None:
+            moving = plan.belt, np.isin(layers.instance, list(carried_instances(layout, plan.belt.box)))
+        return swept_by(layers.depth, plan.camera, motion, moving)
+
+    def _at_moment(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
+        """A layout at the moment of a frame, and at that of the layout's next one, None if nothing moves until then."""
+        spec = self.scene.spec
+        view = index - layout_of(self.scene, index) * spec.output.views
+        here = carried(spec, layout, view)
+        after = carried(spec, layout, min(view + 1, spec.output.views - 1))
+        return here, None if after is here else after
 
     def _settle(self, index: int) -> Layout:
         """A layout, kept for the next views of it."""
@@ -330,8 +356,12 @@ class Renderer:
             keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
         )
 
-    def describe(self, layout: Layout, lights: tuple[LightSpec, ...], replaced: bool = False) -> dict[str, Any]:
+    def describe(
+        self, layout: Layout, lights: tuple[LightSpec, ...], replaced: bool = False, belt: Belt | None = None
+    ) -> dict[str, Any]:
         """Mitsuba's dictionary of a layout under some lights. Shapes stay the same objects while the layout does.
+
+        Patterns on a ``belt`` are where it has run.
 
         No kernel is compiled when lights that are not the scene's, but ``replaced`` them, move.
         """
@@ -345,7 +375,16 @@ class Renderer:
             self._placed = layout, objects
         emitters = {f"light_{i}": self._made(self._emitter(light), replaced) for i, light in enumerate(lights)}
         place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
-        return {"type": "scene", **self._surroundings(place), **self._placed[1], **emitters}
+        surroundings = self._surroundings(place)
+        return {"type": "scene", **surroundings, **self._running(belt), **self._placed[1], **emitters}
+
+    def _running(self, belt: Belt | None) -> dict[str, Any]:
+        """The shape of a belt, its pattern where it has run; nothing if it has none."""
+        if belt is None or self._pattern is None:
+            return {}
+        number, finish, image, bsdf = self._pattern
+        shape, mesh = self.scene.spec.shapes[number], self.scene.shape_meshes[number]
+        return {f"shape_{number}": finished_mesh(mesh, shape, finish, image, bsdf, belt.travel)}
 
     def _emitter(self, light: LightSpec) -> dict[str, Any]:
         if isinstance(light, EnvironmentLight) and light.image is not None:
@@ -386,6 +425,7 @@ class Renderer:
 
     def _static_shapes(self, place: Place) -> dict[str, Any]:
         shapes: dict[str, Any] = {}
+        conveyor, self._pattern = self.scene.spec.conveyor, None
         environment = environment_at(self.scene, place)
         if environment is not None:
             shapes["environment"] = _asset_shape(environment, np.eye(4), 0)
@@ -394,6 +434,8 @@ class Renderer:
                 image = texture_image(finish, self.scene.images)
                 bsdf = mi.load_dict(material(finish, None if image is None else bitmap_texture(image)))
                 shapes[f"shape_{i}"] = finished_mesh(mesh, shape, finish, image, bsdf)
+                if conveyor is not None and shape.name == conveyor.belt and image is not None:
+                    self._pattern = i, finish, image, bsdf
             elif shape.visible:
                 shapes[f"shape_{i}"] = _visible_shape(shape.colour, mesh)
             elif shape.proxy:

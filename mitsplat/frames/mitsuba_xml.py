@@ -29,6 +29,7 @@ from mitsplat.render.layers import describe_sensor, ensure_variant
 from mitsplat.render.places import Finish, draw_place
 from mitsplat.render.textures import finished_mesh, material, texture_image
 from mitsplat.scene.appearance import draw_appearances
+from mitsplat.scene.conveyor import Belt, carried
 from mitsplat.scene.scene import Scene, layout_of, plan_frame
 from mitsplat.spec.shapes import Shape
 
@@ -45,7 +46,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     ensure_variant()
     path = Path(path)
     files = path.with_name(f"{path.stem}_files")
-    layout = settle_layout(scene, layout_of(scene, index))
+    number = layout_of(scene, index)
+    layout = carried(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     files.mkdir(parents=True, exist_ok=True)
     shapes: dict[str, Any] = {}
@@ -64,7 +66,9 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if shape.visible:
             stem = files / f"shape_{number}"
-            shapes[f"shape_{number}"] = _describe_shape(shape, mesh, stem, place.finish_of(shape.name), scene)
+            shapes[f"shape_{number}"] = _describe_shape(
+                shape, mesh, stem, place.finish_of(shape.name), scene, plan.belt
+            )
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {
         "type": "scene",
@@ -221,7 +225,7 @@ def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, inst
 
 
 def _describe_shape(
-    shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: Finish | None, scene: Scene
+    shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: Finish | None, scene: Scene, belt: Belt | None
 ) -> dict[str, Any]:
     """A mesh as ``stem.ply`` and, if it has a pattern, ``stem.png``."""
     path = stem.with_suffix(".ply")
@@ -230,7 +234,8 @@ def _describe_shape(
         if image is not None:
             mi.Bitmap(image).write(str(stem.with_suffix(".png")))
             texture = {"type": "bitmap", "filename": f"{path.parent.name}/{stem.name}.png"}
-        finished_mesh(mesh, shape, finish, image).write_ply(str(path))
+        travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
+        finished_mesh(mesh, shape, finish, image, travel=travel).write_ply(str(path))
         return {
             "type": "ply",
             "filename": f"{path.parent.name}/{path.name}",

@@ -88,7 +88,12 @@ def bitmap_texture(image: ByteImage) -> dict[str, Any]:
 
 
 def finished_mesh(
-    mesh: trimesh.Trimesh, shape: Shape, finish: Finish, image: ByteImage | None, bsdf: Any = None
+    mesh: trimesh.Trimesh,
+    shape: Shape,
+    finish: Finish,
+    image: ByteImage | None,
+    bsdf: Any = None,
+    travel: float = 0.0,
 ) -> Any:
     """Mitsuba's shape of a mesh with texture coordinates.
 
@@ -98,6 +103,7 @@ def finished_mesh(
         finish: Its finish.
         image: The finish's image.
         bsdf: Mitsuba's material, loaded; its own default if None.
+        travel: How far its surface has run along the shape's own x axis [m], as a belt's does.
     """
     props = mi.Properties()
     if bsdf is not None:
@@ -106,7 +112,7 @@ def finished_mesh(
         return plain_mesh(mesh, props)
     corners = np.asarray(mesh.triangles).reshape(-1, 3)
     split = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-    uv = box_projection(mesh, pattern_axes(shape), finish, image.shape[0] / image.shape[1])
+    uv = box_projection(mesh, pattern_axes(shape), finish, image.shape[0] / image.shape[1], travel)
     made = mi.Mesh("mesh", len(corners), len(split.faces), has_vertex_texcoords=True, props=props)
     params = mi.traverse(made)
     params["vertex_positions"] = wrapped(mi.Float, np.asarray(split.vertices, dtype=np.float32))
@@ -126,7 +132,9 @@ def pattern_axes(shape: Shape) -> Float64Array:
     return np.eye(3)
 
 
-def box_projection(mesh: trimesh.Trimesh, axes: Float64Array, finish: Finish, aspect: float) -> Float64Array:
+def box_projection(
+    mesh: trimesh.Trimesh, axes: Float64Array, finish: Finish, aspect: float, travel: float = 0.0
+) -> Float64Array:
     """Texture coordinates of each corner of each triangle (3 F, 2): every face sees the image along its nearest axis.
 
     Args:
@@ -134,8 +142,9 @@ def box_projection(mesh: trimesh.Trimesh, axes: Float64Array, finish: Finish, as
         axes: Columns (3, 3), along which the image is projected.
         finish: Whose ``repeat_width``, rotation and offset count.
         aspect: Height of the image over its width.
+        travel: How far the image has moved along the first axis [m].
     """
-    local = np.asarray(mesh.triangles) @ axes
+    local = np.asarray(mesh.triangles) @ axes - [travel, 0.0, 0.0]
     normals = np.asarray(mesh.face_normals) @ axes
     along = np.argmax(np.abs(normals), axis=1)
     # Seen along x the image lies in y and z, along y in x and z, along z in x and y; its rows go down, and from no side

@@ -106,12 +106,21 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the objects of one layout lie, and which of those that were drawn are not there."""
+    """Where the objects of one layout lie, and which of those that were drawn are not there.
+
+    Attributes:
+        index: Index of the layout.
+        instances: The objects.
+        certificate: What was measured of them at rest.
+        left_out: Those that did not come to rest.
+        settled: The layout as it settled, where this is that at a moment of a conveyor's run.
+    """
 
     index: int
     instances: tuple[Instance, ...]
     certificate: RestCertificate
     left_out: tuple[LeftOut, ...] = ()
+    settled: Layout | None = None
 
     @classmethod
     def of_poses(

@@ -22,6 +22,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.scene.contents import Split, draw_environment, split_of
+from mitsplat.scene.conveyor import Belt, belt_of, check_belt
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.lights import lights_at, written_out
 from mitsplat.scene.references import (
@@ -114,6 +115,7 @@ class FramePlan:
         draws: Random values by name, see :func:`mitsplat.frames.camera_response.develop`.
         seed: Seed of the pixel noise.
         viewpoint: What the camera was drawn or chosen by, see :class:`mitsplat.scene.viewpoints.View`.
+        belt: The conveyor at the moment of the frame, if the scene has one.
     """
 
     index: int
@@ -126,6 +128,7 @@ class FramePlan:
     draws: dict[str, float]
     seed: int
     viewpoint: Mapping[str, Any] = field(default_factory=dict)
+    belt: Belt | None = None
 
 
 def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
@@ -163,6 +166,8 @@ def _scene_of(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
     spec = matched(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     _check_held_out(spec, path)
+    with blaming(path, "conveyor", "belt"):
+        check_belt(spec)
     if spec.backdrop is not None:
         spec = spec.model_copy(update={"shapes": (*spec.shapes, *backdrop_shapes(spec.backdrop)), "backdrop": None})
     named = read_named(spec, path)
@@ -231,7 +236,7 @@ def _walled(spec: SceneSpec, named: Named, assets: tuple[Asset, ...]) -> tuple[S
 
 def _check_lens(spec: SceneSpec, path: Path) -> None:
     """Refuse intrinsics that no camera of the image's size can have, such as a fisheye's that sees behind itself."""
-    for keys, camera in ((("camera",), spec.camera), *((("cameras", i), one) for i, one in enumerate(spec.cameras))):
+    for keys, camera in spec.camera_entries:
         with blaming(path, *keys, "intrinsics"):
             try:
                 camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # which shows most
@@ -332,6 +337,7 @@ def plan_frame(
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
         viewpoint=here.drawn,
+        belt=belt_of(spec, view),
     )
 
 

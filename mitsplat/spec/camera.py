@@ -88,11 +88,10 @@ class Motion(StrictModel):
         (0.0, 0.0), description="Rate of rotation [degrees/s], about an axis that is uniform on the sphere."
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Motion:
-        if not self.speed[1] and not self.rotation[1]:
-            raise FieldError((), "must have a speed or a rotation")
-        return self
+    @property
+    def moves(self) -> bool:
+        """Whether it is more than an open shutter."""
+        return bool(self.speed[1] or self.rotation[1])
 
 
 class Viewpoint(StrictModel):

@@ -64,6 +64,20 @@ class Shape(StrictModel):
         return self
 
 
+class Conveyor(StrictModel):
+    """A belt that runs while images are taken, with all that settled above it."""
+
+    belt: str = Field(description="Name of the shape, a box that runs along its own x axis.")
+    speed: float = Field(description="Speed of its surface [m/s]; negative towards -x.")
+    interval: Positive = Field(description="Time from one turn of the cameras to the next [s].")
+
+    @model_validator(mode="after")
+    def _check(self) -> Conveyor:
+        if not self.speed:
+            raise FieldError("speed", "must not be 0 (a belt that stands still is a shape)")
+        return self
+
+
 class Backdrop(StrictModel):
     """Floor and walls around everything, which lights fall on as on visible shapes. What is behind them is hidden."""
 

@@ -15,9 +15,9 @@ from mitsplat.spec.image import Composite, DepthSensor, Randomise, Rendering, St
 from mitsplat.spec.lights import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.spec.materials import Background
 from mitsplat.spec.objects import MAIN, Arrangement, ObjectSpec, Settle
-from mitsplat.spec.shapes import Backdrop, Enclosure, NamedRegion, Region, Shape
+from mitsplat.spec.shapes import Backdrop, Conveyor, Enclosure, NamedRegion, Region, Shape
 from mitsplat.spec_types import Positive, StrictModel, Unit
-from mitsplat.yaml_input import FieldError
+from mitsplat.yaml_input import FieldError, KeyPath
 
 BACKDROP = "backdrop "
 """How the names of the shapes begin that a backdrop is written out as."""
@@ -134,6 +134,12 @@ class SceneSpec(StrictModel):
         exclude_if=lambda backdrop: backdrop is None,
         description="A room around an environment that is only a table, or around shapes.",
     )
+    conveyor: Conveyor | None = Field(
+        None,
+        exclude_if=lambda conveyor: conveyor is None,
+        description="A belt among the shapes that carries objects from view to view of a layout, whose middle shows "
+        "them as they settled.",
+    )
     background: Background | None = Field(
         None,
         exclude_if=lambda background: background is None,
@@ -187,6 +193,13 @@ class SceneSpec(StrictModel):
             if self.backdrop is not None and shape.name.startswith(BACKDROP):
                 text = f"must not begin with {BACKDROP!r} beside a backdrop (got {shape.name!r})"
                 raise FieldError(("shapes", position, "name"), text)
+        for keys, camera in self.camera_entries:
+            if camera.motion is not None and not camera.motion.moves and self.conveyor is None:
+                raise FieldError((*keys, "motion"), "must have a speed or a rotation, or the scene a conveyor")
+        boxes = [shape.name for shape in self.shapes if shape.box is not None]
+        if self.conveyor is not None and self.conveyor.belt not in boxes:
+            named, got = ", ".join(boxes) or "none", self.conveyor.belt
+            raise FieldError(("conveyor", "belt"), f"must be a box among the shapes, {named} (got {got})")
         skies = [i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)]
         if self.environment == ():
             raise FieldError("environment", "must name at least one asset (got [])")
@@ -232,6 +245,16 @@ class SceneSpec(StrictModel):
                     raise FieldError(("objects", number, "region"), text)
             if entry.region == ():
                 raise FieldError(("objects", number, "region"), "must name at least one region (got [])")
+
+    @property
+    def camera_entries(self) -> tuple[tuple[KeyPath, CameraSpec], ...]:
+        """All cameras, by their keys in the file."""
+        return ((("camera",), self.camera), *((("cameras", i), camera) for i, camera in enumerate(self.cameras)))
+
+    @property
+    def seats(self) -> int:
+        """Views of a turn, in which every camera takes one, and both of a stereo pair."""
+        return sum(2 if camera.stereo else 1 for camera in (self.camera, *self.cameras))
 
     @property
     def region_names(self) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from mitsplat.asset import Asset
 from mitsplat.camera import Camera, look_at_pose
 from mitsplat.capture.capture import Capture
 from mitsplat.labels.overlay import class_colour
+from mitsplat.scene.conveyor import carried
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.viewpoints import view_of
@@ -244,7 +245,8 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Pa
     spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MOST_CAMERAS)).astype(int)
     size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
     for frame in sorted({*own[:MOST_CAMERAS], *spread.tolist()}):
-        camera = view_of(scene, frame, layout if frame in own else None).camera
+        there = None if layout is None or frame not in own else carried(scene.spec, layout, frame % views)
+        camera = view_of(scene, frame, there).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
         yield Part(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)
 

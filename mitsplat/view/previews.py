@@ -15,6 +15,7 @@ from mitsplat.frames.frame import Frame, Renderer
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.quality import PRESETS, PresetName
+from mitsplat.scene.conveyor import carried
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, plan_frame
 from mitsplat.spec.lights import LightSpec
@@ -136,14 +137,14 @@ class SceneRenders:
         self._renderers: dict[PresetName, Renderer] = {}
 
     def layout(self, scene: Scene, index: int) -> Layout:
-        """The layout of a frame, settled now if it is not known."""
+        """The layout at the moment of a frame, settled now if it is not known."""
         if scene is not self._scene:
             self._scene, self._layouts, self._renderers = scene, {}, {}
         number = index // scene.spec.output.views
         if number not in self._layouts:
             self._note(f"settling layout {number}")
             self._layouts[number] = settle_layout(scene, number, progress=self._note)
-        return self._layouts[number]
+        return carried(scene.spec, self._layouts[number], index % scene.spec.output.views)
 
     def render(self, request: ViewRequest, preset: PresetName) -> Preview:
         """The view in one preset."""

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.audit.conveyor import BeltTruth
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
 
@@ -38,6 +39,7 @@ class LayersReader:
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._content = content
+        self._belt = BeltTruth(content)
         self._last: tuple[TrueFrame, Float64Array, float] | None = None
 
     def check(self, frame: TrueFrame) -> Violations:
@@ -86,25 +88,46 @@ class LayersReader:
         slopes = np.column_stack([before.slopes(pixels), np.ones(len(pixels))])
         known = depth.ravel() > step
         motion = frame.camera_from_world @ before.world_from_camera
-
-        def moved(z: Float64Array) -> Float64Array:
-            points = slopes[known] * z[known, None] @ motion[:3, :3].T + motion[:3, 3]
-            ahead[known] = points[:, 2]
-            points[points[:, 2] <= 0] = (0, 0, 1)
-            return frame.project(points)
-
-        ahead = np.zeros(len(pixels))
-        if not known.any():
-            return
-        near, far = moved(depth.ravel() - step / 2), moved(depth.ravel() + step / 2)
-        expected = moved(depth.ravel()) - pixels[known]
-        room = _FLOW_ROUNDED + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
         found = flow.reshape(-1, 2)[known]
         stated = (np.abs(found) < _KNOWN_FLOW).all(axis=1)
-        in_front = ahead[known] > frame.record["camera"]["near"] + step
-        wrong = in_front & (~stated | (np.abs(found - expected).max(axis=1) > room))
+
+        def wrong_if_carried(by: Float64Array) -> BoolArray:
+            """Which of the pixels that have a depth do not move as points that something carries [m]."""
+            run = frame.camera_from_world[:3, :3] @ by
+            ahead = np.zeros(len(found))
+
+            def moved(z: Float64Array) -> Float64Array:
+                points = slopes[known] * z[known, None] @ motion[:3, :3].T + motion[:3, 3] + run
+                ahead[:] = points[:, 2]
+                points[points[:, 2] <= 0] = (0, 0, 1)
+                return frame.project(points)
+
+            near, far = moved(depth.ravel() - step / 2), moved(depth.ravel() + step / 2)
+            expected = moved(depth.ravel()) - pixels[known]
+            room = _FLOW_ROUNDED + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
+            in_front = ahead > frame.record["camera"]["near"] + step
+            wrong: BoolArray = in_front & (~stated | (np.abs(found - expected).max(axis=1) > room))
+            return wrong
+
+        if not known.any():
+            return
+        wrong = wrong_if_carried(np.zeros(3))
+        if (run := self._belt.between(before, frame)).any():
+            # What is no labelled instance may be the belt or what stands still.
+            carried = wrong_if_carried(run)
+            runs, stays = (self._seen(before, carries).ravel()[known] for carries in (True, False))
+            wrong = np.where(runs, carried, np.where(stays, wrong, wrong & carried))
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels do not move as depth and cameras say"
+
+    def _seen(self, frame: TrueFrame, carried: bool) -> BoolArray:
+        """Pixels of labelled instances that the belt carries, or of the others, (H, W)."""
+        width, height = frame.size
+        seen = np.zeros((height, width), dtype=bool)
+        for instance in frame.instances:
+            if self._belt.carries(instance.pose) == carried:
+                seen |= frame.whole(instance)
+        return seen
 
     def finish(self) -> Violations:
         """Nothing is left."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import subprocess
 import sys
 import tempfile
@@ -15,8 +14,8 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
-from scipy.spatial.transform import Rotation
 
+from mitsplat.audit.conveyor import BeltTruth
 from mitsplat.audit.described import Cursor, is_close
 from mitsplat.audit.owned import YOLO_FOLDERS
 from mitsplat.audit.read_back import Violations
@@ -25,8 +24,6 @@ from mitsplat.files import SPLITS, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""
-_BELT = 1e-3
-"""How far below a belt's upper side an object's origin may be that it carries [m]."""
 _PIXEL = 1e-6
 """Difference that OpenCV's and COLMAP's arithmetic makes [px]."""
 
@@ -193,8 +190,7 @@ class LayoutReader:
     """``layouts/``: where the objects came to rest, which the labels' poses must be, or a belt carried them from."""
 
     def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
-        self._root, self._scene = root, content["scene"]
-        self._carried = not content.get("given", False) and "conveyor" in self._scene
+        self._root, self._belt = root, BeltTruth(content)
         self._index, self._found = -1, dict[int, Any]()
 
     def check(self, frame: TrueFrame) -> Violations:
@@ -235,20 +231,11 @@ class LayoutReader:
             yield where, f"its objects are not those of {file}"
 
     def _at_moment(self, stored: Any, frame: TrueFrame) -> Any:
-        """A pose as the scene's conveyor has it at the moment of a frame: above the belt, it has moved with that."""
-        if not self._carried or np.shape(stored) != (4, 4):
+        """A pose as it is at the moment of a frame, carried by a belt or not."""
+        if np.shape(stored) != (4, 4):
             return stored
-        conveyor, output = self._scene["conveyor"], self._scene["output"]
-        box = next(shape["box"] for shape in self._scene["shapes"] if shape["name"] == conveyor["belt"])
-        cameras = (self._scene["camera"], *self._scene.get("cameras", ()))
-        seats = sum(2 if camera.get("stereo") else 1 for camera in cameras)
-        last = math.ceil(output["views"] / seats) - 1
-        time = conveyor["interval"] * (frame.record["view"] // seats - last / 2)
-        turn = Rotation.from_euler("xyz", box["rotate"], degrees=True)
         pose = np.array(stored, dtype=np.float64)
-        place, half = turn.inv().apply(pose[:3, 3] - box["position"]), np.array(box["size"]) / 2
-        if (abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _BELT:
-            pose[:3, 3] += time * conveyor["speed"] * turn.apply((1.0, 0.0, 0.0))
+        pose[:3, 3] += self._belt.way(pose, frame)
         return pose
 
     def finish(self) -> Violations:

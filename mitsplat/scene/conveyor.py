@@ -133,7 +133,13 @@ def check_belt(spec: SceneSpec) -> None:
     for region, _ in spec.all_regions:
         corners = trimesh.bounds.corners(np.array([region.min, region.max]))
         x, y, z = ((corners - pose[:3, 3]) @ pose[:3, :3]).T
-        if z.max() > 0 and x.min() < length / 2 and x.max() > -length / 2 and abs(y).min() < width / 2:
+        if (
+            z.max() > 0
+            and x.min() < length / 2
+            and x.max() > -length / 2
+            and y.min() < width / 2
+            and y.max() > -width / 2
+        ):
             reach = max(reach, float(abs(x).max()))
     wanted = 2 * (reach + abs(belt.travel))
     if not reach:

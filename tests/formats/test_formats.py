@@ -126,6 +126,7 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
         draws={},
         seed=index,
         viewpoint={},
+        belt=None,
     )
     return frame_around(
         plan,

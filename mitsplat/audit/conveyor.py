@@ -1,0 +1,55 @@
+"""Where a scene's conveyor has carried what lies on it, worked out anew from what ``dataset.json`` says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array
+from mitsplat.audit.truth import TrueFrame
+
+_BELOW = 1e-3
+"""How far below a belt's upper side the origin of an object may be that it carries [m]."""
+
+
+class BeltTruth:
+    """A belt that runs along its box's own x axis; without one, nothing moves.
+
+    Args:
+        content: What ``dataset.json`` says.
+    """
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        scene = content["scene"]
+        self._conveyor = None if content.get("given", False) else scene.get("conveyor")
+        if self._conveyor is None:
+            return
+        self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == self._conveyor["belt"])
+        self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
+        cameras = (scene["camera"], *scene.get("cameras", ()))
+        self._seats = sum(2 if camera.get("stereo") else 1 for camera in cameras)
+        self._last = math.ceil(scene["output"]["views"] / self._seats) - 1
+
+    def carries(self, pose: Float64Array) -> bool:
+        """Whether an object at a pose (4, 4) is carried, as it is if its origin is above the belt."""
+        if self._conveyor is None:
+            return False
+        place, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
+        return bool((abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _BELOW)
+
+    def way(self, pose: Float64Array, frame: TrueFrame) -> Float64Array:
+        """How far an object that settled at a pose (4, 4) has been carried when a frame is taken [m], shape (3,)."""
+        return self._run(frame) if self.carries(pose) else np.zeros(3)
+
+    def between(self, frame: TrueFrame, following: TrueFrame) -> Float64Array:
+        """How far the belt runs from one frame to another of the same layout [m], shape (3,)."""
+        return np.zeros(3) if self._conveyor is None else self._run(following) - self._run(frame)
+
+    def _run(self, frame: TrueFrame) -> Float64Array:
+        assert self._conveyor is not None  # noqa: S101
+        time = self._conveyor["interval"] * (frame.record["view"] // self._seats - self._last / 2)
+        return np.asarray(time * self._conveyor["speed"] * self._turn.apply((1.0, 0.0, 0.0)))

@@ -1,0 +1,146 @@
+"""Pictures and labels of what runs on a belt: poses, flow, blur, and the belt's own pattern."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import mitsplat as ms
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.camera import Camera
+from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.write import write_dataset
+from mitsplat.frames.flow import UNKNOWN_FLOW, swept_by
+from mitsplat.scene.conveyor import Belt
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.spec.shapes import Box
+from tests.audit.test_audit import records_of, store
+from tests.conftest import WriteScene
+
+SceneData = dict[str, Any]
+STEP = 0.02
+"""How far the belt runs from view to view [m]: 4 pixels, seen from 0.5 m with a focal length of 100 px."""
+
+
+def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
+    """Two large nuts: one on the belt, one beside it."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = (0.0, 0.0, 0.02), (0.0, 0.14, 0.02)
+    instances = [Instance(i, 0, scene.class_index(0), pose) for i, pose in enumerate(poses, start=1)]
+    return Layout(index, tuple(instances), replace(NOTHING_TO_REST, attempts=1))
+
+
+@pytest.fixture
+def belt_data(scene_data: SceneData) -> SceneData:
+    """A camera that looks straight down on a checkered belt, which runs to the right."""
+    box = {"size": [1, 0.2, 0.1], "position": [0, 0, -0.05]}
+    checkers = {"kind": "checker", "scale": [0.05, 0.05]}
+    return scene_data | {
+        "shapes": [
+            {"name": "belt", "box": box, "visible": True, "materials": [checkers]},
+            {"name": "floor", "box": {"size": [1, 1, 0.02], "position": [0, 0, -0.06]}, "visible": True},
+        ],
+        "conveyor": {"belt": "belt", "speed": 0.2, "interval": STEP / 0.2},
+        "objects": [{"asset": "assets/nut", "count": 2, "scale": 2}],
+        "camera": {
+            "kind": "path",
+            "keys": [{"eye": [0, 0, 0.5], "target": [0, 0, 0], "up": [0, 1, 0]}],
+            "intrinsics": {"fx": 100},
+        },
+        "lights": [{"kind": "environment"}],
+        "composite": {"shadow": "none"},
+        "output": {"width": 64, "height": 48, "layouts": 2, "views": 3},
+    }
+
+
+def test_flow_is_the_belts_and_what_lies_on_it(belt_data: SceneData, write_scene: WriteScene) -> None:
+    scene = ms.load_scene(write_scene(belt_data))
+    frame = ms.render_frame(scene, 0, layout=lying(scene, 0))
+    flow = frame.flow
+    assert flow is not None
+    expected = np.where(frame.instance == 2, 0.0, 100 * STEP / frame.depth)  # f b / z
+    y = (np.arange(48) + 0.5 - 24) / 100 * 0.5
+    expected[abs(y) > 0.11] = 0.0  # the floor; points of what lies beside the belt are no part of it
+    expected[(abs(y) > 0.09) & (abs(y) < 0.11)] = np.nan
+    sure = np.isfinite(expected) & (flow[..., 0] < UNKNOWN_FLOW)
+    assert {1, 2} <= set(frame.instance[sure].tolist())
+    np.testing.assert_allclose(flow[..., 0][sure], expected[sure], atol=2e-3)
+    np.testing.assert_allclose(flow[..., 1][sure], 0, atol=2e-3)
+    assert ms.render_frame(scene, 2, layout=lying(scene, 0)).flow is None
+
+
+def test_the_pattern_runs_with_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
+    belt_data["objects"] = []
+    scene = ms.load_scene(write_scene(belt_data))
+    empty = Layout(0, (), NOTHING_TO_REST)
+    with ms.Renderer(scene) as renderer:
+        first, second = (renderer.render(index, layout=empty).rgb[10:38] for index in (0, 1))
+    shift = round(100 * STEP / 0.5)
+    np.testing.assert_allclose(second[:, shift:], first[:, :-shift], atol=1e-4)
+    assert np.abs(second[:, shift:] - first[:, shift:]).max() > 0.05
+    belt_data["conveyor"]["interval"] = 1e-9
+    still = ms.load_scene(write_scene(belt_data))
+    with ms.Renderer(still) as renderer:
+        np.testing.assert_allclose(renderer.render(1, layout=empty).rgb[10:38], second, atol=1e-5)  # the middle view
+
+
+def test_what_runs_is_blurred(belt_data: SceneData) -> None:
+    belt = Belt(Box(size=(1.0, 0.2, 0.1), position=(0.0, 0.0, -0.05)), 0.3, 0.0, 0.1)
+    camera = Camera.look_at((0.1, -0.3, 0.5), (0, 0, 0), width=32, height=24, fov_x=56)
+    pixels = np.stack(np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5), axis=-1).reshape(-1, 2)
+    rays = np.concatenate([camera.ray_slopes(pixels), np.ones((len(pixels), 1))], axis=1)
+    rotation, centre = camera.world_from_camera[:3, :3], camera.centre
+    depth = (-centre[2] / (rays @ rotation.T)[:, 2]).reshape(24, 32)  # of the plane z = 0
+    points = (rays * depth.reshape(-1, 1)) @ rotation.T + centre
+    other = np.zeros((24, 32), dtype=bool)
+    other[5, 7] = True  # what is carried there
+    motion = {"exposure": 0.004, "velocity": [0.0, 0.0, 0.0], "rotation": [0.0, 0.0, 0.0]}
+    right, down = swept_by(depth, camera, motion, (belt, other))
+    ends = [camera.project(points + np.array([side * 0.5 * 0.004 * 0.3, 0, 0]))[0] for side in (-1, 1)]
+    runs = ((abs(points[:, 1]) < 0.1) & (abs(points[:, 0]) < 0.5)).reshape(24, 32) | other
+    assert 50 < np.count_nonzero(runs) < 700
+    expected = np.where(runs[..., None], (ends[1] - ends[0]).reshape(24, 32, 2), 0.0)
+    np.testing.assert_allclose(np.stack([right, down], axis=-1), expected, atol=1e-4)
+
+
+def test_a_dataset_of_a_belt(belt_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+    """Labels follow what is carried, the audit knows where that is, and a frame is made again as it was."""
+    belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}
+    belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
+    belt_data["output"]["formats"] = ["yolo", "coco", "poses", "bop", "flow", "depth", "colmap"]
+    scene = ms.load_scene(write_scene(belt_data))
+    out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
+    assert audit_dataset(out).violations == ()
+    records = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    places = np.array([[label["world_from_object"][0][3] for label in r["labels"]["instances"]] for r in records])
+    np.testing.assert_allclose(places, [[-STEP, 0], [0, 0], [STEP, 0]] * 2, atol=1e-15)
+    assert [record["conveyor"]["time"] for record in records] == pytest.approx([-0.1, 0, 0.1] * 2)
+    boxes = [record["labels"]["instances"][0]["box"][0] for record in records[:3]]
+    assert boxes[2] - boxes[1] == boxes[1] - boxes[0] == pytest.approx(100 * STEP / 0.47, abs=1)
+    again = remake_frame(scene, 2, tmp_path / "again", dataset=out, settle=lying)
+    assert again.compared and not again.differing
+    # A layout that settled elsewhere is found out.
+    stored = json.loads((out / "layouts/0000.json").read_bytes())
+    stored["instances"][0]["world_from_object"][0][3] = 0.001
+    (out / "layouts/0000.json").write_text(json.dumps(stored))
+    found = {text for _, text in audit_dataset(out).violations}
+    assert any("has another pose than in layouts/0000.json" in text for text in found), found
+
+
+def test_flow_of_a_belt_that_stands_still_is_found_out(
+    belt_data: SceneData, write_scene: WriteScene, tmp_path: Path
+) -> None:
+    belt_data["output"]["formats"] = ["yolo", "flow", "depth"]
+    out = write_dataset(ms.load_scene(write_scene(belt_data)), tmp_path / "out", settle=lying, workers=1).path
+    file = out / "flow/train/000000.flo"
+    flow = cv2.readOpticalFlow(str(file))
+    cv2.writeOpticalFlow(str(file), np.where(flow > 1, 0, flow))
+    store(out, records_of(out))
+    found = audit_dataset(out).violations
+    assert any("do not move as depth and cameras say" in text for _, text in found), found

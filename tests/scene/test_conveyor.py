@@ -1,0 +1,118 @@
+"""Belts: what they carry, at which moments, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.scene.conveyor import belt_of, carried
+from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.scene import Scene, load_scene
+from tests.conftest import WriteScene
+
+SceneData = dict[str, Any]
+SETTLED = replace(NOTHING_TO_REST, attempts=1)
+
+
+@pytest.fixture
+def belt_data(scene_data: SceneData) -> SceneData:
+    """A belt of 1.2 m that is turned by 30 degrees, below a region of 0.4 m."""
+    box = {"size": [1.2, 0.6, 0.1], "position": [0, 0, -0.05], "rotate": [0, 0, 30]}
+    scene_data["shapes"] = [{"name": "belt", "box": box, "visible": True}]
+    return scene_data | {"conveyor": {"belt": "belt", "speed": 0.2, "interval": 0.1}}
+
+
+def lying(*places: tuple[float, float, float]) -> Layout:
+    """A settled layout with an object at each of some places [m]."""
+    instances = []
+    for number, place in enumerate(places, start=1):
+        pose = np.eye(4)
+        pose[:3, 3] = place
+        instances.append(Instance(number, 0, 0, pose))
+    return Layout(0, tuple(instances), SETTLED)
+
+
+def places_of(layout: Layout) -> Any:
+    return np.array([instance.world_from_object[:3, 3] for instance in layout.instances])
+
+
+def scene_of(data: SceneData, write_scene: WriteScene) -> Scene:
+    return load_scene(write_scene(data))
+
+
+def test_what_is_above_the_belt_runs_along_it(belt_data: SceneData, write_scene: WriteScene) -> None:
+    spec = scene_of(belt_data, write_scene).spec
+    beside, below = (0.0, 0.45, 0.01), (0.0, 0.0, -0.2)
+    layout = lying((0.1, 0.0, 0.01), beside, below, (-0.1, 0.05, 0.3))
+    along = np.array([np.cos(np.pi / 6), 0.5, 0.0])
+    for view, time in enumerate((-0.15, -0.05, 0.05, 0.15)):
+        moved = places_of(carried(spec, layout, view)) - places_of(layout)
+        np.testing.assert_allclose(moved[[0, 3]], [0.2 * time * along] * 2, atol=1e-15)
+        np.testing.assert_array_equal(moved[[1, 2]], 0)
+
+
+def test_a_layout_is_carried_from_where_it_settled(belt_data: SceneData, write_scene: WriteScene) -> None:
+    spec = scene_of(belt_data, write_scene).spec
+    layout = lying((0.1, 0.0, 0.01))
+    last = carried(spec, layout, 3)
+    assert carried(spec, last, 3) is last
+    np.testing.assert_array_equal(places_of(carried(spec, last, 0)), places_of(carried(spec, layout, 0)))
+
+
+def test_poses_that_are_made_up_stay(belt_data: SceneData, write_scene: WriteScene) -> None:
+    scene = scene_of(belt_data, write_scene)
+    given = Layout.of_poses(scene, {"nut": [np.eye(4)]})
+    assert carried(scene.spec, given, 0) is given
+
+
+def test_a_scene_without_a_belt_has_the_layout_itself(scene_data: SceneData, write_scene: WriteScene) -> None:
+    layout = lying((0.1, 0.0, 0.01))
+    assert carried(scene_of(scene_data, write_scene).spec, layout, 1) is layout
+
+
+def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene: WriteScene) -> None:
+    belt_data["cameras"] = [{**belt_data["camera"], "height": 0.5}]
+    belt_data["camera"]["stereo"] = {"baseline": 0.05}
+    belt_data["output"]["views"] = 9
+    spec = scene_of(belt_data, write_scene).spec
+    belts = [belt_of(spec, view) for view in range(9)]
+    assert [belt and round(belt.time, 9) for belt in belts] == [-0.1] * 3 + [0.0] * 3 + [0.1] * 3
+    assert [belt and belt.interval for belt in belts] == [0, 0, 0.1, 0, 0, 0.1, 0, 0, 0]
+    layout = lying((0.1, 0.0, 0.01))
+    assert carried(spec, layout, 0) is carried(spec, layout, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"belt": "table"}, "conveyor.belt: must be a box among the shapes, belt (got table)"),
+        ({"speed": 0.0}, "conveyor.speed: must not be 0"),
+        ({"interval": 0.0}, "conveyor.interval: must be > 0"),
+        ({"speed": -3.0}, "conveyor.belt: its box must be 1.45 m long, for the objects of its region not to leave"),
+    ],
+)
+def test_what_no_belt_can_do_is_refused(
+    belt_data: SceneData, write_scene: WriteScene, change: dict[str, Any], sentence: str
+) -> None:
+    belt_data["conveyor"] |= change
+    with pytest.raises(InputError) as caught:
+        scene_of(belt_data, write_scene)
+    assert sentence in str(caught.value)
+
+
+def test_a_belt_below_no_region_is_refused(belt_data: SceneData, write_scene: WriteScene) -> None:
+    belt_data["shapes"][0]["box"]["position"] = [3, 0, 0]
+    with pytest.raises(InputError, match=r"conveyor\.belt: must be below a region, whose objects it carries"):
+        scene_of(belt_data, write_scene)
+
+
+def test_an_open_shutter_needs_something_that_moves(belt_data: SceneData, write_scene: WriteScene) -> None:
+    belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
+    assert not scene_of(belt_data, write_scene).spec.camera.motion.moves  # type: ignore[union-attr]
+    del belt_data["conveyor"]
+    with pytest.raises(InputError, match="motion: must have a speed or a rotation, or the scene a conveyor"):
+        scene_of(belt_data, write_scene)

@@ -136,6 +136,7 @@ def test_a_dataset_of_a_belt(belt_data: SceneData, write_scene: WriteScene, tmp_
 def test_flow_of_a_belt_that_stands_still_is_found_out(
     belt_data: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:
+    belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}
     belt_data["output"]["formats"] = ["yolo", "flow", "depth"]
     out = write_dataset(ms.load_scene(write_scene(belt_data)), tmp_path / "out", settle=lying, workers=1).path
     file = out / "flow/train/000000.flo"

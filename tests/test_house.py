@@ -21,6 +21,7 @@ FLOORS = (
     ("fit", "frames"),
     ("labels", "physics", "render"),
     ("capture", "engine", "plugins", "scene"),
+    ("isolation",),
     ("spec",),
     ("ground",),
 )

@@ -24,6 +24,7 @@ from mitsplat.capture.targets import Board
 from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
+from mitsplat.isolation import ChosenObject, Pick, View, choose_object
 from mitsplat.progress import Progress
 
 MIN_PHOTOS = 3
@@ -53,6 +54,9 @@ class CaptureSettings:
         masks: Folder of masks.
         mask_model: ONNX file of a segmentation network.
         undistorted: Whether photos are resampled to pinhole cameras.
+        picks: Places on the object, PHOTO:X,Y in pixels of the capture's photos; without any, it is what they look at.
+        picks_not: Places on things that are not the object.
+        box: Least and largest x, y and z of a box that holds the object, in the capture's frame.
     """
 
     kind: Literal["object", "environment"] = "object"
@@ -65,6 +69,14 @@ class CaptureSettings:
     masks: Path | None = None
     mask_model: Path | None = None
     undistorted: bool = False
+    picks: tuple[str, ...] = ()
+    picks_not: tuple[str, ...] = ()
+    box: tuple[float, float, float, float, float, float] | None = None
+
+    @property
+    def hinted(self) -> bool:
+        """Whether anything is said of where the object is."""
+        return bool(self.picks or self.picks_not or self.box)
 
     def __post_init__(self) -> None:
         rules = (
@@ -72,6 +84,15 @@ class CaptureSettings:
             (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
             (self.metric and self.poses is None, "poses must be given to be taken as metric"),
             (self.masks is not None and self.mask_model is not None, "give a folder of masks or a model, not both"),
+            (
+                self.hinted and not (self.kind == "object" and self.masks is None and self.mask_model is None),
+                "picks and a box choose an object to make masks of: leave them out with given masks, a model or an "
+                "environment",
+            ),
+            (
+                self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)),
+                f"a box must be X0 Y0 Z0 X1 Y1 Z1, each X0 < X1, Y0 < Y1, Z0 < Z1 (got {self.box})",
+            ),
         )
         for broken, rule in rules:
             if broken:
@@ -351,16 +372,38 @@ def _masked(
         return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
     if settings.mask_model is not None:
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
-    if not frame.table:
+    if not frame.table and not settings.hinted:
         raise InputError(
-            "no table was found under the object to cut it out by: give masks (--masks or --mask-model), put it on "
+            "no table was found under the object to cut it out by: pick it (--pick), give masks (--masks or --mask-model), put it on "
             "something with texture, or capture it as an environment (--kind environment)"
         )
-    points = object_points(capture)
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
-    above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
+    if frame.board is not None and not settings.hinted:
+        points = object_points(capture)
+        above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
+    else:
+        chosen = _chosen(capture, settings)
+        points, above = chosen.points, chosen.above
     masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
     if len(masked.photos) < MIN_PHOTOS:
         return masked
     # What a photo was rejected for may be what the others set right.
     return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=above)
+
+
+def _chosen(capture: Capture, settings: CaptureSettings) -> ChosenObject:
+    """The object, by the hints that there are."""
+    views = {photo.name: View(photo.camera, photo.seen) for photo in capture.photos}
+
+    def pick(spot: str) -> Pick:
+        name, _, pixel = spot.rpartition(":")
+        if name not in views:
+            raise InputError(f"{spot}: a pick must be PHOTO:X,Y with a registered photo, such as {min(views)}:400,300")
+        try:
+            x, y = map(float, pixel.split(","))
+        except ValueError:
+            raise InputError(f"{spot}: a pixel must be given as X,Y (got {pixel})") from None
+        return Pick(spot, views[name], (x, y))
+
+    picks, picks_not = ([pick(spot) for spot in spots] for spots in (settings.picks, settings.picks_not))
+    return choose_object(capture.points, list(views.values()), picks=picks, picks_not=picks_not, box=settings.box)

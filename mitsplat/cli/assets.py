@@ -38,6 +38,17 @@ ScaleFrom = Annotated[
         metavar="A B METRES", help="Distance of two places: PHOTO is its camera, PHOTO:X,Y what it sees at a pixel."
     ),
 ]
+Picks = Annotated[
+    list[str] | None,
+    typer.Option("--pick", metavar="PHOTO:X,Y", help="Pixel on the object, in CAPTURE/images; may be repeated."),
+]
+PicksNot = Annotated[
+    list[str] | None, typer.Option("--pick-not", metavar="PHOTO:X,Y", help="Pixel on a thing that it is not.")
+]
+Box = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that holds the object, in the capture's frame."),
+]
 Size = Annotated[float | None, typer.Option(help="Longest extent [m], where the photos give no scale.")]
 Gaussians = Annotated[int, typer.Option(help="Most Gaussians.")]
 ShDegree = Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")]
@@ -236,6 +247,9 @@ def capture(
     metric: Annotated[bool, typer.Option("--metric", help="The given poses are in metres with z up.")] = False,
     masks: Masks = None,
     mask_model: MaskModel = None,
+    pick: Picks = None,
+    pick_not: PicksNot = None,
+    box: Box = None,
     undistort: Annotated[
         bool, typer.Option("--undistort", help="Resample the photos to cameras without lens distortion.")
     ] = False,
@@ -257,6 +271,9 @@ def capture(
         masks=masks,
         mask_model=mask_model,
         undistorted=undistort,
+        picks=tuple(pick or ()),
+        picks_not=tuple(pick_not or ()),
+        box=box,
     )
     with progress_bar("steps/s") as progress:
         result = capture_photos(photos, out, settings, progress=progress)
@@ -358,6 +375,9 @@ def asset(
     poses: Poses = None,
     masks: Masks = None,
     mask_model: MaskModel = None,
+    pick: Picks = None,
+    pick_not: PicksNot = None,
+    box: Box = None,
     gaussians: Gaussians = 30000,
     iterations: Iterations = 3000,
     budget: Budget = None,
@@ -393,7 +413,16 @@ def asset(
             photos,
             out,
             job,
-            capture=CaptureSettings(kind=kind, scale_from=scale_from, poses=poses, masks=masks, mask_model=mask_model),
+            capture=CaptureSettings(
+                kind=kind,
+                scale_from=scale_from,
+                poses=poses,
+                masks=masks,
+                mask_model=mask_model,
+                picks=tuple(pick or ()),
+                picks_not=tuple(pick_not or ()),
+                box=box,
+            ),
             fit=FitSettings(
                 gaussians=gaussians,
                 iterations=iterations,

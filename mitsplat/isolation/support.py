@@ -1,0 +1,98 @@
+"""What things stand on in a photographed place: a smooth, uneven surface below them, such as a cloth or a lawn.
+
+It is a height over a grid, fitted from below as ground is to laser scans (Zhang et al. 2016 review such filters): what
+lies above it counts the less the farther, what lies on it or below counts in full, and where a thing hides it the
+surface goes on with the least bending (thin plate). The first rounds allow hardly more than a plane; stiffness and
+tolerance fall from round to round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vstack
+from scipy.sparse.linalg import spsolve
+
+from mitsplat.arrays import Float64Array
+
+CELLS = 32
+"""Cells of the grid along an edge."""
+_ROUNDS = 12
+_STIFF = (1e3, 3e-2)
+"""Weight of bending against the points' mean weight in a cell, at the start and at the end."""
+_TOLERANCE = (0.08, 0.01)
+"""Height above the surface up to which points belong to it, at the start and at the end, as a share of the radius."""
+_BELOW = 4.0
+"""Tolerances below the surface from which a point is an outlier."""
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """A surface z = h(x, y) over a square.
+
+    Attributes:
+        low: Least x and y of the grid, shape (2,).
+        cell: Edge of a cell.
+        heights: At the nodes of the grid, shape (N, N), first axis x.
+        roughness: Standard deviation of what belongs to the surface around it.
+    """
+
+    low: Float64Array
+    cell: float
+    heights: Float64Array
+    roughness: float
+
+    def under(self, points: Float64Array) -> Float64Array:
+        """Height z of the surface below or above points (N, 3), shape (N,); beyond the grid, that of its border."""
+        return np.asarray(_interpolation(points, self.low, self.cell, len(self.heights)) @ self.heights.ravel())
+
+
+def find_support(points: Float64Array, middle: Float64Array, radius: float) -> Support:
+    """The surface that things stand on within ``radius`` of ``middle`` (3,), z up.
+
+    Args:
+        points: On all surfaces, as photos show them, shape (N, 3).
+        middle: Of what is looked at.
+        radius: Half the edge of the square.
+    """
+    near = (np.abs(points[:, :2] - middle[:2]) < radius).all(axis=1) & (np.abs(points[:, 2] - middle[2]) < radius)
+    points = points[near]
+    low, cell = middle[:2] - radius, 2 * radius / CELLS
+    nodes = CELLS + 1
+    sample = _interpolation(points, low, cell, nodes)
+    bending = _bending(nodes)
+    share = len(points) / nodes**2
+    heights = np.full(nodes**2, float(np.quantile(points[:, 2], 0.1)) if len(points) else 0.0)
+    gap = points[:, 2] - sample @ heights
+    for turn in np.linspace(0, 1, _ROUNDS):
+        stiff = share * _STIFF[0] ** (1 - turn) * _STIFF[1] ** turn
+        tolerance = radius * _TOLERANCE[0] ** (1 - turn) * _TOLERANCE[1] ** turn
+        counts = np.where(gap > 0, 1 / (1 + (gap / tolerance) ** 2) ** 2, gap > -_BELOW * tolerance)
+        normal = sample.T @ diags_array(counts) @ sample + stiff * bending + 1e-9 * share * eye_array(nodes**2)
+        heights = spsolve(csr_array(normal).tocsc(), sample.T @ (counts * points[:, 2]))
+        gap = points[:, 2] - sample @ heights
+    inside = np.abs(gap) < tolerance
+    roughness = float(np.sqrt((gap[inside] ** 2).mean())) if inside.any() else tolerance
+    return Support(low, cell, heights.reshape(nodes, nodes), roughness)
+
+
+def _interpolation(points: Float64Array, low: Float64Array, cell: float, nodes: int) -> csr_array:
+    """Bilinear weights (N, nodes^2) of a grid's nodes at points (N, 3 or more)."""
+    place = ((points[:, :2] - low) / cell).clip(0, nodes - 1 - 1e-9)
+    corner = np.floor(place).astype(np.int64)
+    x, y = (place - corner).T
+    rows = np.arange(len(points))
+    parts = [(corner[:, 0] + i) * nodes + corner[:, 1] + j for i in (0, 1) for j in (0, 1)]
+    values = [(x if i else 1 - x) * (y if j else 1 - y) for i in (0, 1) for j in (0, 1)]
+    where = np.tile(rows, 4), np.concatenate(parts)
+    return csr_array(coo_array((np.concatenate(values), where), shape=(len(points), nodes**2)))
+
+
+def _bending(nodes: int) -> csr_array:
+    """Quadratic form of the thin plate's bending energy on a grid of nodes x nodes."""
+    one = eye_array(nodes)
+    second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(nodes - 2, nodes))
+    first = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(nodes - 1, nodes))
+    forms = vstack([kron(second, one), kron(one, second), np.sqrt(2) * kron(first, first)])
+    return csr_array(forms.T @ forms)

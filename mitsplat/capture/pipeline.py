@@ -374,8 +374,8 @@ def _masked(
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
     if not frame.table and not settings.hinted:
         raise InputError(
-            "no table was found under the object to cut it out by: pick it (--pick), give masks (--masks or --mask-model), put it on "
-            "something with texture, or capture it as an environment (--kind environment)"
+            "no table was found under the object to cut it out by: pick it (--pick), give masks (--masks or "
+            "--mask-model), put it on something with texture, or capture it as an environment (--kind environment)"
         )
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
     if frame.board is not None and not settings.hinted:

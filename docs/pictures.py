@@ -21,8 +21,14 @@ FOLDER = DOCS / "pictures" / "scene"
 SIZE = (320, 200)
 """Of the reference's pictures [px]; those of the gallery are twice as large."""
 
-GALLERY = ("workcell.yaml", "bin_picking.yaml", "stacks.yaml", "fisheye.yaml", "close_up.yaml", "moving_light.yaml")
-"""Scenes of the gallery, in its order; ``mirror_ball.xml`` follows them."""
+GALLERY = (
+    *("workcell.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "stacks.yaml", "fisheye.yaml"),
+    *("close_up.yaml", "moving_light.yaml"),
+)
+"""Scenes of the gallery, in its order; ``real.yaml``, whose assets a clone has to make, and ``mirror_ball.xml`` follow."""
+
+SHEETS = ("workcell.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "real.yaml")
+"""Scenes of which the gallery also shows twelve frames, or a sequence of them."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,19 @@ def _render_scene(name: str) -> Any:
     return ms.render_frame(ms.load_scene(SCENES / name, overrides=overrides), 0).image
 
 
+def _render_sheet(name: str) -> Any:
+    """Twelve frames: evenly spread, or the first ones of a video."""
+    import numpy as np
+
+    import mitsplat as ms
+
+    scene = ms.load_scene(SCENES / name, overrides={"output.width": SIZE[0], "output.height": 180})
+    last = 11 if scene.spec.conveyor else scene.num_frames - 1
+    with ms.Renderer(scene) as renderer:
+        images = [renderer.render(int(index)).image for index in np.linspace(0, last, 12)]
+    return np.vstack([np.hstack(images[row : row + 4]) for row in (0, 4, 8)])
+
+
 def _render_xml(name: str, folder: Path) -> Any:
     import cv2
 
@@ -166,6 +185,8 @@ def main() -> None:
     }
     for name in GALLERY:
         work[FOLDER / f"gallery-{Path(name).stem}.jpg"] = (name, lambda _, it=name: _render_scene(it))
+    for name in SHEETS:
+        work[FOLDER / f"sheet-{Path(name).stem}.jpg"] = (f"sheet of {name}", lambda _, it=name: _render_sheet(it))
     work[FOLDER / "gallery-mirror_ball.jpg"] = (
         "mirror_ball.xml",
         lambda folder: _render_xml("mirror_ball.xml", folder),

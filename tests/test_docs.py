@@ -37,10 +37,11 @@ def test_pictures_are_of_keys_that_there_are() -> None:
 
 
 def test_every_picture_is_there_and_none_is_left_over() -> None:
-    from pictures import FOLDER, GALLERY, read_pictures
+    from pictures import FOLDER, GALLERY, SHEETS, read_pictures
 
     asked = {picture.file.name for picture in read_pictures()}
     asked |= {f"gallery-{Path(name).stem}.jpg" for name in (*GALLERY, "mirror_ball.xml")}
+    asked |= {f"sheet-{Path(name).stem}.jpg" for name in SHEETS}
     assert {path.name for path in FOLDER.iterdir()} == asked
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 2_000_000
 

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from docutils import nodes
-from pictures import GALLERY, SCENES
+from pictures import GALLERY, SCENES, SHEETS
 from scene_reference import scene_reference
 from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
@@ -61,13 +61,15 @@ def _cli() -> str:
 
 def _gallery() -> str:
     sections = []
-    for name in (*GALLERY, "mirror_ball.xml"):
+    for name in (*GALLERY, "real.yaml", "mirror_ball.xml"):
         path = SCENES / name
         first = path.read_text().split("\n", 1)[0]
         told, language = re.sub(r"^# |^<!-- | -->$", "", first), "xml" if path.suffix == ".xml" else "yaml"
         title = path.stem.replace("_", " ").capitalize()
+        frame = f"![A frame of {name}](pictures/scene/gallery-{path.stem}.jpg)\n\n" if name != "real.yaml" else ""
+        sheet = f"![Twelve frames of {name}](pictures/scene/sheet-{path.stem}.jpg)\n\n" if name in SHEETS else ""
         sections.append(
-            f"## {title}\n\n{told}\n\n![A frame of {name}](pictures/scene/gallery-{path.stem}.jpg)\n\n"
+            f"## {title}\n\n{told}\n\n{frame}{sheet}"
             f"```{{literalinclude}} ../scenes/{name}\n:language: {language}\n:caption: scenes/{name}\n```"
         )
     return "\n\n".join(sections)

@@ -25,10 +25,10 @@ GALLERY = (
     *("workcell.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "stacks.yaml", "fisheye.yaml"),
     *("close_up.yaml", "moving_light.yaml"),
 )
-"""Scenes of the gallery, in its order; ``real.yaml``, whose assets a clone has to make, and ``mirror_ball.xml`` follow."""
+"""Scenes of the gallery, in its order; ``real.yaml``, whose assets are made first, and ``mirror_ball.xml`` follow."""
 
 SHEETS = ("workcell.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "real.yaml")
-"""Scenes of which the gallery also shows twelve frames, or a sequence of them."""
+"""Scenes of which the gallery also shows up to twelve frames, or a sequence of them."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _render_scene(name: str) -> Any:
 
 
 def _render_sheet(name: str) -> Any:
-    """Twelve frames: evenly spread, or the first ones of a video."""
+    """Up to twelve frames, four in a row: evenly spread, or the first ones of a video."""
     import numpy as np
 
     import mitsplat as ms
@@ -136,8 +136,8 @@ def _render_sheet(name: str) -> Any:
     scene = ms.load_scene(SCENES / name, overrides={"output.width": SIZE[0], "output.height": 180})
     last = 11 if scene.spec.conveyor else scene.num_frames - 1
     with ms.Renderer(scene) as renderer:
-        images = [renderer.render(int(index)).image for index in np.linspace(0, last, 12)]
-    return np.vstack([np.hstack(images[row : row + 4]) for row in (0, 4, 8)])
+        images = [renderer.render(int(index)).image for index in np.unique(np.linspace(0, last, 12).astype(int))]
+    return np.vstack([np.hstack(images[row : row + 4]) for row in range(0, len(images) - 3, 4)])
 
 
 def _render_xml(name: str, folder: Path) -> Any:

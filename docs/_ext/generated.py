@@ -67,7 +67,7 @@ def _gallery() -> str:
         told, language = re.sub(r"^# |^<!-- | -->$", "", first), "xml" if path.suffix == ".xml" else "yaml"
         title = path.stem.replace("_", " ").capitalize()
         frame = f"![A frame of {name}](pictures/scene/gallery-{path.stem}.jpg)\n\n" if name != "real.yaml" else ""
-        sheet = f"![Twelve frames of {name}](pictures/scene/sheet-{path.stem}.jpg)\n\n" if name in SHEETS else ""
+        sheet = f"![Frames of {name}](pictures/scene/sheet-{path.stem}.jpg)\n\n" if name in SHEETS else ""
         sections.append(
             f"## {title}\n\n{told}\n\n{frame}{sheet}"
             f"```{{literalinclude}} ../scenes/{name}\n:language: {language}\n:caption: scenes/{name}\n```"

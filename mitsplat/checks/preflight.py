@@ -171,7 +171,6 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
             yield replace(finding, name=f"{name}: {finding.name}")
         if not wrong:
             yield Finding(name, True, f"{len(asset.splats)} Gaussians, nothing to say")
-    extent = np.subtract(spec.region.max, spec.region.min)
     most = [entry.count[1] for entry in spec.objects]
     meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
     volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
@@ -187,7 +186,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
     if support and not faults:
         yield from _rest(scene)
-    yield _sight(scene, extent)
+    yield _sight(scene)
     lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in assets)
     yield Finding(
         "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
@@ -213,18 +212,20 @@ def _rest(scene: Scene) -> Iterator[Finding]:
         yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
 
 
-def _sight(scene: Scene, extent: Float64Array) -> Finding:
-    """Whether the cameras look at where objects are dropped: the middle of the region, at its bottom."""
-    spec = scene.spec
-    middle = np.array(spec.region.min) + (0.5, 0.5, 0.0) * extent
+def _sight(scene: Scene) -> Finding:
+    """Whether the cameras look at where objects are dropped: the middle of a region, at its bottom."""
+    corners = np.array([(region.min, region.max) for region, _ in scene.spec.all_regions])
+    middles = np.column_stack([corners.mean(axis=1)[:, :2], corners[:, 0, 2]])
     views = range(0, scene.num_frames, max(1, scene.num_frames // 24))
     blind = []
     for index in views:
         camera = plan_frame(scene, index).camera
-        ((x, y),), (depth,) = camera.project(middle[None])
-        if not (depth > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):
+        pixels, depths = camera.project(middles)
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        if not (inside & (depths > camera.near)).any():
             blind.append(index)
-    text = f"{len(views) - len(blind)} of {len(views)} views show the middle of the region"
+    where = "a region" if len(middles) > 1 else "the region"
+    text = f"{len(views) - len(blind)} of {len(views)} views show the middle of {where}"
     remedy = f"turn the camera there: `mitsplat preview --frame {blind[0] if blind else 0}` shows one that does not"
     return Finding("sight", len(blind) * 2 <= len(views), text, remedy)
 

@@ -68,7 +68,6 @@ class Belt:
         return above
 
 
-@lru_cache(maxsize=16)
 def belt_of(spec: SceneSpec, view: int) -> Belt | None:
     """The belt at the moment of a view of a layout; all cameras of a turn look at the same moment."""
     if spec.conveyor is None:

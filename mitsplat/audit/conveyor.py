@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.audit.truth import TrueFrame
+from mitsplat.audit.truth import TrueFrame, seats_of
 
 _BELOW = 1e-3
 """How far below a belt's upper side the origin of an object may be that it carries [m]."""
@@ -30,8 +30,7 @@ class BeltTruth:
             return
         self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == self._conveyor["belt"])
         self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
-        cameras = (scene["camera"], *scene.get("cameras", ()))
-        self._seats = sum(2 if camera.get("stereo") else 1 for camera in cameras)
+        self._seats = len(seats_of(scene))
         self._last = math.ceil(scene["output"]["views"] / self._seats) - 1
 
     def carries(self, pose: Float64Array) -> bool:

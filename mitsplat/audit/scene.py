@@ -10,7 +10,7 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.read_back import Violations
-from mitsplat.audit.truth import TrueFrame
+from mitsplat.audit.truth import TrueFrame, seats_of
 
 _SIGMAS = 6.0
 """Multiples of a jitter's standard deviation within which cameras stay."""
@@ -24,6 +24,7 @@ class SceneReader:
     def __init__(self, content: Mapping[str, Any]) -> None:
         scene = content["scene"]
         self._cameras, self._output = (scene["camera"], *scene.get("cameras", ())), scene["output"]
+        self._seats = seats_of(scene)
         self._distractors = set(content.get("distractors", ()))
         self._held_out = _held_out(content["scene"])
         self._given = content.get("given", False)
@@ -95,13 +96,12 @@ class SceneReader:
 
     def _seat(self, frame: TrueFrame) -> tuple[int, bool]:
         """Position of a frame's camera among the scene's, and whether it is the right one of a pair: taken in turn."""
-        seats = [(n, side) for n, one in enumerate(self._cameras) for side in range(2 if one.get("stereo") else 1)]
-        number, side = seats[frame.record["view"] % len(seats)]
+        number, side = self._seats[frame.record["view"] % len(self._seats)]
         return number, side == 1
 
     def _turn(self, frame: TrueFrame) -> tuple[int, int]:
         """Which of its camera's views of the layout a frame is, and of how many."""
-        seats = sum(2 if camera.get("stereo") else 1 for camera in self._cameras)
+        seats = len(self._seats)
         turn, seat = divmod(frame.record["view"], seats)
         return turn, len(range(seat, self._output["views"], seats))
 

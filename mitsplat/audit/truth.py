@@ -26,6 +26,12 @@ VOC_TRUNCATED, VOC_OCCLUDED = 0.15, 0.05
 """Shares of an object beyond the box of what is seen, and hidden in it, above which VOC's guidelines set its flags."""
 
 
+def seats_of(scene: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """Of each view of a turn its camera's position among the scene's, and 1 if it is the right one of a pair."""
+    cameras = enumerate((scene["camera"], *scene.get("cameras", ())))
+    return [(number, side) for number, camera in cameras for side in range(2 if camera.get("stereo") else 1)]
+
+
 @dataclass(frozen=True, eq=False)
 class TrueInstance:
     """An instance of a frame.

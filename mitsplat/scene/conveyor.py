@@ -53,30 +53,27 @@ class Belt:
         """Of its surface in the world [m/s], shape (3,)."""
         return np.asarray(self.speed * stated_pose(self.box)[:3, 0])
 
-    def carries(self, points: Float64Array) -> BoolArray:
-        """Which of some points (N, 3) in the world [m] are above it."""
-        return self._over(points, np.inf)
-
     def shows(self, points: Float64Array) -> BoolArray:
         """Which of some points (N, 3) in the world [m] lie on its upper side."""
-        return self._over(points, _NEAR)
+        return _over(self.box, points, _NEAR)
 
-    def _over(self, points: Float64Array, height: float) -> BoolArray:
-        pose, half = stated_pose(self.box), np.array(self.box.size) / 2
-        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
-        above: BoolArray = (z > half[2] - _NEAR) & (z < half[2] + height) & (abs(x) <= half[0]) & (abs(y) <= half[1])
-        return above
+
+def _over(box: Box, points: Float64Array, height: float) -> BoolArray:
+    """Which of some points (N, 3) in the world [m] are above a box, up to a height [m]."""
+    pose, half = stated_pose(box), np.array(box.size) / 2
+    x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+    above: BoolArray = (z > half[2] - _NEAR) & (z < half[2] + height) & (abs(x) <= half[0]) & (abs(y) <= half[1])
+    return above
 
 
 def belt_of(spec: SceneSpec, view: int) -> Belt | None:
     """The belt at the moment of a view of a layout; all cameras of a turn look at the same moment."""
     if spec.conveyor is None:
         return None
-    box = next(shape.box for shape in spec.shapes if shape.name == spec.conveyor.belt)
-    if box is None:
-        raise AssertionError("a scene's belt is a box")
-    turn, turns = view // spec.seats, -(-spec.output.views // spec.seats)
-    follows = view + 1 < spec.output.views and (view + 1) // spec.seats != turn
+    box = next(shape.box for shape in spec.shapes if shape.name == spec.conveyor.belt and shape.box is not None)
+    seats = len(spec.seats)
+    turn, turns = view // seats, -(-spec.output.views // seats)
+    follows = view + 1 < spec.output.views and (view + 1) // seats != turn
     interval = spec.conveyor.interval
     return Belt(box, spec.conveyor.speed, interval * (turn - (turns - 1) / 2), interval if follows else 0.0)
 
@@ -114,7 +111,7 @@ def carried_instances(layout: Layout, box: Box) -> frozenset[int]:
     """Ids of the instances that a belt carries: those whose origin was above it when they had settled."""
     settled = (layout.settled or layout).instances
     places = np.array([instance.world_from_object[:3, 3] for instance in settled]).reshape(-1, 3)
-    above = Belt(box, 0.0, 0.0, 0.0).carries(places)
+    above = _over(box, places, np.inf)
     return frozenset(instance.id for instance, is_above in zip(settled, above, strict=True) if is_above)
 
 

@@ -218,7 +218,7 @@ class SceneSpec(StrictModel):
             raise FieldError("depth_sensor", "stereo must have a camera without lens distortion")
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: give output.test")
-        turn = sum(1 if camera.stereo is None else 2 for camera in (self.camera, *self.cameras))
+        turn = len(self.seats)
         if any(camera.stereo for camera in (self.camera, *self.cameras)) and self.output.views % turn:
             raise FieldError(
                 ("output", "views"), f"must be a multiple of {turn}, so that pairs are whole (got {self.output.views})"
@@ -252,9 +252,10 @@ class SceneSpec(StrictModel):
         return ((("camera",), self.camera), *((("cameras", i), camera) for i, camera in enumerate(self.cameras)))
 
     @property
-    def seats(self) -> int:
-        """Views of a turn, in which every camera takes one, and both of a stereo pair."""
-        return sum(2 if camera.stereo else 1 for camera in (self.camera, *self.cameras))
+    def seats(self) -> tuple[tuple[int, int], ...]:
+        """Of each view of a turn its camera's position among all, and 1 if it is the right one of a stereo pair."""
+        cameras = enumerate((self.camera, *self.cameras))
+        return tuple((number, side) for number, camera in cameras for side in range(2 if camera.stereo else 1))
 
     @property
     def region_names(self) -> tuple[str, ...]:

@@ -12,12 +12,12 @@ import numpy as np
 
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.highlight import Lobe
+from mitsplat.plugins.sky_irradiance import SkyIrradiance
 
 SURVEY_LATTICE = (233, 144)
 OPEN_LATTICE = (34, 21)
-SKY_LATTICE = (377, 233)
 LOBE_LATTICE = (21, 13)
-REFERENCE_LATTICE = (4181, 2584)
+WHOLE_LATTICE = (4181, 2584)
 """Points and generator of Fibonacci lattices: consecutive Fibonacci numbers give the best two-dimensional ones
 (Niederreiter 1992, section 5.3)."""
 
@@ -148,15 +148,12 @@ class Emitters:
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
 
-            def sky(point: Any) -> tuple[Any, Any]:
-                return _facing(si, emitter, point, active)[0], mi.Color3f(0)
-
             def mirrored(point: Any) -> tuple[Any, Any]:
                 direction, weight = lobe.sample(point)
                 radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
                 return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
 
-            total += dr.pi * self.sky_colour if self.even_sky else self._integrate(si, active, SKY_LATTICE, sky)[0]
+            total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)
             shine += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
         return total, shine
 
@@ -210,14 +207,21 @@ def _facing(si: Any, emitter: Any, point: Any, active: Any) -> tuple[Any, Any]:
     return dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0), direction
 
 
+def sky_irradiance(emitter: Any) -> SkyIrradiance:
+    """Irradiance of an emitter at infinity on every orientation, from directions in proportion to its radiance."""
+    point = lattice_point(dr.arange(mi.UInt32, WHOLE_LATTICE[0]), WHOLE_LATTICE)
+    sample, radiance = emitter.sample_direction(receiver(mi.Point3f(0), mi.Vector3f(0, 0, 1)), point, True)
+    return SkyIrradiance(sample.d, radiance)
+
+
 def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
     """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
 
     Where next to nothing reaches that element, it is the mean over all orientations, a quarter of the fluence.
     """
-    i = dr.arange(mi.UInt32, REFERENCE_LATTICE[0])
+    i = dr.arange(mi.UInt32, WHOLE_LATTICE[0])
     si = receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))
-    sample, radiance = scene.sample_emitter_direction(si, lattice_point(i, REFERENCE_LATTICE), False)
+    sample, radiance = scene.sample_emitter_direction(si, lattice_point(i, WHOLE_LATTICE), False)
     irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
     mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])
     return dr.maximum(dr.select(irradiance > 1e-3 * mean, irradiance, mean), 1e-12)

@@ -10,6 +10,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 import cv2
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -402,7 +403,8 @@ class Renderer:
         if self._sky is None or self._sky[0] != emitter["filename"]:
             self._sky = emitter["filename"], mi.load_dict(emitter)
         state = mi.traverse(self._sky[1])
-        state["scale"], state["to_world"] = emitter["scale"], emitter["to_world"]
+        # As a constant of kernels it would have them compiled anew for every radiance.
+        state["scale"], state["to_world"] = dr.opaque(mi.Float, emitter["scale"]), emitter["to_world"]
         state.update()
         return self._sky[1]
 

@@ -16,7 +16,7 @@ FLOORS = (
     ("cli",),
     ("detector", "report", "view"),
     ("audit", "checks"),
-    ("dataset",),
+    ("dataset", "importing"),
     ("bake", "formats", "reconstruct"),
     ("fit", "frames"),
     ("labels", "physics", "render"),

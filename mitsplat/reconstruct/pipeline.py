@@ -172,6 +172,7 @@ def make_asset(
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict)}
+    record["asset_from_capture"] = result.asset_from_capture.tolist()
     if result.isolation is not None:
         record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}
     if result.alignment is not None:

@@ -13,10 +13,10 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.causes import find_causes
 from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
+from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
@@ -70,6 +70,7 @@ class Reconstruction:
         isolation: What was removed, or None for surroundings.
         alignment: Where a registered mesh was found.
         refinement: What came of refining the mesh, in the capture's frame, or None where that was not asked for.
+        asset_from_capture: Where the capture's frame is in the asset's, a similarity, shape (4, 4).
     """
 
     asset: Asset
@@ -78,6 +79,7 @@ class Reconstruction:
     isolation: Isolation | None
     alignment: Alignment | None
     refinement: RefinedMesh | None
+    asset_from_capture: Float64Array
 
 
 def reconstruct_asset(
@@ -152,7 +154,9 @@ def reconstruct_asset(
         units=capture.units,
         capture_light="uniform" if kind == "object" else "scene",
     )
+    metres = 1.0
     if settings.size is not None:
+        metres = asset.factor_to(settings.size)
         asset = asset.resized(settings.size)
     elif capture.units == "unknown" and alignment is not None and imported and imported.metres_per_unit:
         metres = imported.metres_per_unit / alignment.scale
@@ -162,7 +166,9 @@ def reconstruct_asset(
             progress(0, 1, "splitting the mesh into convex pieces")
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
-    return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement)
+    return Reconstruction(
+        asset, verdict, held_out, isolation, alignment, refinement, np.diag([metres, metres, metres, 1.0])
+    )
 
 
 def check_refinable(settings: ReconstructSettings, kind: str, imported: ImportedMesh | None) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.causes import views_from
 from mitsplat.files import write_text
 from mitsplat.html import REPORT_FILE, eight_bit, figure_of, make_page, shrunk_image, verdict_of
+from mitsplat.reconstruct.causes import views_from
 from mitsplat.reconstruct.evaluation import HeldOutView, sized_photo
 from mitsplat.reconstruct.reconstruct import Reconstruction
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mitsplat.asset import Asset
-from mitsplat.reconstruct.splat_import import ImportSettings, import_splats
+from mitsplat.importing.splat_import import ImportSettings, import_splats
 
 OUT = Path(__file__).resolve().parents[1] / "assets" / "real"
 

@@ -21,12 +21,12 @@ from mitsplat.asset import Asset
 from mitsplat.camera import Camera, spiral
 from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
+from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.evaluation import AssetView, Thresholds, iou, is_closed, show_asset
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
-from mitsplat.reconstruct.upright import Plane, Upright, cut_support, find_up
 from mitsplat.render.layers import render_splats
 from mitsplat.splat_files import Axis, usual_up
 from mitsplat.splats import Splats

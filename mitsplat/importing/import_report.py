@@ -13,9 +13,9 @@ from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.files import is_inside, write_text
 from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
+from mitsplat.importing.splat_import import Imported
 from mitsplat.mesh import mass_properties
 from mitsplat.reconstruct.evaluation import show_asset
-from mitsplat.reconstruct.splat_import import Imported
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsplat.camera import Camera
-from mitsplat.capture.causes import blurred_photos, missing_views, views_from
+from mitsplat.reconstruct.causes import blurred_photos, missing_views, views_from
 from mitsplat.reconstruct.evaluation import Thresholds
 from tests.reconstruct.test_reconstruct import GOOD
 

@@ -8,7 +8,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.assets.known import paint, photograph, speckle, table_scene
+from benchmarks.assets.known import table_scene
+from benchmarks.assets.photographing import paint, photograph, speckle
 from mitsplat.camera import Camera
 from mitsplat.capture.targets import Board
 

@@ -21,9 +21,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import trimesh
-from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from benchmarks.assets import photographing
+from benchmarks.assets.photographing import Sensors, by_name, paint, photograph, speckle
 from benchmarks.record import figure, recording
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
@@ -84,31 +85,6 @@ def cameras(count: int, width: int) -> list[Camera]:
     return [Camera.look_at(place, (0, 0, 0.025), width=width, height=width * 3 // 4, fov_x=42) for place in places]
 
 
-def photograph(
-    scene: Mapping[str, Any], views: list[Camera], folder: Path, *, samples: int, noise: float = 0.01
-) -> dict[str, Camera]:
-    """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files."""
-    from mitsplat.plugins.device import ray_scene
-
-    ensure_variant()
-    folder.mkdir(parents=True, exist_ok=True)
-    loaded = ray_scene(scene)
-    rng = np.random.default_rng(0)
-    found = _named(views)
-    sensors = _Sensors()
-    for number, (name, camera) in enumerate(found.items()):
-        radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
-        # A path that grazes an edge may end in no number.
-        noisy = np.nan_to_num(np.clip(radiance, 0, 1)) ** (1 / 2.2) + rng.normal(0, noise, radiance.shape)
-        Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(folder / name)
-    return found
-
-
-def _named(views: list[Camera]) -> dict[str, Camera]:
-    """Cameras by the names of their photos."""
-    return {f"photo{number:02}.png": camera for number, camera in enumerate(views)}
-
-
 def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
     """A board, z = 0 and its middle the origin, on a speckled table under a lamp and an even sky."""
     ensure_variant()
@@ -137,38 +113,7 @@ def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def speckle(rng: np.random.Generator, size: int, colour: tuple[float, float, float]) -> np.ndarray:
-    """A texture of random brightness, (size, size, 3)."""
-    return np.clip(np.array(colour) * rng.uniform(0.1, 1.3, (size, size, 1)), 0, 1).astype(np.float32)
-
-
-def paint(texture: np.ndarray) -> dict[str, Any]:
-    """A matt surface with this texture, its first row above."""
-    bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
-    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
-
-
-class _Sensors:
-    """Mitsuba's own cameras: x left and y up, half a pixel as here. One that only moves needs no new kernels."""
-
-    def __init__(self) -> None:
-        self._made: dict[tuple[int, int, float], Any] = {}
-
-    def like(self, camera: Camera) -> Any:
-        """The sensor of a camera, until the next call."""
-        key = camera.width, camera.height, camera.fx
-        if key not in self._made:
-            film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
-            angle = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
-            self._made[key] = mi.load_dict({"type": "perspective", "fov": angle, "film": film})
-        parameters = mi.traverse(self._made[key])
-        parameters["to_world"] = mi.Transform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0]))
-        parameters.update()
-        return self._made[key]
-
-
-def _speckled(mesh: trimesh.Trimesh) -> Any:
+def speckled(mesh: trimesh.Trimesh) -> Any:
     """The solid with matt speckles of 3 and 10 mm on its vertices."""
     from mitsplat.plugins.device import plain_mesh
 
@@ -229,7 +174,7 @@ def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.T
 
     solid = ray_scene({"solid": plain_mesh(mesh, mi.Properties())})
     depths = mi.load_dict({"type": "aov", "aovs": "depth:depth"})
-    overlaps, sensors = [], _Sensors()
+    overlaps, sensors = [], Sensors()
     for photo in capture.photos:
         _, alpha = photo.picture()
         true = np.array(mi.render(solid, integrator=depths, sensor=sensors.like(truth[photo.name]), spp=1))[..., -1] > 0
@@ -275,14 +220,14 @@ def measure(args: argparse.Namespace) -> int:
     """Print and keep the figures; how many of them miss what is wanted."""
     mesh, views, photos = solid(), cameras(args.views, args.width), args.out / "photos"
     ensure_variant()
-    scene = table_scene(BOARD, np.random.default_rng(5)) | {"solid": _speckled(mesh)}
-    source = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
-    marker, made = args.out / "photos.json", json.dumps([args.views, args.width, args.samples, source])
+    scene = table_scene(BOARD, np.random.default_rng(5)) | {"solid": speckled(mesh)}
+    source = hashlib.sha256(b"".join(Path(str(module)).read_bytes() for module in (__file__, photographing.__file__)))
+    marker, made = args.out / "photos.json", json.dumps([args.views, args.width, args.samples, source.hexdigest()])
     if not (marker.exists() and marker.read_text() == made):
         shutil.rmtree(photos, ignore_errors=True)
         photograph(scene, views, photos, samples=args.samples)
         marker.write_text(made)
-    truth = _named(views)
+    truth = by_name(views)
     fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge)
 
     def tell(done: int, total: int, text: str) -> None:

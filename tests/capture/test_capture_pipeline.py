@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageFilter
 
-from benchmarks.assets.known import photograph
+from benchmarks.assets.photographing import photograph
 from mitsplat.camera import Camera
 from mitsplat.capture import known_poses as poses
 from mitsplat.capture import pipeline as take

@@ -1,0 +1,107 @@
+"""Photographs of known scenes: path-traced, with noise and an exposure per photo, and where things are in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from PIL import Image
+
+from mitsplat.camera import Camera
+from mitsplat.render.layers import ensure_variant
+
+
+class Sensors:
+    """Mitsuba's own cameras: x left and y up, half a pixel as here. One that only moves needs no new kernels."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, int, float], Any] = {}
+
+    def like(self, camera: Camera) -> Any:
+        """The sensor of a camera, until the next call."""
+        key = camera.width, camera.height, camera.fx
+        if key not in self._made:
+            film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+            angle = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
+            self._made[key] = mi.load_dict({"type": "perspective", "fov": angle, "film": film})
+        parameters = mi.traverse(self._made[key])
+        parameters["to_world"] = mi.Transform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+        parameters.update()
+        return self._made[key]
+
+
+def by_name(views: Sequence[Camera]) -> dict[str, Camera]:
+    """Cameras by the names of their photos."""
+    return {f"photo{number:02}.png": camera for number, camera in enumerate(views)}
+
+
+def photograph(
+    scene: Mapping[str, Any],
+    views: Sequence[Camera],
+    folder: Path,
+    *,
+    samples: int,
+    noise: float = 0.01,
+    gains: np.ndarray | None = None,
+) -> dict[str, Camera]:
+    """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files.
+
+    Args:
+        scene: As a dictionary.
+        views: From where.
+        folder: Where photos are written.
+        samples: Paths per pixel.
+        noise: Standard deviation in display-encoded values.
+        gains: Of each photo and channel, shape (N, 3), that its light is multiplied by.
+    """
+    from mitsplat.plugins.device import ray_scene
+
+    ensure_variant()
+    folder.mkdir(parents=True, exist_ok=True)
+    loaded = ray_scene(scene)
+    rng = np.random.default_rng(0)
+    found = by_name(views)
+    sensors = Sensors()
+    for number, (name, camera) in enumerate(found.items()):
+        radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
+        if gains is not None:
+            radiance = radiance * gains[number]
+        # A path that grazes an edge may end in no number.
+        noisy = np.nan_to_num(np.clip(radiance, 0, 1)) ** (1 / 2.2) + rng.normal(0, noise, radiance.shape)
+        Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(folder / name)
+    return found
+
+
+def show_where(scene: Mapping[str, Any], thing: str, views: Sequence[Camera], folder: Path, finer: int = 3) -> None:
+    """Write masks of where a thing of a scene is seen: in most of ``finer`` squared points of a pixel."""
+    from mitsplat.plugins.device import ray_scene
+
+    ensure_variant()
+    folder.mkdir(parents=True, exist_ok=True)
+    loaded, alone = ray_scene(scene), ray_scene({thing: scene[thing]})
+    depths = mi.load_dict({"type": "aov", "aovs": "depth:depth"})
+    sensors = Sensors()
+    for name, camera in by_name(views).items():
+        fine = sensors.like(camera.resized(finer * camera.width, finer * camera.height))
+        near, own = (
+            np.array(mi.render(shown, integrator=depths, sensor=fine, spp=1, seed=7))[..., -1]
+            for shown in (loaded, alone)
+        )
+        shown = (own > 0) & (np.abs(own - near) < 1e-4 * np.maximum(own, near))
+        seen = shown.reshape(camera.height, finer, camera.width, finer).mean(axis=(1, 3)) >= 0.5
+        Image.fromarray(np.uint8(255) * seen.astype(np.uint8)).save(folder / name)
+
+
+def speckle(rng: np.random.Generator, size: int, colour: tuple[float, float, float]) -> np.ndarray:
+    """A texture of random brightness, (size, size, 3)."""
+    return np.clip(np.array(colour) * rng.uniform(0.1, 1.3, (size, size, 1)), 0, 1).astype(np.float32)
+
+
+def paint(texture: np.ndarray) -> dict[str, Any]:
+    """A matt surface with this texture, its first row above."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
+    colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}

@@ -187,6 +187,10 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of a part of the image, which begins at a pixel and may reach beyond the border."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def project(self, points: npt.ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Pixel positions (N, 2), lens distortion included, and depths along z [m] (N,) of world points (N, 3).
 

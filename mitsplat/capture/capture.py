@@ -24,6 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.arrays import Float32Array, Float64Array, Int32Array
 from mitsplat.camera import Camera, Lens
+from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, file_inside, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSIONS
@@ -35,6 +36,7 @@ HELD_OUT_EVERY = 8
 CAPTURE_FILE = "capture.json"
 _POINTS = "points.npz"
 _Row = tuple[float, float, float, float]
+_Gain = Annotated[float, Field(gt=0)]
 
 
 class _Strict(BaseModel):
@@ -57,12 +59,13 @@ class PhotoCamera(_Strict):
 
 
 class PhotoSpec(_Strict):
-    """A photo's keys; files are relative to the folder."""
+    """A photo's keys; files are relative to the folder, ``gain`` is absent where a photo is as it was taken."""
 
     name: str = Field(min_length=1)
     file: str = Field(min_length=1)
     mask: str | None = None
     camera: PhotoCamera
+    gain: tuple[_Gain, _Gain, _Gain] | None = None
 
 
 class CaptureSpec(_Strict):
@@ -77,6 +80,10 @@ class CaptureSpec(_Strict):
     photos: list[PhotoSpec]
 
 
+Window = tuple[int, int, int, int]
+"""Part of a photo: left, top, width and height [px]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Photo:
     """One registered photograph.
@@ -87,6 +94,8 @@ class Photo:
         camera: From where and through which lens; its frame is the capture's.
         mask: 8-bit image of the same size, 255 = object.
         seen: Indices of the capture's points that this photo observes, shape (K,).
+        gain: What its linear red, green and blue are multiplied by to look as the capture's other photos; None: they
+            are as they are.
     """
 
     name: str
@@ -94,13 +103,18 @@ class Photo:
     camera: Camera
     mask: Path | None = None
     seen: Int32Array = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+    gain: tuple[float, float, float] | None = None
 
-    def picture(self, scale: float = 1.0) -> tuple[Float32Array, Float32Array | None]:
+    def picture(self, scale: float = 1.0, window: Window | None = None) -> tuple[Float32Array, Float32Array | None]:
         """The photo, display-encoded in [0, 1], shape (H, W, 3), and its mask as alpha, shape (H, W), or None.
+
+        Its exposure is corrected by ``gain``.
 
         Args:
             scale: Size relative to the camera's, at most 1; pixels are averages over the area they cover. The camera of
                 the picture is ``camera.resized(W, H)``.
+            window: Part of the photo to show, by left, top, width and height [px], inside of it; the camera is then
+                ``camera.cropped(*window).resized(W, H)``.
 
         Raises:
             InputError: If a file cannot be read or has another size than the camera.
@@ -108,10 +122,12 @@ class Photo:
         """
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be in (0, 1] (got {scale})")
-        rgb = self._read(self.file, "RGB", scale)
-        return rgb, None if self.mask is None else self._read(self.mask, "L", scale)
+        rgb = self._read(self.file, "RGB", scale, window)
+        if self.gain is not None:
+            rgb = np.clip(encode_srgb(decode_srgb(rgb) * self.gain), 0, 1).astype(np.float32)
+        return rgb, None if self.mask is None else self._read(self.mask, "L", scale, window)
 
-    def _read(self, path: Path, mode: Literal["RGB", "L"], scale: float) -> Float32Array:
+    def _read(self, path: Path, mode: Literal["RGB", "L"], scale: float, window: Window | None) -> Float32Array:
         try:
             with Image.open(path) as image:
                 pixels = image.convert(mode)
@@ -124,6 +140,9 @@ class Photo:
             raise InputError(
                 f"{path}: must be of its camera's {size[0]}x{size[1]} px (got {pixels.width}x{pixels.height})"
             )
+        if window is not None:
+            (left, top), size = window[:2], window[2:]
+            pixels = pixels.crop((left, top, left + size[0], top + size[1]))
         values = np.asarray(pixels, dtype=np.float32) / np.float32(255)
         target = (max(1, round(size[0] * scale)), max(1, round(size[1] * scale)))
         return values if target == size else np.asarray(cv2.resize(values, target, interpolation=cv2.INTER_AREA))
@@ -251,8 +270,12 @@ class Capture:
                 rejected=dict(sorted(self.rejected.items())),
                 photos=[_photo_spec(photo, folder) for photo in photos],
             )
+            stored = spec.model_dump()
+            for entry in stored["photos"]:
+                if entry["gain"] is None:
+                    del entry["gain"]
             # Last, so that an interrupted save is not mistaken for a capture.
-            write_text(folder / CAPTURE_FILE, json.dumps(spec.model_dump(), indent=1) + "\n")
+            write_text(folder / CAPTURE_FILE, json.dumps(stored, indent=1) + "\n")
         except OSError as error:
             raise InputError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
         return replace(self, photos=tuple(photos))
@@ -287,7 +310,7 @@ class Capture:
                 raise InputError(f"{folder / CAPTURE_FILE}: {entry.name}: {error}") from error
             file = _named_file(folder, entry.file)
             mask = None if entry.mask is None else _named_file(folder, entry.mask)
-            photos.append(Photo(entry.name, file, camera, mask, indices))
+            photos.append(Photo(entry.name, file, camera, mask, indices, entry.gain))
         try:
             known = {key: getattr(spec, key) for key in ("units", "up", "rejected", "scale_error", "table")}
             return cls(tuple(photos), points, colours, **known)
@@ -327,6 +350,7 @@ def _photo_spec(photo: Photo, folder: Path) -> PhotoSpec:
         name=photo.name,
         file=photo.file.relative_to(folder).as_posix(),
         mask=None if photo.mask is None else photo.mask.relative_to(folder).as_posix(),
+        gain=photo.gain,
         camera=PhotoCamera(
             **{key: getattr(camera, key) for key in PhotoCamera.model_fields if key != "world_from_camera"},
             world_from_camera=tuple(map(tuple, camera.world_from_camera.tolist())),

@@ -14,6 +14,7 @@ import numpy as np
 
 from mitsplat.capture.board_mask import bare_squares
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
+from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
@@ -123,6 +124,12 @@ class CaptureResult:
         return len(self.capture.photos) / self.given
 
     @property
+    def exposure(self) -> str | None:
+        """How far exposures differed, which is corrected, a clause; None where they hardly did."""
+        gains = [np.log(photo.gain).mean() for photo in self.capture.photos if photo.gain is not None]
+        return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}, which is corrected" if gains else None
+
+    @property
     def weak(self) -> dict[str, int]:
         """Photos that observe few points, and how many."""
         counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
@@ -206,6 +213,7 @@ def capture_photos(
     capture = replace(capture, photos=near, table=frame.table)
     if settings.undistorted:
         capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
+    capture = even_exposure(capture)
     if settings.kind == "object":
         capture = _masked(capture, frame, settings, prepared, out, progress)
         if len(capture.photos) < MIN_PHOTOS:

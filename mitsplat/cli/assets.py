@@ -289,6 +289,8 @@ def capture(
     scale = "in metres" if found.units == "metre" else "in unknown units"
     error = "" if found.scale_error is None else f" ± {found.scale_error:.2%}"
     typer.echo(f"frame: {scale}{error}, {'z up' if found.up == 'z' else 'up unknown'}, by {result.source}")
+    if result.exposure is not None:
+        typer.echo(f"exposure: {result.exposure}")
     typer.echo(f"picture: {out / 'capture.png'}")
     if result.shortcoming is not None:
         raise PartialResultError(f"{out}: {result.shortcoming}")
@@ -477,8 +479,8 @@ def import_(
     What is invisible, too large or loose is removed, up is found, and an object gets a mesh and convex pieces;
     report.html shows it all. What is questionable is said; `check` says more.
     """
-    from mitsplat.reconstruct.import_report import check_scene_path, write_import_report, write_scene
-    from mitsplat.reconstruct.splat_import import ImportSettings, import_splats
+    from mitsplat.importing.import_report import check_scene_path, write_import_report, write_scene
+    from mitsplat.importing.splat_import import ImportSettings, import_splats
     from mitsplat.reconstruct.surface import SurfaceSettings
 
     _check_folder(out)

@@ -20,7 +20,8 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.capture.capture import Photo
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Photo, Window
 from mitsplat.capture.masks import shapes_differ
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS
@@ -210,6 +211,15 @@ def fit_line(values: Float64Array, wanted: Float64Array, *, shift: bool) -> tupl
     near = misses[:, best] <= 2.5 * deviation
     scale, *rest = np.linalg.lstsq(design[near], wanted[near])[0]
     return float(scale), float(sum(rest) - scale * middle)
+
+
+def crop_map(inverse: DepthMap, camera: Camera, window: Window) -> DepthMap:
+    """What the map of a whole photo has in a window of it, to the nearest of the map's own pixels."""
+    rows, columns = inverse.shape
+    left, top, width, height = window
+    x = np.floor((left + np.arange(width) + 0.5) * columns / camera.width).astype(np.int64)
+    y = np.floor((top + np.arange(height) + 0.5) * rows / camera.height).astype(np.int64)
+    return inverse[np.ix_(y, x)]
 
 
 def resize_map(inverse: DepthMap, width: int, height: int) -> DepthMap:

@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo
+from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps
+from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
 from mitsplat.fit.folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
@@ -32,6 +32,7 @@ from mitsplat.fit.optimizer import Adam, GaussianModel
 from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, TrainingView, unpacked
+from mitsplat.fit.windows import object_windows
 from mitsplat.plugins.backward import DepthRendering
 from mitsplat.plugins.device import number, on_device, wrapped
 from mitsplat.plugins.photometric import photometric_loss
@@ -55,6 +56,8 @@ class FitSettings:
         target_psnr: Mean PSNR [dB] at which the fit ends early: of one in eight of the training photos, which are then
             set aside for that. Held-out photos take part in no decision.
         size: Longest edge of the pictures [px]; photos are made smaller, never larger.
+        crop: Whether photos are fitted around the object alone, and ``size`` is that of these parts; only where masks
+            supervise alpha. Held-out photos are compared whole.
         sh_degree: Degree of the spherical harmonics, 0 to 3; a degree more every fifth of the fit.
         masks: ``alpha``: only what masks show is fitted, and they supervise alpha; ``ignore``: what they leave out may
             look like anything; ``off``: they are not read.
@@ -88,6 +91,7 @@ class FitSettings:
     budget: float | None = None
     target_psnr: float | None = None
     size: int = 800
+    crop: bool = True
     sh_degree: int = 3
     masks: Literal["alpha", "ignore", "off"] = "alpha"
     background: Literal["random", "black"] = "random"
@@ -246,8 +250,14 @@ class _Fit:
     ) -> None:
         self.settings, self.points = settings, capture.points
         with ThreadPoolExecutor(min(_READERS, os.cpu_count() or 1)) as threads:
+            cut = settings.crop and settings.masks == "alpha" and all(photo.mask is not None for photo in training)
+            windows = object_windows(training) if cut else [None] * len(training)
             self.photos = list(
-                threads.map(lambda photo: _training_view(photo, settings, maps.get(photo.name)), training)
+                threads.map(
+                    lambda photo, window: _training_view(photo, settings, maps.get(photo.name), window),
+                    training,
+                    windows,
+                )
             )
             if settings.coarse > 0:
                 list(threads.map(lambda sight: sight.half, self.photos))
@@ -519,9 +529,15 @@ def _set_aside(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Ph
     return tuple(photo for photo in training if photo not in validation), validation
 
 
-def _training_view(photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None) -> TrainingView:
-    scale = min(1.0, settings.size / max(photo.camera.width, photo.camera.height))
-    return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth)
+def _training_view(
+    photo: Photo, settings: FitSettings, inverse_depth: DepthMap | None = None, window: Window | None = None
+) -> TrainingView:
+    camera = photo.camera
+    if window is not None:
+        camera = camera.cropped(*window)
+        inverse_depth = None if inverse_depth is None else crop_map(inverse_depth, photo.camera, window)
+    scale = min(1.0, settings.size / max(camera.width, camera.height))
+    return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth, window=window)
 
 
 def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
@@ -530,7 +546,7 @@ def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -
     digest.add_json([__version__, asdict(settings)])
     for photo in capture.photos:
         camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
-        digest.add(json.dumps([photo.name, camera]), np.ascontiguousarray(photo.seen).tobytes())
+        digest.add(json.dumps([photo.name, camera, photo.gain]), np.ascontiguousarray(photo.seen).tobytes())
         for file in (photo.file, photo.mask):
             digest.add(b"-" if file is None else file.read_bytes())
     digest.add(capture.points.tobytes(), capture.colours.tobytes())

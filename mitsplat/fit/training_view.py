@@ -14,7 +14,7 @@ from PIL import Image
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import Photo
+from mitsplat.capture.capture import Photo, Window
 from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
 from mitsplat.fit.image_metrics import psnr, ssim
@@ -55,6 +55,7 @@ class TrainingView:
         scale: Size relative to it.
         masked: Whether its mask is used.
         inverse_depth: Of its pixels, in any size, if they are known.
+        window: The part of the photo that is used; all of it if None.
 
     Attributes:
         camera: Its camera at that size.
@@ -62,15 +63,24 @@ class TrainingView:
         inverse_depth: Of its pixels [1/m], (H, W), NaN where unknown; or None.
     """
 
-    def __init__(self, photo: Photo, scale: float, *, masked: bool, inverse_depth: DepthMap | None = None) -> None:
-        rgb, mask = photo.picture(scale)
+    def __init__(
+        self,
+        photo: Photo,
+        scale: float,
+        *,
+        masked: bool,
+        inverse_depth: DepthMap | None = None,
+        window: Window | None = None,
+    ) -> None:
+        rgb, mask = photo.picture(scale, window)
         height, width, _ = rgb.shape
-        self.camera: Camera = photo.camera.resized(width, height)
+        camera = photo.camera if window is None else photo.camera.cropped(*window)
+        self.camera: Camera = camera.resized(width, height)
         self.masked = masked and mask is not None
         cover = mask if self.masked and mask is not None else np.ones((height, width), np.float32)
         pixels = np.rint(np.concatenate([rgb, cover[..., None]], axis=2) * 255).astype(np.uint8)
         self._pixels: npt.NDArray[np.uint8] | None = pixels
-        self._photo, self._scale, self._mask_used = photo, scale, masked
+        self._photo, self._scale, self._mask_used, self._window = photo, scale, masked, window
         self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
         self._depths: tuple[Any, Any] | None = None
         self._half: TrainingView | None = None
@@ -80,7 +90,11 @@ class TrainingView:
         """The same photo at half the size, read when it is first asked for."""
         if self._half is None:  # a cached_property of Python 3.11 would let threads take turns
             self._half = TrainingView(
-                self._photo, 0.5 * self._scale, masked=self._mask_used, inverse_depth=self.inverse_depth
+                self._photo,
+                0.5 * self._scale,
+                masked=self._mask_used,
+                inverse_depth=self.inverse_depth,
+                window=self._window,
             )
         return self._half
 

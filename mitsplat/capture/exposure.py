@@ -1,0 +1,90 @@
+"""Exposure and white balance of each photo against the others, by the points that several of them see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.colour import decode_srgb
+
+STEADY = 0.02
+"""Standard deviation of the photos' logarithmic gains up to which exposure counts as fixed, and is left alone."""
+_EDGE = 320
+"""Longest edge of the pictures that points are looked up in, whose pixels are means over noise [px]."""
+_SURE = (0.04, 0.96)
+"""Display-encoded values that are neither lost in noise nor clipped."""
+_FEWEST = 20
+"""Points from which a photo is corrected."""
+_ROUNDS = 12
+_LEAST_SCALE = 0.02
+"""Least scale of what counts as an ordinary difference between logarithms."""
+
+
+def even_exposure(capture: Capture) -> Capture:
+    """The capture with gains for its photos that make shared points look the same, if exposure was not fixed."""
+    gains = relative_gains(capture.photos, capture.points)
+    if np.log(gains).std(axis=0).max(initial=0.0) <= STEADY:
+        return capture
+    rows = [(float(r), float(g), float(b)) for r, g, b in gains]
+    return replace(
+        capture, photos=tuple(replace(photo, gain=gain) for photo, gain in zip(capture.photos, rows, strict=True))
+    )
+
+
+def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Array:
+    """What each photo's linear red, green and blue are to be multiplied by, (N, 3); their logarithms have mean 0.
+
+    The logarithm of what a photo shows of a point is the point's less the photo's: linear least squares, the points
+    eliminated, in which differences count by Cauchy's weights, because gloss and hidden points tell of no exposure.
+
+    Args:
+        photos: With ``seen``.
+        points: Of their capture, shape (M, 3).
+    """
+    photo, point, seen = _observations(photos, points)
+    corrections = np.zeros((len(photos), 3))
+    if not len(photo):
+        return np.ones((len(photos), 3))
+    weight = np.ones(len(photo))
+    for _ in range(_ROUNDS):
+        shape = len(photos), int(point.max()) + 1
+        links = coo_array((weight, (photo, point)), shape=shape).tocsr()
+        share = 1 / np.maximum(np.asarray(links.sum(axis=0)).ravel(), 1e-12)
+
+        def means(values: Float64Array, weight: Float64Array = weight, share: Float64Array = share) -> Float64Array:
+            return np.column_stack([np.bincount(point, weight * v, len(share)) * share for v in values.T])
+
+        spread = links @ (links * share).T
+        system = np.diag(np.asarray(links.sum(axis=1)).ravel()) - spread.toarray()
+        residual = weight[:, None] * (means(seen)[point] - seen)
+        right = np.column_stack([np.bincount(photo, r, len(photos)) for r in residual.T])
+        # Least norm: groups of photos that share no point keep their means.
+        corrections = np.linalg.lstsq(system, right, rcond=1e-9)[0]
+        corrected = seen + corrections[photo]
+        off = np.linalg.norm(corrected - means(corrected)[point], axis=1)
+        weight = 1 / (1 + (off / max(float(np.median(off)), _LEAST_SCALE)) ** 2)
+    corrections[np.bincount(photo, minlength=len(photos)) < _FEWEST] = 0
+    return np.asarray(np.exp(corrections - corrections.mean(axis=0)))
+
+
+def _observations(photos: Sequence[Photo], points: Float64Array) -> tuple[Int64Array, Int64Array, Float64Array]:
+    """Photo and point of each sight of a point, (K,), and the logarithm of its linear colour, (K, 3)."""
+    found = []
+    for number, photo in enumerate(photos):
+        scale = min(1.0, _EDGE / max(photo.camera.width, photo.camera.height))
+        rgb, _ = photo.picture(scale)
+        height, width, _ = rgb.shape
+        pixels, depth = photo.camera.resized(width, height).project(points[photo.seen])
+        inside = (depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+        x, y = pixels[inside].astype(np.int64).T
+        values = rgb[y, x]
+        sure = ((values > _SURE[0]) & (values < _SURE[1])).all(axis=1)
+        own = photo.seen[inside][sure].astype(np.int64)
+        found.append((np.full(len(own), number, dtype=np.int64), own, np.log(decode_srgb(values[sure]))))
+    photo_of, point_of, seen = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return photo_of, point_of, seen

@@ -53,6 +53,7 @@ _ADVICE = {
     "watertight": "photograph the object from all sides, or import a closed mesh",
     "offset": "fit longer, or check the frame and scale of an imported mesh",
     "scale_error": "measure a longer distance, or put a board beside the object that more photos see",
+    "surface": "check masks and splats in the report, give better masks, or fit longer",
     "lost": "check whether masks leave parts of the object out",
 }
 
@@ -126,6 +127,8 @@ class Verdict:
         solid: Whether it must, as that of an object.
         refinement: What came of refining the mesh, as one clause, or None where that was not asked for.
         causes: What was measured of the photos, one clause each, by the threshold that it makes an asset miss.
+        surface: What the mesh of an object was reconstructed from, or None where it was not.
+        surface_faults: Why finer surfaces were not kept, one clause each.
     """
 
     photos: int
@@ -145,6 +148,8 @@ class Verdict:
     solid: bool
     refinement: str | None = None
     causes: Mapping[str, str] = field(default_factory=dict)
+    surface: str | None = None
+    surface_faults: Sequence[str] = ()
 
     @property
     def registered(self) -> float:
@@ -171,6 +176,11 @@ class Verdict:
                 if value is not None and sign * value < sign * limit:
                     rule = "at least" if sign > 0 else "at most"
                     found.append(f"{sentence} ({rule} {limit:g} is wanted): {self._advice(name)}")
+        if self.surface_faults:
+            found.append(
+                f"the mesh is only the {self.surface}, because {', and '.join(self.surface_faults)}: "
+                f"{self._advice('surface')}"
+            )
         if self.solid and not self.watertight:
             found.append(f"the mesh is open (a closed one is wanted): {self._advice('watertight')}")
         return tuple(found)

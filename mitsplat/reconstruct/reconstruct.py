@@ -21,6 +21,7 @@ from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_he
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
+from mitsplat.reconstruct.sound_surface import find_sound_surface
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface, simplify_surface
 from mitsplat.splats import Splats
 
@@ -123,12 +124,14 @@ def reconstruct_asset(
         isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
     cameras = [camera for camera, _, _ in pictures]
-    alignment = refinement = None
+    alignment = refinement = sound = None
     if imported is None:
-        masks = [view.mask for view in views] if kind == "object" else None
-        seen_by = [view.camera for view in views] if kind == "object" else cameras
         floor = 0.0 if kind == "object" and capture.table and _stands(splats) else None
-        mesh = reconstruct_surface(splats, seen_by, masks, settings.surface, floor=floor, progress=progress)
+        if kind == "object":
+            sound = find_sound_surface(splats, views, settings.surface, floor=floor, progress=progress)
+            mesh = sound.mesh
+        else:
+            mesh = reconstruct_surface(splats, cameras, settings=settings.surface, progress=progress)
         if settings.refine is not None:
             refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=progress)
             mesh = refinement.mesh
@@ -145,6 +148,8 @@ def reconstruct_asset(
     verdict = judge(
         capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes
     )
+    if sound is not None:
+        verdict = replace(verdict, surface=sound.source, surface_faults=sound.faults)
     asset = Asset(
         name=name,
         class_name=class_name or name,

@@ -71,6 +71,7 @@ def _verdict(result: Reconstruction) -> str:
         "Gaussians": f"{found.gaussians}",
         "Mesh": f"{found.faces} faces, {'watertight' if found.watertight else 'open'}, "
         f"convex pieces: {len(result.asset.pieces)}",
+        "Surface": found.surface,
         "Refinement of the mesh": found.refinement,
     }
     if result.isolation is not None:

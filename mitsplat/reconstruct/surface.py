@@ -94,6 +94,7 @@ def reconstruct_surface(
     *,
     floor: float | None = None,
     thin: bool = False,
+    depth: bool = True,
     progress: Progress | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the splats in their own frame.
@@ -107,6 +108,7 @@ def reconstruct_surface(
         floor: Height z of the table that the object stands on, if it does.
         thin: Keep sheets and stems that are thinner than a cell, such as leaves, three cells thick, where Gaussians lie
             densely: depths of both sides cancel each other there.
+        depth: Whether the splats' depth cuts into the hull; without it, they only say where the hull is looked for.
         progress: Told after every view how many of how many are done.
 
     Returns:
@@ -121,7 +123,10 @@ def reconstruct_surface(
     masked = masks is not None
     state = grid.start(settings.dissent + 1 if masked else 0)
     for number, camera in enumerate(cameras):
-        grid.fuse(state, splats, camera, None if masks is None else masks[number])
+        if masks is not None:
+            grid.carve(state, camera, masks[number])
+        if depth:
+            grid.fuse(state, splats, camera)
         if progress is not None:
             progress(number + 1, len(cameras), "finding the surface")
     distance, known = grid.combine(state, settings.blur)
@@ -256,27 +261,21 @@ class _Grid:
         nothing = dr.zeros(mi.Float, self.count)
         return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], *[nothing] * 4)
 
-    def fuse(self, state: _State, splats: Splats, camera: Camera, mask: Float32Array | None) -> None:
-        """Add what one view says."""
+    def carve(self, state: _State, camera: Camera, mask: Float32Array) -> None:
+        """Add what the mask of one view says."""
+        pixel, z, ahead = self._seen_from(camera)
+        silhouette = _bilinear(_signed_distance(mask), camera, pixel, ahead)[0]
+        away = dr.select(ahead, silhouette * z / view_of(make_sensor(camera))._opaque["fx"], _FAR)
+        for k, held in enumerate(state.hull):
+            state.hull[k], away = dr.minimum(held, away), dr.maximum(held, away)
+        dr.eval(state.hull)
+
+    def fuse(self, state: _State, splats: Splats, camera: Camera) -> None:
+        """Add what one view of the splats says."""
         layers = render_splats(splats, camera, quality="fast")
         depth = np.where(layers.alpha > _OPAQUE, layers.depth, 0.0).astype(np.float32)
-        view = view_of(make_sensor(camera))
-        x, y, z = self._in_camera(camera)
-        ahead = z > view.near_plane
-        u, v = x / z, y / z
-        if camera.distortion:
-            u, v, _ = view.distort(u, v)
-        own = view._opaque
-        pixel = mi.Point2f(u * own["fx"] + own["cx"], v * own["fy"] + own["cy"])
-        width, height = dr.opaque(mi.Float, camera.width), dr.opaque(mi.Float, camera.height)
-        ahead &= (pixel.x >= 0) & (pixel.y >= 0) & (pixel.x < width) & (pixel.y < height)
+        pixel, z, ahead = self._seen_from(camera)
         span = dr.opaque(mi.Float, self.truncation)
-        if mask is not None:
-            silhouette = _bilinear(_signed_distance(mask), camera, pixel, ahead)[0]
-            away = dr.select(ahead, silhouette * z / own["fx"], _FAR)
-            for k, held in enumerate(state.hull):
-                state.hull[k], away = dr.minimum(held, away), dr.maximum(held, away)
-            dr.eval(state.hull)
         seen, low, high = _bilinear(depth, camera, pixel, ahead)
         # Between a surface and what lies behind its edge nothing is interpolated.
         behind = z - seen
@@ -287,6 +286,19 @@ class _Grid:
         state.count = state.count + dr.select(valid, 1, 0)
         state.towards = state.towards + dr.select(ahead & (low > 0), 1, 0)
         dr.eval(state.total, state.squares, state.count, state.towards)
+
+    def _seen_from(self, camera: Camera) -> tuple[Any, Any, Any]:
+        """Where the middles of all cells are in a picture [px], how deep [m], and whether they are in it."""
+        view = view_of(make_sensor(camera))
+        x, y, z = self._in_camera(camera)
+        ahead = z > view.near_plane
+        u, v = x / z, y / z
+        if camera.distortion:
+            u, v, _ = view.distort(u, v)
+        own = view._opaque
+        pixel = mi.Point2f(u * own["fx"] + own["cx"], v * own["fy"] + own["cy"])
+        width, height = dr.opaque(mi.Float, camera.width), dr.opaque(mi.Float, camera.height)
+        return pixel, z, ahead & (pixel.x >= 0) & (pixel.y >= 0) & (pixel.x < width) & (pixel.y < height)
 
     def combine(self, state: _State, blur: float) -> tuple[Float32Array, BoolArray]:
         """Distance to the surface of every cell [m], positive inside, and whether it is known, of shape ``shape``."""

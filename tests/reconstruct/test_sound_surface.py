@@ -1,0 +1,75 @@
+"""Which surface is kept where splats or masks are wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.assets.known import chamfer
+from mitsplat.errors import InputError
+from mitsplat.reconstruct.evaluation import sized_photo
+from mitsplat.reconstruct.segment_splats import MaskedView
+from mitsplat.reconstruct.sound_surface import CONVEX, FINEST, HULL, find_sound_surface
+from mitsplat.reconstruct.surface import SurfaceSettings
+from mitsplat.splats import Splats
+from tests.conftest import KnownObject
+from tests.reconstruct.test_reconstruct import GOOD
+
+SETTINGS = SurfaceSettings(voxels=64, faces=4000)
+
+
+def views_of(known: KnownObject) -> list[MaskedView]:
+    sized = [sized_photo(photo, 160) for photo in known.capture.training]
+    return [MaskedView(camera, mask) for camera, _, mask in sized if mask is not None]
+
+
+def test_what_masks_and_splats_bear_out_is_kept_as_fine_as_it_is(known_object: KnownObject) -> None:
+    found = find_sound_surface(known_object.splats, views_of(known_object), SETTINGS)
+    assert (found.source, found.faults) == (FINEST, ())
+    assert chamfer(found.mesh, known_object.mesh) < 0.004
+
+
+def test_depth_that_is_wrong_gives_way_to_the_hull_of_the_masks(known_object: KnownObject) -> None:
+    """Most of the Gaussians have shrunk towards the middle, and are seen through the others."""
+    splats = known_object.splats
+    inner = np.arange(len(splats)) % 3 > 0
+    means = np.where(inner[:, None], 0.4 * splats.means, splats.means)
+    wrong = replace(splats, means=means, opacities=np.where(inner, 0.98, 0.3).astype(np.float32))
+    found = find_sound_surface(wrong, views_of(known_object), SETTINGS)
+    assert found.source == HULL
+    for fault, reason in zip(found.faults, ("masks with an IoU of only", "% of the diagonal", "IoU"), strict=True):
+        assert reason in fault
+    assert found.mesh.is_volume
+    assert chamfer(found.mesh, known_object.mesh) < 0.02
+
+
+def test_masks_that_contradict_each_other_give_way_to_the_splats(known_object: KnownObject) -> None:
+    views = [
+        MaskedView(view.camera, np.roll(view.mask, 70 if number % 2 else -70, axis=1))
+        for number, view in enumerate(views_of(known_object))
+    ]
+    found = find_sound_surface(known_object.splats, views, SETTINGS)
+    assert found.source == CONVEX
+    assert found.mesh.is_volume
+    assert chamfer(found.mesh, known_object.mesh.convex_hull) < 0.02
+    assert len(found.faults) == 3
+    told = replace(GOOD, surface=found.source, surface_faults=found.faults).misses()
+    assert len(told) == 1
+    assert told[0].startswith("the mesh is only the convex hull of the splats, because the depth of the splats")
+
+
+def test_the_hull_of_splats_ends_at_the_floor(known_object: KnownObject) -> None:
+    views = [MaskedView(view.camera, np.zeros_like(view.mask)) for view in views_of(known_object)]
+    found = find_sound_surface(known_object.splats, views, SETTINGS, floor=-0.03)
+    assert found.source == CONVEX
+    assert found.mesh.bounds[0, 2] == pytest.approx(-0.03)
+
+
+def test_splats_without_volume_are_refused(known_object: KnownObject) -> None:
+    views = [MaskedView(view.camera, np.zeros_like(view.mask)) for view in views_of(known_object)]
+    flat = known_object.splats.means * (1, 1, 0)
+    splats: Splats = replace(known_object.splats, means=flat)
+    with pytest.raises(InputError, match=r"the splats span no volume \(3\d+ opaque Gaussians\)"):
+        find_sound_surface(splats, views, SETTINGS)

@@ -220,12 +220,12 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out
     found = np.array([photo.camera.centre for photo in moved.photos])
     truth_from_asset, residuals = fit_similarity(found, np.array([truth[photo.name].centre for photo in moved.photos]))
     scale = float(np.cbrt(np.linalg.det(truth_from_asset[:3, :3])))
-    splats, surface = made.splats.transformed(truth_from_asset), trimesh.load_mesh(asset / "mesh.ply")
+    surface = trimesh.load_mesh(asset / "mesh.ply")
     surface.apply_transform(truth_from_asset)
     gains = dict(zip(truth, exposures(len(truth)), strict=True))
-    held_out = [photo.name for photo in capture.held_out]
+    held_out = {photo.name: photo.camera for photo in moved.held_out}
     pairs = []
-    for name, view in zip(held_out, show_asset(splats, None, [truth[name] for name in held_out]), strict=True):
+    for name, view in zip(held_out, show_asset(made.splats, None, list(held_out.values())), strict=True):
         shown = np.array(Image.open(out / "truth" / name)) > 0
         photo = np.array(Image.open(out / "photos" / name).convert("RGB")) / 255
         pairs.append((photo[shown] ** 2.2 / gains[name], np.clip(view.render[shown], 0, 1) ** 2.2))

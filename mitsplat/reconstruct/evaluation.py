@@ -149,7 +149,10 @@ class Verdict:
     refinement: str | None = None
     causes: Mapping[str, str] = field(default_factory=dict)
     surface: str | None = None
-    surface_faults: Sequence[str] = ()
+    surface_faults: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "surface_faults", tuple(self.surface_faults))  # files have lists
 
     @property
     def registered(self) -> float:

@@ -52,6 +52,8 @@ SMALLEST_PART = 0.02
 
 _QUALITY = Quality(alpha_min=2e-3, transmittance_min=1e-3, sh_degree=0)
 _NEIGHBOURS = 12
+_MOST_NEIGHBOURS = 12 * 4**3
+"""Of each Gaussian in a group that seems to float."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,18 +217,29 @@ def sample_nearest(
 
 
 def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:
-    """Indices of Gaussians in groups that touch no other and have little of the visible weight (N,)."""
+    """Indices of Gaussians in groups that touch no other and have little of the visible weight (N,).
+
+    Neighbours are looked at as far as it takes: where a fit puts many Gaussians in one place, as MCMC does, the nearest
+    ones of each are of that place alone.
+    """
     count = len(splats)
     if count < 2:
         return np.zeros(0, dtype=np.int64)
     sigma = splats.scales.max(axis=1).astype(np.float64)
-    distance, other = KDTree(splats.means).query(splats.means, k=min(_NEIGHBOURS + 1, count))
-    touching = distance <= TOUCH * np.maximum(sigma[:, None], sigma[other])
-    row = np.broadcast_to(np.arange(count)[:, None], other.shape)[touching]
-    graph = coo_array((np.ones(len(row)), (row, other[touching])), shape=(count, count))
-    _, group = connected_components(graph, directed=False)
-    share = np.bincount(group, weights=weight) / max(float(weight.sum()), 1e-30)
-    return np.flatnonzero(share[group] < SMALLEST_PART)
+    tree = KDTree(splats.means)
+    floating, neighbours = np.arange(count), _NEIGHBOURS
+    graph = coo_array((count, count)).tocsr()
+    while True:
+        distance, other = tree.query(splats.means[floating], k=min(neighbours + 1, count))
+        touching = distance <= TOUCH * np.maximum(sigma[floating, None], sigma[other])
+        row = np.broadcast_to(floating[:, None], other.shape)[touching]
+        graph = graph + coo_array((np.ones(len(row)), (row, other[touching])), shape=(count, count)).tocsr()
+        _, group = connected_components(graph, directed=False)
+        share = np.bincount(group, weights=weight) / max(float(weight.sum()), 1e-30)
+        floating = np.flatnonzero(share[group] < SMALLEST_PART)
+        if not len(floating) or neighbours >= min(_MOST_NEIGHBOURS, count):
+            return floating
+        neighbours *= 4
 
 
 def _lost_share(before: Splats, after: Splats, views: Sequence[MaskedView]) -> float:

@@ -10,6 +10,7 @@ table bounds it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ import manifold3d
 import mitsuba as mi
 import numpy as np
 import trimesh
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter, label
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
@@ -46,6 +47,10 @@ _BEHIND = 2.0
 surface inwards, because all of the space in front counts; without a limit, hollows close that some views miss."""
 _DOUBT = 0.5
 """Standard deviations between views by which depth must exceed the hull to cut it: masks err less than depths."""
+_PASSAGE = 2.5
+"""Radius up to which a passage into a solid is closed [cells]."""
+_EDGE = 1.5
+"""Room between solid cells that the inner edges and corners of hollows do not have where that radius ends [cells]."""
 _FILLED = 0.5
 """Share of a cell's cross-section that Gaussians must cover to fill it."""
 _DRAWS = 8
@@ -311,6 +316,7 @@ class _Grid:
             distance = distance + _DOUBT * np.sqrt(np.maximum(squares - mean * mean, 0))
             distance = np.minimum(distance, np.clip(np.array(state.hull[-1]), -self.truncation, self.truncation))
             known = np.ones_like(known)
+            distance = _sealed(distance.reshape(self.shape), self.truncation)
         # Marching cubes looks at all eight corners, and the blur at neighbours.
         known = binary_erosion(known.reshape(self.shape), np.ones((3, 3, 3)), border_value=1)
         shaped = distance.reshape(self.shape).astype(np.float32)
@@ -355,6 +361,27 @@ class _Grid:
                 value = dr.fma(dr.opaque(mi.Float, float(step[row, column])), cells[column], value)
             found.append(value)
         return found[0], found[1], found[2]
+
+
+def _sealed(distance: Float32Array, inside: float) -> Float32Array:
+    """Distances with ``inside`` in voids that only narrow passages connect with the outside.
+
+    Views that look between Gaussians dig such passages, and voids behind them. Voids are what a closing (Serra 1982) of
+    the solid cuts off, which no ball of that size reaches from the outside; edges of hollows, which none reaches
+    either, are thinner than voids and stay.
+    """
+    empty = np.pad(distance <= 0, 1 + math.ceil(_PASSAGE), constant_values=True)
+    if empty.all():
+        return distance
+    room = distance_transform_edt(empty)
+    wide = label(room > _PASSAGE)[0]
+    hidden = empty & (distance_transform_edt(wide != wide[0, 0, 0]) > _PASSAGE)
+    void = hidden & (room > _EDGE)
+    if not void.any():
+        return distance
+    void = hidden & (distance_transform_edt(~void) <= 1 + _EDGE)
+    border = (slice(1 + math.ceil(_PASSAGE), -1 - math.ceil(_PASSAGE)),) * 3
+    return np.where(void[border], np.float32(inside), distance)
 
 
 def _signed_distance(mask: Float32Array) -> Float32Array:

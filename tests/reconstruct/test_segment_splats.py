@@ -7,7 +7,7 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.reconstruct.evaluation import sized_photo
-from mitsplat.reconstruct.segment_splats import MaskedView, isolate_object, visible_weights
+from mitsplat.reconstruct.segment_splats import MaskedView, find_floaters, isolate_object, visible_weights
 from mitsplat.splats import Splats
 from tests.conftest import KnownObject
 from tests.plugins.test_backward import separated
@@ -95,3 +95,12 @@ def test_masks_of_something_else_are_refused(known_object: KnownObject) -> None:
         isolate_object(known_object.splats, views)
     with pytest.raises(InputError, match="got no view with one"):
         isolate_object(known_object.splats, [])
+
+
+def test_places_with_many_gaussians_each_do_not_float() -> None:
+    """A row of sixty places that touch, twenty Gaussians in each, and one such place apart."""
+    places = np.append(np.arange(60) * 0.01, 1.0)
+    means = np.zeros((61 * 20, 3))
+    means[:, 0] = np.repeat(places, 20) + np.random.default_rng(6).uniform(-1e-4, 1e-4, 61 * 20)
+    found = find_floaters(rubbish(means, 0.005), np.ones(len(means)))
+    np.testing.assert_array_equal(found, np.arange(1200, 1220))

@@ -19,7 +19,7 @@ from mitsplat.mesh import prepare_mesh
 from mitsplat.mesh_distance import Surface
 from mitsplat.reconstruct.evaluation import sized_photo
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
-from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface, simplify_surface
+from mitsplat.reconstruct.surface import SurfaceSettings, _sealed, reconstruct_surface, simplify_surface
 from tests.conftest import KnownObject
 
 
@@ -171,3 +171,17 @@ def test_files_without_a_similarity_are_refused(tmp_path: Path, text: str, rule:
         invert_transform(tmp_path / "matrix.txt")
     with pytest.raises(InputError, match="cannot be read"):
         invert_transform(tmp_path / "none.txt")
+
+
+def test_passages_are_closed_and_hollows_are_not() -> None:
+    """A block with a void that a thin channel joins with the outside, and a pocket."""
+    solid = np.zeros((40, 40, 40), dtype=bool)
+    solid[4:36, 4:36, 4:36] = True
+    solid[10:20, 10:20, 10:20] = False
+    solid[13:16, 13:16, :10] = False
+    solid[24:33, 24:33, 20:] = False
+    sealed = _sealed(np.where(solid, 1.0, -1.0).astype(np.float32), 3.0) > 0
+    assert sealed[10:20, 10:20, 10:20].all()
+    assert not sealed[24:33, 24:33, 20:].any()
+    assert not sealed[:4].any() and not sealed[36:].any()
+    assert not (_sealed(np.full((4, 4, 4), -1.0, np.float32), 3.0) > 0).any()

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from mitsplat.spec.image import DepthSensor
 
 
+_ONE_POSE = frozenset(("bop", "colmap", "flow"))
+"""Formats that say by one pose of the camera where all that an image shows is."""
+
+
 @dataclass(frozen=True, eq=False)
 class Catalogue:
     """What the labels of a scene refer to.
@@ -75,6 +79,11 @@ class Catalogue:
                 raise InputError(
                     f"{scene.path}: output.formats: bop must have a camera without lens distortion "
                     f"(got {list(camera.intrinsics.distortion)})"
+                )
+            if camera.motion is not None and camera.motion.readout[1] and (one := _ONE_POSE.intersection(formats)):
+                raise InputError(
+                    f"{scene.path}: output.formats: {min(one)} must have a camera whose rows are exposed at once, with "
+                    f"one pose (got camera.motion.readout {list(camera.motion.readout)})"
                 )
         meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
         distractors = [position for position, kind in enumerate(kinds) if kind is None]

@@ -24,7 +24,8 @@ from mitsplat.errors import InputError
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND, develop_layers, light_layers
 from mitsplat.frames.flow import motions_of, optical_flow, swept_by
-from mitsplat.labels.labels import Labels, Truth, label_instances
+from mitsplat.frames.rolling_shutter import Band, bands_of, project_by_row, stacked_silhouettes
+from mitsplat.labels.labels import Labels, Projection, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.masks import Silhouette
 from mitsplat.physics.settle import settle_layout
@@ -44,8 +45,8 @@ from mitsplat.render.layers import (
 from mitsplat.render.places import Backing, Finish, Place, draw_place, environment_at
 from mitsplat.render.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.scene.appearance import Appearance, draw_appearances
-from mitsplat.scene.conveyor import Belt, carried, carried_instances
-from mitsplat.scene.layout import Layout
+from mitsplat.scene.conveyor import Belt, carried, carried_by, carried_instances
+from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
 from mitsplat.spec.lights import EnvironmentLight, LightEntry, LightSpec
@@ -137,9 +138,10 @@ class Frame(Deferred):
     def flow(self) -> Float32Array | None:
         """Motion of every pixel to the image that follows [px], (H, W, 2); None if none follows.
 
-        Components are 1e10 where it is unknown, see :func:`mitsplat.frames.flow.optical_flow`.
+        Nor if its rows are not exposed at once. Components are 1e10 where it is unknown, see
+        :func:`mitsplat.frames.flow.optical_flow`.
         """
-        if self.plan.next_camera is None:
+        if self.plan.next_camera is None or "readout" in self.plan.viewpoint.get("motion", {}):
             return None
         motions = {} if self.next_layout is None else motions_of(self.layout, self.next_layout)
         belt = self.plan.belt
@@ -193,6 +195,40 @@ def render_frame(
 @lru_cache(maxsize=2)
 def _kept_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -> Renderer:
     return Renderer(scene, quality=quality)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What a band of rows shows; ``swept`` is how far its pixels move while the shutter is open, down and right."""
+
+    band: Band
+    layers: Layers
+    swept: tuple[Float32Array, Float32Array]
+    silhouettes: Mapping[int, Silhouette]
+
+
+def _swept(
+    layers: Layers, camera: Camera, motion: Mapping[str, Any], layout: Layout, belt: Belt | None
+) -> tuple[Float32Array, Float32Array]:
+    """How far every pixel moves while the shutter is open, by the camera's motion and a belt's."""
+    moving = None
+    if belt is not None:
+        moving = belt, np.isin(layers.instance, list(carried_instances(layout, belt.box)))
+    return swept_by(layers.depth, camera, motion, moving)
+
+
+def _projection(layout: Layout, plan: FramePlan) -> Projection | None:
+    """Where points of instances are in an image whose rows are exposed one after another, None for others."""
+    motion, belt = plan.viewpoint.get("motion", {}), plan.belt
+    if "readout" not in motion:
+        return None
+    carried_ones = frozenset[int]() if belt is None else carried_instances(layout, belt.box)
+
+    def project(points: Float64Array, instance: Instance) -> tuple[Float64Array, Float64Array]:
+        velocity = belt.velocity if belt is not None and instance.id in carried_ones else np.zeros(3)
+        return project_by_row(plan.camera, motion, points, velocity)
+
+    return project
 
 
 @contextmanager
@@ -291,11 +327,23 @@ class Renderer:
             )
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
+        motion, swept, looks = plan.viewpoint.get("motion"), None, list[_Look]()
+        if motion is not None:
+            with _timed(seconds, "composite"):
+                swept = _swept(layers, plan.camera, motion, layout, plan.belt)
+            with _timed(seconds, "render"):
+                bands = bands_of(plan.camera, motion, swept)
+                looks = [self._look(band, plan, motion, layout, lights is not None) for band in bands]
+                if looks:
+                    layers = Layers.stacked([(look.layers, look.band.rows) for look in looks])
+                    swept = (
+                        np.concatenate([look.swept[0] for look in looks]),
+                        np.concatenate([look.swept[1] for look in looks]),
+                    )
         with _timed(seconds, "composite"):
             composite, shape = self.scene.spec.composite, layers.shape
             behind = self._background(draw_place(self.scene.spec, index, layout.index).background, plan.camera)
             linear = light_layers(layers, composite, behind)
-            motion = plan.viewpoint.get("motion")
             development = develop_layers(
                 linear,
                 shape,
@@ -303,13 +351,15 @@ class Renderer:
                 tone=composite.tone,
                 sensor=composite.sensor,
                 seed=plan.seed,
-                swept=None if motion is None else self._swept(layers, plan, layout, motion),
+                swept=swept,
             )
         with _timed(seconds, "silhouettes"):
-            source = self.scene.spec.labels.source
-            silhouettes = render_silhouettes(self.integrator, mitsuba_scene, plan.camera, source=source)
+            if looks:
+                silhouettes = stacked_silhouettes([look.band for look in looks], [look.silhouettes for look in looks])
+            else:
+                silhouettes = self._silhouettes(mitsuba_scene, plan.camera)
         with _timed(seconds, "label"):
-            labels = self._label(layers, silhouettes, layout, plan.camera)
+            labels = self._label(layers, silhouettes, layout, plan)
         with _timed(seconds, "composite"):
             image = development.image()
         made = {"plan": plan, "layout": layout, "layers": layers, "image": image, "labels": labels, "seconds": seconds}
@@ -317,14 +367,20 @@ class Renderer:
         made["appearances"] = draw_appearances(self.scene, layout)
         return Frame.later({"rgb": partial(host_array, linear, shape)}, **made, next_layout=next_layout)
 
-    def _swept(
-        self, layers: Layers, plan: FramePlan, layout: Layout, motion: Mapping[str, Any]
-    ) -> tuple[Float32Array, Float32Array]:
-        """How far every pixel moves while the shutter is open, by the camera's motion and a belt's."""
-        moving = None
-        if plan.belt is not None:
-            moving = plan.belt, np.isin(layers.instance, list(carried_instances(layout, plan.belt.box)))
-        return swept_by(layers.depth, plan.camera, motion, moving)
+    def _silhouettes(self, mitsuba_scene: Any, camera: Camera) -> dict[int, Silhouette]:
+        return render_silhouettes(self.integrator, mitsuba_scene, camera, source=self.scene.spec.labels.source)
+
+    def _look(self, band: Band, plan: FramePlan, motion: Mapping[str, Any], layout: Layout, replaced: bool) -> _Look:
+        """What the rows of a band show at their moment."""
+        belt = plan.belt
+        if belt is not None:
+            belt = replace(belt, time=belt.time + band.time)
+            layout = carried_by(belt, layout)
+        mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights, replaced, belt), parallel=False)
+        layers = render_layers(self.integrator, mitsuba_scene, band.camera, seed=plan.seed)
+        ways = _swept(layers, band.camera, motion, layout, belt)
+        silhouettes = self._silhouettes(mitsuba_scene, band.camera)
+        return _Look(band, layers, (ways[0][band.rows], ways[1][band.rows]), silhouettes)
 
     def _at_moment(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
         """A layout at the moment of a frame, and at that of the layout's next one, None if nothing moves until then."""
@@ -342,7 +398,7 @@ class Renderer:
             self._settled[index] = settle_layout(self.scene, index)
         return self._settled[index]
 
-    def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera) -> Labels:
+    def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, plan: FramePlan) -> Labels:
         scene, rules = self.scene, self.scene.spec.labels
         if rules.source == "splats":  # the depth that is not looked at stays on the device
             truth = Truth(layers.instance, layers.proxy_instance, silhouettes, layers.depth)
@@ -353,8 +409,9 @@ class Renderer:
             layout.instances,
             scene.class_names,
             rules,
-            camera=camera,
+            camera=plan.camera,
             keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
+            project=_projection(layout, plan),
         )
 
     def describe(

@@ -17,7 +17,7 @@ Positions are in pixels with the image's corner at (0, 0), so pixel centres are 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -49,6 +49,10 @@ KEYPOINT_TOLERANCE = 0.005
 
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
 """Visibility of a keypoint, as in COCO: outside the image, behind something, seen."""
+
+
+Projection = Callable[[Float64Array, "Instance"], tuple[Float64Array, Float64Array]]
+"""Pixels (N, 2) and depths [m] (N,) of points (N, 3) of an instance in the world."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +232,7 @@ def label_instances(
     *,
     camera: Camera | None = None,
     keypoints: Mapping[int, Float64Array] | None = None,
+    project: Projection | None = None,
 ) -> Labels:
     """Labels of the ``instances`` that a frame shows.
 
@@ -238,6 +243,7 @@ def label_instances(
         rules: What is dropped or marked.
         camera: Needed for keypoints.
         keypoints: Points of each asset that has any, by its position, in its own coordinates [m], shape (K, 3).
+        project: Where the camera shows points of an instance, if that is not a matter of its pose alone.
 
     Raises:
         ValueError: If a map is not a 2-D integer array, the maps differ in shape, or one holds an id of none of the
@@ -299,7 +305,7 @@ def label_instances(
                 world_from_object=instance.world_from_object,
                 keypoints=np.zeros((0, 3))
                 if points is None or camera is None
-                else _see_keypoints(points, instance, camera, truth),
+                else _see_keypoints(points, instance, camera, truth, project),
                 marks=marks,
             )
         )
@@ -350,10 +356,13 @@ def _agreement(
     return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
 
 
-def _see_keypoints(points: Float64Array, instance: Instance, camera: Camera, truth: Truth) -> Float64Array:
+def _see_keypoints(
+    points: Float64Array, instance: Instance, camera: Camera, truth: Truth, project: Projection | None
+) -> Float64Array:
     """Pixels and visibilities of an asset's keypoints, shape (K, 3)."""
     pose = instance.world_from_object
-    pixels, depth = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    pixels, depth = camera.project(points) if project is None else project(points, instance)
     seen = np.zeros((len(points), 3))
     for row, (x, y), z in zip(seen, pixels, depth, strict=True):
         if not (z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -69,6 +69,34 @@ class Layers(Deferred):
         order_error = known.pop("order_error", None)
         makers = {name: partial(fetch[name], value, shape) for name, value in known.items()}
         return cls.later(makers, _channels=known, _shape=shape, _order_error=order_error)
+
+    @classmethod
+    def stacked(cls, parts: Sequence[tuple[Layers, slice]]) -> Layers:
+        """Layers of one below another, of each of which the stated rows are taken; all on the device, equally wide."""
+        width = parts[0][0].shape[1]
+        counts = [width * (rows.stop - rows.start) for _, rows in parts]
+
+        def joined(values: list[Any]) -> Any:
+            kind = type(values[0])
+            if dr.depth_v(values[0]) == 2:
+                return kind(*[joined(list(column)) for column in zip(*values, strict=True)])
+            out, begin = dr.zeros(kind, sum(counts)), 0
+            for value, count, (_, rows) in zip(values, counts, parts, strict=True):
+                i = dr.arange(mi.UInt32, count)
+                single = dr.width(value) == 1  # what is the same everywhere is one value on the device
+                source = value if single else dr.gather(kind, value, i + dr.opaque(mi.UInt32, width * rows.start))
+                dr.scatter(out, source, i + dr.opaque(mi.UInt32, begin))
+                begin += count
+            return out
+
+        known = [part.__dict__["_channels"] for part, _ in parts]
+        channels = {name: joined([channels[name] for channels in known]) for name in known[0]}
+        errors = [part.order_error for part, _ in parts]
+        if errors[0] is not None:
+            found = [(error["largest"], error["mean"]) for error in errors if error is not None]
+            largest, mean = np.array(found).T
+            channels["order_error"] = [largest.max(), np.average(mean, weights=counts)]
+        return cls.on_device(channels, (sum(counts) // width, width))
 
     @property
     def order_error(self) -> dict[str, float] | None:

@@ -86,9 +86,14 @@ def carried(spec: SceneSpec, layout: Layout, view: int) -> Layout:
         layout: As it settled, or carried to another view.
         view: Position of the view among the layout's.
     """
-    settled = layout.settled or layout
     belt = belt_of(spec, view)
-    if belt is None or not settled.certificate.attempts:  # physics had no part in it
+    return layout if belt is None else carried_by(belt, layout)
+
+
+def carried_by(belt: Belt, layout: Layout) -> Layout:
+    """A settled layout as it is at the moment of a belt; poses that were given stay as they are."""
+    settled = layout.settled or layout
+    if not settled.certificate.attempts:  # physics had no part in it
         return layout
     return _moved(settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
 

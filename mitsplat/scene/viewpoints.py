@@ -104,11 +104,12 @@ class _Turn:
         return taken, drawn
 
     def _motion(self, motion: Motion) -> dict[str, Any]:
-        """Exposure [s], velocity [m/s] and rate of rotation [degrees/s], in the camera's frame."""
+        """Exposure and readout [s], velocity [m/s] and rate of rotation [degrees/s], in the camera's frame."""
         rng = random_stream(self.seed, "camera motion", self.index)
         exposure, *rates = (float(rng.uniform(*bounds)) for bounds in (motion.exposure, motion.speed, motion.rotation))
         velocity, rotation = (rate * direction(2 * np.pi * rng.uniform(), rng.uniform(-1, 1)) for rate in rates)
-        return {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
+        drawn = {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
+        return drawn | ({"readout": float(rng.uniform(*motion.readout))} if motion.readout[1] else {})
 
     def _sway(self, hand: Handheld) -> Float64Array:
         """Displacement [m] and rotation vector [degrees] of a hand at a turn, shape (6,).

@@ -87,6 +87,11 @@ class Motion(StrictModel):
     rotation: NonNegativeRange = Field(
         (0.0, 0.0), description="Rate of rotation [degrees/s], about an axis that is uniform on the sphere."
     )
+    readout: NonNegativeRange = Field(
+        (0.0, 0.0),
+        exclude_if=lambda readout: readout == (0.0, 0.0),
+        description="How long after the first row the last one is exposed [s]; 0 for all rows at once.",
+    )
 
     @property
     def moves(self) -> bool:

@@ -48,7 +48,7 @@ def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[l
         ValueError: If the quality asks for a tolerance, several samples or a kernel that limits opacity.
     """
     _check(view, quality)
-    lists = bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False)
+    lists = bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False, for_gradients=True)
     # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
     *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
     return rgb, alpha
@@ -70,6 +70,8 @@ _RED, _DEPTH = 6, 9
 def _check(view: View, quality: Quality) -> None:
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
         raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
+    if quality.extends:
+        raise ValueError("gradients need rays that do not extend beyond their end (quality.extends)")
     if KERNELS[quality.kernel].alpha_max < 1:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
 
@@ -246,7 +248,7 @@ def render_records(
         CrowdedError: If there are too many pairs of a Gaussian and a tile to hold.
     """
     _check(view, quality)
-    lists = bin_records(records, None, least, box, view, quality, _PLACE.instance)
+    lists = bin_records(records, None, least, box, view, quality, _PLACE.instance, for_gradients=True)
     return (DepthRendering if depth else Rendering)(lists, view, quality)
 
 

@@ -27,6 +27,7 @@ an ellipse, with a closed-form bounding box, unless the cut-off ellipsoid touche
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -261,22 +262,25 @@ def ellipse_bounds(cutoff: Conic6) -> tuple[Any, Any, Any, Any, Any]:
     return (mid_u - half_u) * inv, (mid_u + half_u) * inv, (mid_v - half_v) * inv, (mid_v + half_v) * inv, ellipse
 
 
-def ellipse_span(cutoff: Conic6, lo_v: Any, hi_v: Any) -> tuple[Any, Any, Any]:
-    """Range (du_min, du_max) of the part of an ellipse within a band of v, and whether there is any."""
+def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
+    """Function from a band of v to the range (du_min, du_max) of an ellipse's part in it, and whether there is any."""
     a, b, c, d, e, f = cutoff
     du_min, du_max, _, _, _ = ellipse_bounds(cutoff)
     half = 0.5 * dr.rcp(a)
+    extremes = [-0.5 * (b * du + e) / c for du in (du_min, du_max)]
 
-    def edge(extreme: Any, sign: float) -> tuple[Any, Any]:
-        # The outline bends away on both sides of the ellipse's extreme point: the band's nearest v to it counts.
-        v = dr.clip(-0.5 * (b * extreme + e) / c, lo_v, hi_v)
+    def edge(v: Any, sign: float) -> tuple[Any, Any]:
         linear = dr.fma(b, v, d)
         root = dr.square(linear) - 4 * a * dr.fma(dr.fma(c, v, e), v, f)
         return (sign * dr.safe_sqrt(root) - linear) * half, root >= 0
 
-    lo, below = edge(du_min, -1.0)
-    hi, above = edge(du_max, 1.0)
-    return lo, hi, below & above
+    def span(lo_v: Any, hi_v: Any) -> tuple[Any, Any, Any]:
+        # The outline bends away on both sides of the ellipse's extreme point: the band's nearest v to it counts.
+        lo, below = edge(dr.clip(extremes[0], lo_v, hi_v), -1.0)
+        hi, above = edge(dr.clip(extremes[1], lo_v, hi_v), 1.0)
+        return lo, hi, below & above
+
+    return span
 
 
 def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v: Any) -> Any:

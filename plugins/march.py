@@ -250,7 +250,7 @@ def _march(
         return ([pixel[:-ESTIMATE] for pixel in found], [pixel[ERROR] for pixel in found]) if estimated else (found, [])
 
     found, errors = pixels(0.5, 0.5, labelled=True)
-    image, unsure = _collect(found, lanes, lists.instance)
+    image, unsure = _collect(found, lanes, lists.instance, quality)
     if gives_up and several:
         unsure &= lanes.image(mi.Bool, [~_too_wrong(errors, tolerance)] * lanes.rows)
     if quality.order != "tile":
@@ -266,7 +266,7 @@ def _march(
             colours.append([*image.rgb, image.alpha])
         else:
             found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
-            colours.append([*_picture(found, lanes)])
+            colours.append([*_picture(found, lanes, quality)])
             errors = [dr.maximum(a, b) for a, b in zip(errors, also, strict=True)]
         dr.eval(colours[-1], errors)
     if n > 1:
@@ -303,23 +303,27 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
     where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
     rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
     found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
-    image, _ = _collect(found, lanes, lists.instance)
+    image, _ = _collect(found, lanes, lists.instance, quality)
     dr.eval(image)
     return image
 
 
-def _picture(pixels: list[Pixel], lanes: Lanes) -> list[Any]:
+def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
     """Red, green, blue and opacity of the lanes' pixels as row-major arrays."""
-    colours = [lanes.image(mi.Float, [p[c] for p in pixels]) for c in (RED, GREEN, BLUE)]
-    return [*colours, lanes.image(mi.Float, [1.0 - p[T] for p in pixels])]
+    shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[T]] for pixel in pixels]
+    if quality.extends:
+        end = dr.opaque(mi.Float, quality.transmittance_min)
+        whole = [dr.select(pixel[T] <= end, dr.rcp(1.0 - pixel[T]), 1.0) for pixel in pixels]
+        shown = [[value * scale for value in values] for values, scale in zip(shown, whole, strict=True)]
+    return [lanes.image(mi.Float, channel) for channel in zip(*shown, strict=True)]
 
 
-def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None) -> tuple[Image, Any]:
+def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quality) -> tuple[Image, Any]:
     """The lanes' pixels as row-major arrays, and where an instance may be wrong.
 
     ``only`` is the id of all Gaussians if there is but one.
     """
-    *rgb, alpha = _picture(pixels, lanes)
+    *rgb, alpha = _picture(pixels, lanes, quality)
     depths = []
     for pixel in pixels:
         opacity = 1.0 - pixel[T]

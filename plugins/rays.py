@@ -327,6 +327,17 @@ class View:
             (y + (TILE_HEIGHT - half) - o["cy"]) / o["fy"],
         )
 
+    def tile_grid(self) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+        """Slope of the first tile's middle, step from tile to tile, and a tile's width, along u and along v.
+
+        Of an undistorted view.
+        """
+        o, inset = self._opaque, 1.0 if self.samples == 1 else 0.0
+        return (
+            ((0.5 * TILE_WIDTH - o["cx"]) / o["fx"], TILE_WIDTH / o["fx"], (TILE_WIDTH - inset) / o["fx"]),
+            ((0.5 * TILE_HEIGHT - o["cy"]) / o["fy"], TILE_HEIGHT / o["fy"], (TILE_HEIGHT - inset) / o["fy"]),
+        )
+
     @cached_property
     def _tile_table(self) -> Any:
         """Slope boxes of all tiles of a distorted view, 4 floats each, from the slopes around each tile's edge."""

@@ -26,7 +26,7 @@ from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH, View
 from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, prefix_ranges
-from mitsplat.plugins.walk import largest, respond_along
+from mitsplat.plugins.walk import exp2, largest, respond_along
 from mitsplat.quality import Quality
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
@@ -192,7 +192,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, place: Any, instanc
     slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
     start, stop = dr.gather(mi.UInt32, lists.start, place), dr.gather(mi.UInt32, lists.stop, place)
-    cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
+    cut = dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
     near, shared_column = view.near_plane, not view.distortion
 
     def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
@@ -202,7 +202,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, place: Any, instanc
         mine = record[RECORD - 1] == instance
         responses = respond_along(record, lists, us, vs, shared_column, cap=None)
         return i + 1, [
-            dr.select(mine & (log_alpha > cut) & (z > near), t * (1 - dr.exp2(log_alpha)), t)
+            dr.select(mine & (log_alpha > cut) & (z > near), t * (1 - exp2(log_alpha)), t)
             for t, (log_alpha, z) in zip(through, responses, strict=True)
         ]
 

@@ -21,21 +21,27 @@ import numpy as np
 from mitsplat.errors import MissingResourceError
 from mitsplat.plugins.chosen import ChosenTiles, TileBox
 from mitsplat.plugins.device import concatenated
-from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD, conic_touches_rectangle, ellipse_span
+from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD, conic_touches_rectangle, ellipse_spans
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import View
 from mitsplat.quality import Quality
 
-PAIRS_MAX = 1 << 26
+NUMBER_BITS = 26
+"""Bits of the number of a record or pair in what pairs are sorted by."""
+
+PAIRS_MAX = 1 << NUMBER_BITS
 """Most pairs of a Gaussian and a tile that are held at once, about 40 bytes each."""
 
 DEPTH_BITS = 16
 """Bits of a depth that pairs are sorted by: 11 of its mantissa tell depths apart that differ by 0.05 %, and 5 of its
 exponent those up to 2^32 times the near plane. Equals stay in the order of the clouds."""
 
+TILES_MAX = 1 << (64 - DEPTH_BITS - NUMBER_BITS)
+"""Most tiles of a view."""
+
 
 class CrowdedError(MissingResourceError):
-    """A view has more pairs than :data:`PAIRS_MAX`: render a part of it."""
+    """A view has more pairs than :data:`PAIRS_MAX`, or tiles than :data:`TILES_MAX`: render a part of it."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -52,8 +58,8 @@ class TileLists:
         near: Coefficients of :func:`mitsplat.plugins.gaussian.general_response`, 16 floats each, of the Gaussians that
             reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
         entries: Record numbers, tile after tile.
-        slots: Place of every entry if they were sorted by record number instead.
-        first: First of those places of each record, and the number of entries.
+        slots: Place of every entry if they were sorted by record number instead; of lists that are for gradients.
+        first: First of those places of each record, and the number of entries; of the same.
         nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
         visible, pairs: Number of records and of entries.
@@ -86,8 +92,9 @@ def bin_gaussians(
     quality: Quality,
     *,
     at_camera: bool = True,
-    chosen: ChosenTiles | None = None,
+    chosen: ChosenTiles | TileBox | None = None,
     fitted: bool = False,
+    for_gradients: bool = False,
 ) -> TileLists:
     """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
 
@@ -99,6 +106,7 @@ def bin_gaussians(
         at_camera: Whether Gaussians that reach the camera's plane are seen.
         chosen: The only tiles that have lists; all of the view's if None.
         fitted: Whether only the tiles in a box around all that is seen have lists.
+        for_gradients: Whether entries are to be known by record too.
 
     Raises:
         CrowdedError: If the view has too many pairs to hold.
@@ -120,9 +128,9 @@ def bin_gaussians(
     records, near_rows, least, box = source.records(owner, local, near)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
-    return bin_records(
-        records, near_rows, least, box, view, quality, only, TileBox.around(box, view) if fitted else chosen
-    )
+    if fitted:
+        chosen = TileBox.around(box, view)
+    return bin_records(records, near_rows, least, box, view, quality, only, chosen, for_gradients=for_gradients)
 
 
 def bin_records(
@@ -134,13 +142,15 @@ def bin_records(
     quality: Quality,
     only: int | None,
     chosen: ChosenTiles | TileBox | None = None,
+    *,
+    for_gradients: bool = False,
 ) -> TileLists:
     """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
 
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    pairs = _pair(dr.detach(records), least, box, view, quality, chosen)
+    pairs = _pair(dr.detach(records), least, box, view, quality, chosen, for_gradients)
     if pairs is None:
         return _empty(view, chosen, records)
     tiles, own = _numbered(view, chosen)
@@ -159,13 +169,15 @@ def _listed(
     own: Any = None,
 ) -> TileLists:
     """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
-    slots = stable_order(pairs.level, DEPTH_BITS)
+    count = dr.width(pairs.key)
     # As many bits as numbers of all tiles have, so that lists of a few need no kernels of their own.
-    slots = stable_order(pairs.tile, max(1, (view.tiles_x * view.tiles_y - 1).bit_length()), slots)
-    entries, levels = dr.gather(mi.UInt32, pairs.record, slots), dr.gather(mi.UInt32, pairs.level, slots)
-    begins, tile = _first_entries(pairs.tile, slots, tiles), dr.arange(mi.UInt32, tiles)
+    key = _sorted(pairs.key, DEPTH_BITS + max(1, (view.tiles_x * view.tiles_y - 1).bit_length()))
+    number, tile = mi.UInt32(key & ((1 << NUMBER_BITS) - 1)), dr.arange(mi.UInt32, tiles)
+    slots, entries = (None, number) if pairs.record is None else (number, dr.gather(mi.UInt32, pairs.record, number))
+    begins = _first_entries(key, tiles)
     start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
-    dr.eval(entries, start, stop)
+    dr.eval(entries, slots, start, stop)
+    levels = mi.UInt32(key >> NUMBER_BITS) & ((1 << DEPTH_BITS) - 1)
     return TileLists(
         records=records,
         near=near,
@@ -178,7 +190,7 @@ def _listed(
         stop=stop,
         least=least,
         visible=visible,
-        pairs=dr.width(entries),
+        pairs=count,
         instance=only,
         tiles=own,
     )
@@ -208,8 +220,8 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
     """
     visible = dr.width(first.records) // RECORD
     both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
-    record, place, level = (concatenated(parts) for parts in zip(*both, strict=True))
-    pairs = _Pairs(record, place, level, None)
+    pairs = _Pairs(_Pairs.key_of(*(concatenated(parts) for parts in zip(*both, strict=True))))
+    dr.eval(pairs.key)
     records, near = second.records, second.near
     if near is not None and first.near is not None:
         # The rows of the second follow those of the first.
@@ -233,19 +245,18 @@ def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
 
 def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
     """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
-    number, place, _ = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
+    place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
     tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
     record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
     slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
     level = _level(_least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
-    dr.eval(level)
-    count = dr.width(tiles)
-    again = _Pairs(number, place, level, None)
+    again, count = _Pairs(_Pairs.key_of(place, level, number)), dr.width(tiles)
+    dr.eval(again.key)
     return _listed(lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles)
 
 
 def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:
-    """Records (counted from ``shift``), places in ``tiles``, and levels of the entries of some tiles; None if none."""
+    """Places in ``tiles``, levels, and records (from ``shift`` on) of the entries of some tiles; None if none."""
     start = dr.gather(mi.UInt32, lists.start, tiles)
     length = dr.gather(mi.UInt32, lists.stop, tiles) - start
     begin, size = prefix_ranges(length)
@@ -262,29 +273,47 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
         return (k + 1,)
 
     dr.while_loop((dr.zeros(mi.UInt32, dr.width(tiles)),), lambda k: k < length, one_pair, label="merge")
-    dr.eval(number, place, level)
-    return number, place, level
+    dr.eval(place, level, number)
+    return place, level, number
 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of a record and a tile, record after record: record, tile, level of depth; and where each record starts."""
+    """Pairs of a record and a tile, record after record.
 
-    record: Any
-    tile: Any
-    level: Any
-    first: Any
+    Attributes:
+        key: What they are sorted by, see :meth:`key_of`.
+        record: Number of each one's record, of pairs that are numbered themselves.
+        first: First pair of each record, and the number of pairs; of the same.
+    """
+
+    key: Any
+    record: Any | None = None
+    first: Any | None = None
+
+    @staticmethod
+    def key_of(tile: Any, level: Any, number: Any) -> Any:
+        """Tile, level of depth, and the number of the record, or of the pair, in one."""
+        return mi.UInt64(tile) << (DEPTH_BITS + NUMBER_BITS) | mi.UInt64(level) << NUMBER_BITS | mi.UInt64(number)
 
 
 def _pair(
-    records: Any, least: Any, box: Any, view: View, quality: Quality, chosen: ChosenTiles | TileBox | None
+    records: Any,
+    least: Any,
+    box: Any,
+    view: View,
+    quality: Quality,
+    chosen: ChosenTiles | TileBox | None,
+    numbered: bool,
 ) -> _Pairs | None:
     """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
 
     Raises:
-        CrowdedError: If there are more than :data:`PAIRS_MAX`.
+        CrowdedError: If there are more than :data:`PAIRS_MAX`, or their keys have no room for tiles or records.
     """
     count = dr.width(least)
+    if count > 1 << NUMBER_BITS or view.tiles_x * view.tiles_y > TILES_MAX:
+        raise CrowdedError
     order = dr.arange(mi.UInt32, count)
     x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
     row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0))
@@ -315,23 +344,32 @@ def _pair(
         return None
     record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
     ellipsoid = dr.gather(mi.Float, least, owner)
-    number, tile_of, level_of = (dr.empty(mi.UInt32, pairs) for _ in range(3))
-    first = dr.empty(mi.UInt32, count + 1)
+    key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
+
+    def in_view(tile: Any) -> Any:
+        return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile)
+
+    depth_of = _depths(record, ellipsoid, in_view(first_tile), view, quality)
 
     def one_tile(k: Any) -> tuple[Any]:
         tile, pair = first_tile + k, pair_of + k
-        slopes = view.tile_slopes(tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile))
-        depth = _least_depth(record, ellipsoid, slopes) if quality.order == "ray" else _depth_where_seen(record, slopes)
-        for target, value in ((number, owner), (tile_of, tile), (level_of, _level(depth, view))):
-            dr.scatter(target, value, pair, mode=dr.ReduceMode.Permute)
+        depth = depth_of(in_view(tile))
+        own = _Pairs.key_of(tile, _level(depth, view), pair if numbered else owner)
+        dr.scatter(key, own, pair, mode=dr.ReduceMode.Permute)
+        if numbered:
+            dr.scatter(number, owner, pair, mode=dr.ReduceMode.Permute)
         return (k + 1,)
 
     dr.while_loop((dr.zeros(mi.UInt32, rows),), lambda k: k < length, one_tile, label="pairs")
+    if not numbered:
+        dr.eval(key)
+        return _Pairs(key)
+    first = dr.empty(mi.UInt32, count + 1)
     end, inside = dr.opaque(mi.UInt32, pairs), row_of < dr.opaque(mi.UInt32, rows)
     dr.scatter(first, dr.select(inside, dr.gather(mi.UInt32, pair_of, row_of, inside), end), order)
     dr.scatter(first, end, dr.opaque(mi.UInt32, count))
-    dr.eval(number, tile_of, level_of, first)
-    return _Pairs(number, tile_of, level_of, first)
+    dr.eval(key, number, first)
+    return _Pairs(key, number, first)
 
 
 def prefix_ranges(sizes: Any) -> tuple[Any, int]:
@@ -360,10 +398,13 @@ def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any
     k2 = opacity - cut
     conic = a - k2 * g, b2 - k2 * h, c - k2 * i, -k2 * e, -k2 * f, -k2
     whole = a < 0
+    if not view.distortion:
+        span_between = ellipse_spans(conic)
+        _, (first_v, step_v, height) = view.tile_grid()
 
     def straight(y: Any) -> tuple[Any, Any]:
-        _, _, lo_v, hi_v = view.tile_slopes(y * view.tiles_x)
-        lo_u, hi_u, meets = ellipse_span(conic, lo_v - v0, hi_v - v0)
+        dv = dr.fma(mi.Float(y), step_v, first_v) - v0
+        lo_u, hi_u, meets = span_between(dv - 0.5 * height, dv + 0.5 * height)
         lo, hi = view.tile_columns(u0 + lo_u, u0 + hi_u)
         lo, hi = dr.maximum(lo, x0), dr.minimum(dr.select(meets, hi, 0), x1)
         return dr.select(whole, x0, lo), dr.select(whole, x1, hi)
@@ -382,17 +423,17 @@ def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any
     return distorted if view.distortion else straight
 
 
-def stable_order(key: Any, bits: int, order: Any | None = None) -> Any:
-    """Stable order of keys of so many bits: positions in ``key``, which is taken in ``order`` if that is given.
+def stable_order(key: Any, bits: int) -> Any:
+    """Stable order of keys of so many bits: positions in ``key``.
 
     A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.
     """
-    count = dr.width(key)
+    count, order = dr.width(key), None
     radix = 16 if dr.backend_v(key) == dr.JitBackend.LLVM else 8
     passes = -(-bits // radix)
     width = -(-bits // passes)
     for shift in range(0, bits, width):
-        digit = (key if order is None else dr.gather(mi.UInt32, key, order)) >> shift & ((1 << width) - 1)
+        digit = mi.UInt32((key if order is None else dr.gather(type(key), key, order)) >> shift) & ((1 << width) - 1)
         dr.eval(digit)
         permutation = dr.detail.block_mkperm(digit, count, 1 << width)
         order = permutation if order is None else dr.gather(mi.UInt32, order, permutation)
@@ -400,14 +441,27 @@ def stable_order(key: Any, bits: int, order: Any | None = None) -> Any:
     return order
 
 
-def _first_entries(tile: Any, order: Any, tiles: int) -> Any:
-    """Number of the first entry of every tile, and of all entries, by bisection."""
-    wanted = dr.arange(mi.UInt32, tiles + 1)
-    pairs = dr.opaque(mi.UInt32, dr.width(order))
+def _sorted(key: Any, bits: int) -> Any:
+    """Keys (UInt64, evaluated) of pairs by their leading ``bits``, above their numbers, by which they ascend already.
+
+    On a CPU, where NumPy sorts several of them with each instruction, in their own memory.
+    """
+    if dr.backend_v(key) == dr.JitBackend.LLVM:
+        key.numpy().sort()
+        return key
+    in_order = dr.gather(mi.UInt64, key, stable_order(key >> NUMBER_BITS, bits))
+    dr.eval(in_order)
+    return in_order
+
+
+def _first_entries(key: Any, tiles: int) -> Any:
+    """Number of the first entry of every tile, and of all entries, by bisection of sorted keys."""
+    wanted = _Pairs.key_of(dr.arange(mi.UInt32, tiles + 1), mi.UInt32(0), mi.UInt32(0))
+    pairs = dr.opaque(mi.UInt32, dr.width(key))
 
     def halve(low: Any, high: Any) -> tuple[Any, Any]:
         middle = (low + high) // 2
-        before = dr.gather(mi.UInt32, tile, dr.gather(mi.UInt32, order, middle, low < high), low < high) < wanted
+        before = dr.gather(mi.UInt64, key, middle, low < high) < wanted
         return dr.select(before, middle + 1, low), dr.select(before, high, middle)
 
     state = dr.zeros(mi.UInt32, tiles + 1), pairs + dr.zeros(mi.UInt32, tiles + 1)
@@ -431,26 +485,54 @@ def _depth_of_level(level: Any, view: View) -> Any:
     return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
 
+def _depths(record: Any, ellipsoid: Any, first: Any, view: View, quality: Quality) -> Callable[[Any], Any]:
+    """Function from a tile in the row of tiles of the ``first`` one to a record's depth there, by which it is sorted.
+
+    In an undistorted view, most of it is the same for a whole row.
+    """
+    if quality.order == "ray":
+        return lambda tile: _least_depth(record, ellipsoid, view.tile_slopes(tile))
+    if view.distortion:
+        return lambda tile: _depth_where_seen(record, view.tile_slopes(tile))
+    (first_u, step_u, width), (first_v, step_v, height) = view.tile_grid()
+    row = first // view.tiles_x
+    depth_around, begin = _depths_where_seen(record, width, height), row * view.tiles_x
+    middle_u, middle_v = first_u - record[0], dr.fma(mi.Float(row), step_v, first_v) - record[1]
+    return lambda tile: depth_around(dr.fma(mi.Float(tile - begin), step_u, middle_u), middle_v)
+
+
 def _depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
-    """Depth of a Gaussian's peak along the ray of a tile around which the tile sees most of it.
+    """Depth of a Gaussian's peak along the ray around which a tile between some slopes sees most of it."""
+    lo_u, hi_u, lo_v, hi_v = slopes
+    depth_around = _depths_where_seen(record, hi_u - lo_u, hi_v - lo_v)
+    return depth_around(0.5 * (lo_u + hi_u) - record[0], 0.5 * (lo_v + hi_v) - record[1])
+
+
+def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, Any], Any]:
+    """Function from the middle of a tile of such slopes, from the footprint's centre on, to :func:`_depth_where_seen`.
 
     With M the inverse covariance of the footprint and V that of a tile's pixels, taken for a Gaussian around its middle
     m, their product has its mean at (I + V M)^-1 m from the footprint's centre: near the centre of what is small
     against the tile, in the middle of the tile for what is large.
     """
-    lo_u, hi_u, lo_v, hi_v = slopes
-    u0, v0, a, b2, c = (record[k] for k in range(5))
-    middle_u, middle_v = 0.5 * (lo_u + hi_u) - u0, 0.5 * (lo_v + hi_v) - v0
-    variance_u, variance_v = (dr.square(w) / (12 * LOG2_E_HALF) for w in (hi_u - lo_u, hi_v - lo_v))
+    a, b2, c = (record[k] for k in (2, 3, 4))
+    variance_u, variance_v = (dr.square(w) / (12 * LOG2_E_HALF) for w in (width, height))
     # What is smaller than the tile by more than this is seen at its centre, and would overflow.
     p11, p22 = 1 + dr.minimum(variance_u * a, 1e15), 1 + dr.minimum(variance_v * c, 1e15)
     b = dr.clip(0.5 * b2, -1e15 / variance_u, 1e15 / variance_u)
     inverse = dr.rcp(dr.maximum(p11 * p22 - variance_u * b * (variance_v * b), 1))
-    du = inverse * (p22 * middle_u - variance_u * b * middle_v)
-    dv = inverse * (p11 * middle_v - variance_v * b * middle_u)
-    du, dv = dr.clip(du, lo_u - u0, hi_u - u0), dr.clip(dv, lo_v - v0, hi_v - v0)
-    top, bottom = _depth_fraction(record, du, dv)
-    return dr.select(record[2] < 0, 0, record[9] * dr.maximum(top, 0) / bottom)
+    uu, uv = inverse * p22, inverse * (variance_u * b)
+    vu, vv = inverse * (variance_v * b), inverse * p11
+    half_u, half_v = 0.5 * width, 0.5 * height
+
+    def depth_around(middle_u: Any, middle_v: Any) -> Any:
+        du, dv = uu * middle_u - uv * middle_v, vv * middle_v - vu * middle_u
+        du = dr.clip(du, middle_u - half_u, middle_u + half_u)
+        dv = dr.clip(dv, middle_v - half_v, middle_v + half_v)
+        top, bottom = _depth_fraction(record, du, dv)
+        return dr.select(a < 0, 0, record[9] * dr.maximum(top, 0) / bottom)
+
+    return depth_around
 
 
 def _least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:

@@ -22,7 +22,7 @@ from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.camera_response import tone_curve
 from mitsplat.quality import KERNELS, PRESETS, Quality
-from mitsplat.render.layers import Layers, make_sensor, render_splats
+from mitsplat.render.layers import Layers, ensure_variant, make_sensor, render_splats
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 from tests.reference import render_reference
@@ -160,6 +160,31 @@ def test_coincident_layers_multiply(count: int, tolerance: float) -> None:
     quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0)
     alpha = render_splats(splats, CAMERA, quality=quality).alpha
     assert alpha[12, 16] == pytest.approx(1 - 0.99**count, abs=1e-4)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
+def test_a_ray_that_ended_shows_what_it_met_alone(tolerance: float) -> None:
+    """Eleven layers of opacity 0.3 leave less than 0.02 of the light, which goes to nothing, or is of their colour."""
+    quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0.02)
+    for count, left in ((5, 0.7**5), (30, 0.7**11)):
+        splats = one((50.0, 50.0, 0.001), opacity=0.3, count=count)
+        ended, extended = (render_splats(splats, CAMERA, quality=replace(quality, extends=e)) for e in (False, True))
+        expected = 1 - left, 1 if count == 30 else 1 - left
+        for layers, alpha in zip((ended, extended), expected, strict=True):
+            assert layers.alpha[12, 16] == pytest.approx(alpha, abs=1e-4)
+            colour = alpha * decode_srgb(np.array([0.2, 0.5, 0.8]))
+            np.testing.assert_allclose(layers.rgb[12, 16], colour, atol=2e-4)
+
+
+def test_powers_of_two_are_those_of_numpy() -> None:
+    ensure_variant()
+    from mitsplat.plugins.walk import exp2
+
+    x = np.linspace(-126, 126, 200_001, dtype=np.float32)
+    found, whole = (exp2(mi.Float(values)).numpy().astype(np.float64) for values in (x, np.arange(-126.0, 127.0)))
+    tolerance = 1e-5 if mi.variant() == "cuda_ad_rgb" else 2e-7
+    np.testing.assert_allclose(found, np.exp2(x.astype(np.float64)), rtol=tolerance)
+    np.testing.assert_array_equal(whole, np.exp2(np.arange(-126.0, 127.0)))
 
 
 def test_equal_depths_keep_their_order_when_others_come_between() -> None:

@@ -1,0 +1,39 @@
+"""Lists of Gaussians per tile: what is in them, and in which order."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mitsplat.camera import Camera
+from mitsplat.quality import PRESETS
+from mitsplat.render.layers import ensure_variant, make_sensor
+from tests.render.test_render import make_splats
+
+CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=50, fov_x=50)
+
+
+@pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}])
+def test_entries_ascend_by_depth_and_number_and_have_a_place_by_record(lens: dict[str, tuple[float, ...]]) -> None:
+    ensure_variant()
+    from mitsplat.plugins.gaussian import upload_cloud
+    from mitsplat.plugins.project import Placement, merge_clouds
+    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.plugins.tiles import bin_gaussians
+
+    splats = make_splats(400, 3)
+    cloud = upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    scene = merge_clouds([cloud]), [Placement(0, np.eye(4), 1)]
+    view = view_of(make_sensor(replace(CAMERA, **lens)))
+    seen, known = (bin_gaussians(*scene, view, PRESETS["fast"], for_gradients=wanted) for wanted in (False, True))
+    entries, levels, start, stop = (np.array(values) for values in (seen.entries, seen.levels, seen.start, seen.stop))
+    assert seen.slots is None and len(entries) == seen.pairs == (stop - start).sum()
+    for first, last in zip(start, stop, strict=True):
+        both = levels[first:last].astype(np.int64) << 32 | entries[first:last]
+        assert (np.diff(both) > 0).all()
+    np.testing.assert_array_equal(np.array(known.entries), entries)
+    slots, begins = np.array(known.slots), np.array(known.first)
+    np.testing.assert_array_equal(np.sort(slots), np.arange(seen.pairs))
+    assert ((begins[entries] <= slots) & (slots < begins[entries + 1])).all()
+    assert dr.width(known.first) == seen.visible + 1

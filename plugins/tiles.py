@@ -346,10 +346,10 @@ def _pair(
     ellipsoid = dr.gather(mi.Float, least, owner)
     key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
 
-    def in_view(tile: Any) -> Any:
-        return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile)
+    def in_view(tile: Any, active: Any = True) -> Any:
+        return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile, active)
 
-    depth_of = _depths(record, ellipsoid, in_view(first_tile), view, quality)
+    depth_of = _depths(record, ellipsoid, in_view(first_tile, length > 0), view, quality)
 
     def one_tile(k: Any) -> tuple[Any]:
         tile, pair = first_tile + k, pair_of + k

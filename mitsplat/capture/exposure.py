@@ -20,7 +20,6 @@ _SURE = (0.04, 0.96)
 """Display-encoded values that are neither lost in noise nor clipped."""
 _FEWEST = 20
 """Points from which a photo is corrected."""
-_ROUNDS = 12
 _LEAST_SCALE = 0.02
 """Least scale of what counts as an ordinary difference between logarithms."""
 
@@ -30,28 +29,24 @@ def even_exposure(capture: Capture) -> Capture:
     gains = relative_gains(capture.photos, capture.points)
     if np.log(gains).std(axis=0).max(initial=0.0) <= STEADY:
         return capture
-    rows = [(float(r), float(g), float(b)) for r, g, b in gains]
-    return replace(
-        capture, photos=tuple(replace(photo, gain=gain) for photo, gain in zip(capture.photos, rows, strict=True))
+    photos = (
+        replace(p, gain=(float(r), float(g), float(b))) for p, (r, g, b) in zip(capture.photos, gains, strict=True)
     )
+    return replace(capture, photos=tuple(photos))
 
 
 def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Array:
     """What each photo's linear red, green and blue are to be multiplied by, (N, 3); their logarithms have mean 0.
 
     The logarithm of what a photo shows of a point is the point's less the photo's: linear least squares, the points
-    eliminated, in which differences count by Cauchy's weights, because gloss and hidden points tell of no exposure.
-
-    Args:
-        photos: With ``seen``.
-        points: Of their capture, shape (M, 3).
+    eliminated, in which differences count by Cauchy's weights, because gloss and hidden points tell of no exposure. The
+    points are those of the photos' capture, shape (M, 3).
     """
     photo, point, seen = _observations(photos, points)
-    corrections = np.zeros((len(photos), 3))
     if not len(photo):
         return np.ones((len(photos), 3))
-    weight = np.ones(len(photo))
-    for _ in range(_ROUNDS):
+    corrections, weight = np.zeros((len(photos), 3)), np.ones(len(photo))
+    for _ in range(12):
         shape = len(photos), int(point.max()) + 1
         links = coo_array((weight, (photo, point)), shape=shape).tocsr()
         share = 1 / np.maximum(np.asarray(links.sum(axis=0)).ravel(), 1e-12)
@@ -78,13 +73,13 @@ def _observations(photos: Sequence[Photo], points: Float64Array) -> tuple[Int64A
     for number, photo in enumerate(photos):
         scale = min(1.0, _EDGE / max(photo.camera.width, photo.camera.height))
         rgb, _ = photo.picture(scale)
-        height, width, _ = rgb.shape
-        pixels, depth = photo.camera.resized(width, height).project(points[photo.seen])
-        inside = (depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+        size = rgb.shape[1], rgb.shape[0]
+        pixels, _ = photo.camera.resized(*size).project(points[photo.seen])
+        inside = ((pixels >= 0) & (pixels < size)).all(axis=1)
         x, y = pixels[inside].astype(np.int64).T
         values = rgb[y, x]
         sure = ((values > _SURE[0]) & (values < _SURE[1])).all(axis=1)
         own = photo.seen[inside][sure].astype(np.int64)
         found.append((np.full(len(own), number, dtype=np.int64), own, np.log(decode_srgb(values[sure]))))
-    photo_of, point_of, seen = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return photo_of, point_of, seen
+    photo_of, point_of, shown = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return photo_of, point_of, shown

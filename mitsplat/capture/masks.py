@@ -38,7 +38,7 @@ MIN_AGREEMENT = 0.7
 """Share of the object's points in a photo that its mask must cover."""
 
 _WORK_EDGE = 480
-"""Longer edge at which GrabCut works [px]."""
+"""Longer edge of a photo at which GrabCut begins, and of the object at which it ends [px]."""
 
 _FAR_OFF = 100
 """Sizes of the image within which a point must be projected to count."""
@@ -189,7 +189,8 @@ def agreed_masks(masked: Capture, points: Float64Array, bare: Bare | None = None
     hull, cell = _agreed_hull([(camera, mask) for camera, _, mask in small.values()], points)
 
     def make(photo: Photo) -> BoolArray:
-        camera, bgr, mask = small[photo.name] if photo.name in small else _reduced(photo)
+        rough = small[photo.name][2] if photo.name in small else None
+        camera, bgr, mask = _reduced(photo, 1 if rough is None else _share(rough))
         silhouette = _silhouette(hull, cell, camera)
         size = float(np.sqrt(np.count_nonzero(silhouette)))
         if size > 0:
@@ -329,9 +330,15 @@ def _silhouette(cells: Float64Array, cell: float, camera: Camera) -> BoolArray:
     return ~_grown(~_grown(shown, edge), edge / 2)
 
 
-def _reduced(photo: Photo) -> tuple[Camera, ByteImage, BoolArray]:
-    """Camera, BGR picture (H, W, 3) and mask (H, W) of a photo in the size for GrabCut; without a mask, none of it."""
-    scale = min(1.0, _WORK_EDGE / max(photo.camera.width, photo.camera.height))
+def _share(mask: BoolArray) -> float:
+    """What share of the longer edge of its picture a mask spans."""
+    shown = np.argwhere(mask)
+    return float(np.ptp(shown, axis=0).max() + 1) / max(mask.shape) if len(shown) else 1.0
+
+
+def _reduced(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolArray]:
+    """Camera, BGR picture (H, W, 3) and mask (H, W) in the size for GrabCut of a ``share`` of a photo's longer edge."""
+    scale = min(1.0, _WORK_EDGE / share / max(photo.camera.width, photo.camera.height))
     rgb, mask = photo.picture(scale)
     bgr = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
     height, width = bgr.shape[:2]

@@ -49,7 +49,9 @@ Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that holds the object, in the capture's frame."),
 ]
-Size = Annotated[float | None, typer.Option(help="Longest extent [m], where the photos give no scale.")]
+Size = Annotated[
+    float | None, typer.Option(help="Longest edge of the smallest upright box around it [m], without other scale.")
+]
 Gaussians = Annotated[int, typer.Option(help="Most Gaussians.")]
 ShDegree = Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")]
 Iterations = Annotated[int, typer.Option(help="Steps of the fit, one photo each.")]

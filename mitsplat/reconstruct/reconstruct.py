@@ -34,7 +34,8 @@ class ReconstructSettings:
         surface: How the mesh is reconstructed.
         view_size: Longest edge of the pictures that masks and depth are read from [px].
         verdict_size: Longest edge of the held-out pictures [px].
-        size: Longest extent of the mesh [m], which then decides the units.
+        size: Longest edge of the smallest upright box around the mesh [m], which then decides the units; the asset is
+            turned about z until that box lies along its axes.
         refine: How the mesh of an object is refined by its masks; None leaves it as it is reconstructed.
     """
 
@@ -65,7 +66,7 @@ class Reconstruction:
     """An asset and what is known about it.
 
     Attributes:
-        asset: In the capture's frame, or in metres where a size was given or a mesh registered.
+        asset: In the capture's frame, or in metres where a size was given, and then turned, or a mesh registered.
         verdict: Its quality.
         held_out: The views that this was judged by.
         isolation: What was removed, or None for surroundings.
@@ -159,21 +160,22 @@ def reconstruct_asset(
         units=capture.units,
         capture_light="uniform" if kind == "object" else "scene",
     )
-    metres = 1.0
+    asset_from_capture = np.eye(4)
     if settings.size is not None:
-        metres = asset.factor_to(settings.size)
+        turn = _squaring_turn(mesh)
+        asset = asset.transformed(turn)
+        asset_from_capture = np.diag([*[asset.factor_to(settings.size)] * 3, 1.0]) @ turn
         asset = asset.resized(settings.size)
     elif capture.units == "unknown" and alignment is not None and imported and imported.metres_per_unit:
         metres = imported.metres_per_unit / alignment.scale
         asset = replace(asset.scaled(metres), units="metre")
+        asset_from_capture = np.diag([metres, metres, metres, 1.0])
     if kind == "object":
         if progress is not None:
             progress(0, 1, "splitting the mesh into convex pieces")
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
-    return Reconstruction(
-        asset, verdict, held_out, isolation, alignment, refinement, np.diag([metres, metres, metres, 1.0])
-    )
+    return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement, asset_from_capture)
 
 
 def check_refinable(settings: ReconstructSettings, kind: str, imported: ImportedMesh | None) -> None:
@@ -197,6 +199,17 @@ def _stands(splats: Splats) -> bool:
         np.quantile(height, _BELOW)
         > -_BELOW * np.ptp(np.quantile(splats.means, (_BELOW, 1 - _BELOW), axis=0), axis=0).max()
     )
+
+
+def _squaring_turn(mesh: trimesh.Trimesh) -> Float64Array:
+    """The least turn about z, (4, 4), after which the smallest upright box around a mesh lies along the axes.
+
+    A ruler is held against that box; extents along axes that cameras chose may be larger by almost a half.
+    """
+    flat, _ = trimesh.bounds.oriented_bounds_2D(np.asarray(mesh.vertices)[:, :2])
+    angle = float(np.arctan2(flat[1, 0], flat[0, 0]))
+    angle -= np.pi / 2 * round(angle / (np.pi / 2))
+    return np.asarray(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
 
 
 def _placed(

@@ -203,6 +203,26 @@ def test_a_capture_in_metres_takes_no_size(known_object: KnownObject) -> None:
         reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=replace(SETTINGS, size=0.2))
 
 
+def test_a_size_is_what_a_ruler_finds_whichever_way_the_capture_lies(known_object: KnownObject) -> None:
+    """The capture's axes have nothing to do with the edges of the smallest upright box around the solid."""
+    turn = trimesh.transformations.rotation_matrix(0.6, (0, 0, 1)) @ np.diag([3.0, 3.0, 3.0, 1.0])
+    capture = replace(known_object.capture.transformed(turn), units="unknown")
+    vertices = np.asarray(known_object.mesh.vertices)
+    edges = trimesh.bounds.oriented_bounds_2D(vertices[:, :2])[1]
+    settings = replace(SETTINGS, size=float(max(*edges, np.ptp(vertices[:, 2]))))
+    found = reconstruct_asset(capture, known_object.splats.transformed(turn), name="part", settings=settings)
+    assert found.asset.mesh is not None
+    assert found.asset.mesh.extents.max() == pytest.approx(settings.size, rel=1e-12)
+    assert found.asset.units == "metre"
+    # A share of a cell of the grid is left.
+    asset_from_truth = found.asset_from_capture @ turn
+    np.testing.assert_allclose(np.cbrt(np.linalg.det(asset_from_truth[:3, :3])), 1, rtol=0.01)
+    np.testing.assert_allclose(np.sort(found.asset.mesh.extents[:2]), np.sort(edges), rtol=0.01)
+    assert found.isolation is not None
+    kept = known_object.splats.select(found.isolation.kept).transformed(asset_from_truth)
+    np.testing.assert_allclose(found.asset.splats.means, kept.means, atol=1e-6)
+
+
 def test_photos_go_through_all_stages(
     known_object: KnownObject, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

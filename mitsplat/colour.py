@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +13,6 @@ from mitsplat.arrays import Float64Array
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Rec. 709 luminance of linear sRGB."""
-_XYZ_FROM_RGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""Of linear sRGB (IEC 61966-2-1)."""
-_WHITE = (0.3127, 0.3290)
-"""Chromaticity of sRGB's white."""
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-"""From tristimulus values to cone responses."""
 
 
 def encode_srgb(linear: npt.ArrayLike) -> Float64Array:
@@ -50,48 +46,31 @@ def saturation_matrix(factor: float) -> Float64Array:
 @lru_cache(maxsize=256)
 def black_body_colour(kelvin: float) -> tuple[float, float, float]:
     """Linear sRGB of a black body (Kang et al. 2002), of luminance 1; a negative component counts as 0."""
-    rgb = np.maximum(np.linalg.inv(_XYZ_FROM_RGB) @ _xyz(*_planckian_xy(kelvin)), 0.0)
+    colour = _colour_science()
+    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="Kang 2002"))
+    rgb = np.maximum(np.linalg.inv(colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ) @ white, 0.0)
     red, green, blue = (rgb / (LUMINANCE @ rgb)).tolist()
     return red, green, blue
 
 
 @lru_cache(maxsize=64)
 def white_balance_matrix(kelvin: float) -> Float64Array:
-    """Matrix (3, 3) on linear sRGB that shows daylight of a temperature as white, of luminance 1.
+    """Matrix (3, 3) on linear sRGB that shows daylight of a temperature (CIE 15) as white, of luminance 1.
 
     A von Kries adaptation in Bradford's cone space (Lam 1985).
     """
-    seen, shown = _BRADFORD @ _xyz(*_daylight_xy(kelvin)), _BRADFORD @ _xyz(*_WHITE)
-    matrix = np.linalg.inv(_XYZ_FROM_RGB) @ (np.linalg.inv(_BRADFORD) @ np.diag(shown / seen) @ _BRADFORD)
-    matrix = matrix @ _XYZ_FROM_RGB
+    colour = _colour_science()
+    space = colour.RGB_COLOURSPACES["sRGB"]
+    seen = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="CIE Illuminant D Series"))
+    shown = colour.xy_to_XYZ(space.whitepoint)
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(seen, shown, transform="Bradford")
+    matrix = np.linalg.inv(space.matrix_RGB_to_XYZ) @ adapt @ space.matrix_RGB_to_XYZ
     return np.asarray(matrix / (LUMINANCE @ matrix @ np.ones(3)), dtype=np.float64)
 
 
-def _xyz(x: float, y: float) -> Float64Array:
-    """Tristimulus values of a chromaticity, of luminance 1."""
-    return np.array([x * (1 / y), 1.0, (1 - (x + y)) * (1 / y)])
-
-
-def _planckian_xy(kelvin: float) -> tuple[float, float]:
-    """Chromaticity of a black body of 1667 to 25000 K (Kang et al. 2002)."""
-    square, cube = np.square(kelvin), np.power(kelvin, 3)
-    if kelvin <= 4000:
-        x = -0.2661239 * 10**9 / cube - 0.2343589 * 10**6 / square + 0.8776956 * 10**3 / kelvin + 0.179910
-    else:
-        x = -3.0258469 * 10**9 / cube + 2.1070379 * 10**6 / square + 0.2226347 * 10**3 / kelvin + 0.24039
-    square, cube = np.square(x), np.power(x, 3)
-    if kelvin <= 2222:
-        return x, -1.1063814 * cube - 1.34811020 * square + 2.18555832 * x - 0.20219683
-    if kelvin <= 4000:
-        return x, -0.9549476 * cube - 1.37418593 * square + 2.09137015 * x - 0.16748867
-    return x, 3.0817580 * cube - 5.8733867 * square + 3.75112997 * x - 0.37001483
-
-
-def _daylight_xy(kelvin: float) -> tuple[float, float]:
-    """Chromaticity of daylight of 4000 to 25000 K (CIE 15, illuminants D)."""
-    square, cube = np.square(kelvin), np.power(kelvin, 3)
-    if kelvin <= 7000:
-        x = -4.607 * 10**9 / cube + 2.9678 * 10**6 / square + 0.09911 * 10**3 / kelvin + 0.244063
-    else:
-        x = -2.0064 * 10**9 / cube + 1.9018 * 10**6 / square + 0.24748 * 10**3 / kelvin + 0.23704
-    return x, -3.000 * np.square(x) + 2.870 * x - 0.275
+def _colour_science() -> Any:
+    """colour-science, without its warning that plots need Matplotlib."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour  # takes a second, and warns as it is imported
+    return colour

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -37,3 +38,17 @@ def test_entries_ascend_by_depth_and_number_and_have_a_place_by_record(lens: dic
     np.testing.assert_array_equal(np.sort(slots), np.arange(seen.pairs))
     assert ((begins[entries] <= slots) & (slots < begins[entries + 1])).all()
     assert dr.width(known.first) == seen.visible + 1
+
+
+def test_sorts_agree_with_numpy() -> None:
+    """In several threads as in one; and the stable radix sort of keys of 64 bits, by which a GPU sorts."""
+    ensure_variant()
+    from mitsplat.plugins.tiles import sort_in_threads, stable_order
+
+    keys = np.random.default_rng(2).integers(0, 1 << 31, 150_000).astype(np.uint64) // 1000
+    for threads in (1, 3, 8):
+        found = keys.copy()
+        sort_in_threads(found, threads)
+        np.testing.assert_array_equal(found, np.sort(keys))
+    order = np.array(stable_order(mi.UInt64(keys), 31))
+    np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))

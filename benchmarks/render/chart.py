@@ -1,6 +1,6 @@
 """Speed against accuracy, as ``mitsplat chart`` measures it, kept for the documentation.
 
-    python -m benchmarks.render.chart FILE [--frames 2] [--size 1280x720]
+    python -m benchmarks.render.chart FILE [--frames 2] [--size 1280x720] [--at 0.03 ...] [--picture chart.png]
 
 FILE is a scene, or a file of splats, for which Mitsuba's own path is measured as well.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.record import figure, recording
-from mitsplat.frames.speed_accuracy import measure_steps
+from mitsplat.frames.speed_accuracy import draw_chart, measure_steps
 
 UNITS = {"seconds": "s", "psnr": "dB", "memory": "GiB"}
 
@@ -24,16 +24,22 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--frames", type=int, default=2)
     parser.add_argument("--size", help="of the pictures, such as 640x480; as the scene says by default")
+    parser.add_argument("--at", nargs="*", type=float, default=[], help="tolerances of the order of blending, as well")
+    parser.add_argument("--picture", type=Path, help="chart to draw")
     options = parser.parse_args()
     overrides: dict[str, Any] = {}
     if options.size:
         overrides = dict(zip(("output.width", "output.height"), map(int, options.size.split("x")), strict=True))
-    with recording("render.chart", parser, options):
-        for row in measure_steps(options.file, frames=options.frames, overrides=overrides):
+    with recording("render.chart", parser, options, ignore=("at", "picture")):
+        rows = measure_steps(options.file, tolerances=options.at, frames=options.frames, overrides=overrides)
+        for row in rows:
             values = {key: value for key, value in asdict(row).items() if key != "name"}
             print(f"{row.name:30s}" + "".join(f"{key} {value:.4g}  " for key, value in values.items()), flush=True)
             for key, value in values.items():
                 figure(value, UNITS.get(key, ""), row.name, key)
+    if options.picture:
+        title = f"{options.file.name}: {options.frames} images"
+        draw_chart(rows, options.picture, title=title, tolerance=0.004)
 
 
 if __name__ == "__main__":

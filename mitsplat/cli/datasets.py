@@ -245,6 +245,10 @@ def chart(
     tolerance: Annotated[
         float, typer.Option(help="Mark the cheapest preset within this error (RMSE of encoded colours).")
     ] = 0.004,
+    at: Annotated[
+        list[float] | None,
+        typer.Option(help="Tolerance of the order of blending, at which `balanced` is measured too; repeatable."),
+    ] = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Chart to write (.png); a .csv of the same name goes beside it.")
     ] = Path("chart.png"),
@@ -270,6 +274,7 @@ def chart(
     with progress_bar() as progress:
         rows = measure_steps(
             scene,
+            tolerances=at or (),
             frames=frames,
             overrides=_overrides(size=size),
             allow_outside=allow_outside,

@@ -68,6 +68,20 @@ LIGHT_STEPS = (
 )
 
 
+def tolerance_steps(tolerances: Sequence[float]) -> tuple[Step, ...]:
+    """The preset ``balanced`` at other tolerances of the order of blending.
+
+    Raises:
+        InputError: If one is negative or not a number.
+    """
+    balanced = PRESETS["balanced"]
+    return tuple(Step(f"{_CURVE}{t:g}", replace(balanced, tolerance=t)) for t in tolerances)
+
+
+_CURVE = "balanced at "
+"""What names of steps of :func:`tolerance_steps` begin with, before the tolerance."""
+
+
 @dataclass(frozen=True)
 class Row:
     """What one step costs and misses, over all pictures.
@@ -110,6 +124,7 @@ def measure_steps(
     path: str | Path,
     steps: Sequence[Step] | None = None,
     *,
+    tolerances: Sequence[float] = (),
     frames: int = 3,
     overrides: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
@@ -121,6 +136,7 @@ def measure_steps(
     Args:
         path: Scene file, or a file of splats, which is looked at from around.
         steps: What to measure; all that apply to the file by default.
+        tolerances: Of the order of blending, at which ``balanced`` is measured too.
         frames: Pictures to compare, spread evenly over the scene's.
         overrides: Changes to the scene file by key, such as ``output.width``.
         allow_outside: Whether the scene may name files outside of its folder.
@@ -136,6 +152,7 @@ def measure_steps(
         raise InputError(f"frames must be at least 1 (got {frames})")
     if steps is None:
         steps = STEPS + (SPLATS_STEPS if _is_splats(path) else LIGHT_STEPS)
+    steps = (*steps, *tolerance_steps(tolerances))
     exact = Step("exact", PRESETS["exact"])
     plan = [exact, *(step for step in steps if step != exact)]
     rows: dict[str, Row] = {}
@@ -345,7 +362,10 @@ def write_csv(rows: Sequence[Row], file: Path) -> None:
 
 
 def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float) -> None:
-    """Time of an image against its error, both logarithmic; the steps that nothing beats in both are joined."""
+    """Time of an image against its error, both logarithmic.
+
+    The steps that nothing beats in both are joined by stairs, and those of ``balanced`` by a curve over its tolerance.
+    """
     from matplotlib.figure import Figure  # takes half a second, which only a chart needs
 
     figure = Figure(figsize=(8, 5), layout="constrained")
@@ -361,6 +381,7 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
         )
     )
     axes.step(*zip(*front, strict=True), where="post", color="0.7", zorder=1)
+    axes.plot(*zip(*curve_of(rows, least), strict=True), color="C0", linewidth=1, zorder=1)
     chosen = cheapest(rows, tolerance)
     for row, error in zip(rows, errors, strict=True):
         axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
@@ -370,3 +391,10 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
     axes.set(xscale="log", yscale="log", xlabel="seconds per image", ylabel="RMSE against exact", title=title)
     axes.margins(x=0.2, y=0.1)
     figure.savefig(file, dpi=110)
+
+
+def curve_of(rows: Sequence[Row], least: float = 0.0) -> list[tuple[float, float]]:
+    """Seconds and errors, at least the ``least``, of ``balanced`` at all of its tolerances, from the largest on."""
+    at = {f"{_CURVE}{PRESETS['balanced'].tolerance:g}" if row.name == "balanced" else row.name: row for row in rows}
+    known = {float(name.removeprefix(_CURVE)): row for name, row in at.items() if name.startswith(_CURVE)}
+    return [(row.seconds, max(row.rmse, least)) for _, row in sorted(known.items(), reverse=True)]

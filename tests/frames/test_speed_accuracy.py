@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from mitsplat.cli import app
 from mitsplat.errors import InputError
-from mitsplat.frames.speed_accuracy import Row, Step, cheapest, draw_chart, measure_steps
+from mitsplat.frames.speed_accuracy import Row, Step, cheapest, curve_of, draw_chart, measure_steps, tolerance_steps
 from mitsplat.quality import PRESETS
 from tests.render.test_render import make_splats
 
@@ -57,13 +57,16 @@ def test_coarser_steps_are_measured_to_be_less_exact(splat_file: Path) -> None:
 def test_chart_command_writes_table_csv_and_picture(splat_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "chart.png"
     result = CliRunner().invoke(
-        app, ["chart", str(splat_file), "--size", "48x32", "-n", "1", "--tolerance", "0", "-o", str(out)]
+        app,
+        ["chart", str(splat_file), "--size", "48x32", "-n", "1", "--tolerance", "0", "--at", "0", "-o", str(out)],
     )
     assert result.exit_code == 0, result.output
     assert "exact *" in result.output
     with out.with_suffix(".csv").open() as stream:
         lines = list(csv.DictReader(stream))
     assert {"fast", "balanced", "exact"} < {line["name"] for line in lines}
+    in_ray_order = next(line for line in lines if line["name"] == "balanced at 0")
+    assert float(in_ray_order["estimate"]) == 0 < float(in_ray_order["rmse"])
     theirs = next(line for line in lines if "volprim" in line["name"])
     assert 0 < float(theirs["rmse"]) < 0.5 and theirs["mask_iou"] == "nan"
     exact, balanced, fast = (next(li for li in lines if li["name"] == name) for name in ("exact", "balanced", "fast"))
@@ -77,3 +80,15 @@ def test_chart_shows_every_step(tmp_path: Path) -> None:
     a, b = (np.asarray(Image.open(tmp_path / name)) for name in ("a.png", "b.png"))
     assert a.shape[0] > 300 and (a != 255).mean() > 0.01
     assert a.shape != b.shape or (a != b).any()
+
+
+def test_the_curve_goes_from_the_largest_tolerance_to_the_smallest() -> None:
+    rows = [
+        *ROWS,
+        row("balanced at 0", 4.0, 0.0),
+        row("balanced at 0.03", 1.5, 0.004),
+        row("balanced at 1e-05", 3.0, 0.0),
+    ]
+    assert curve_of(rows, 1e-4) == [(1.5, 0.004), (2.0, 0.001), (3.0, 1e-4), (4.0, 1e-4)]
+    with pytest.raises(InputError, match="tolerance must be at least 0"):
+        tolerance_steps([0.01, -1.0])

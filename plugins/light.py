@@ -37,9 +37,12 @@ from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import stable_order
 
-R2 = (3242174889, 2447445414)
-"""Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
-effectiveness of quasirandom sequences")."""
+RECURRENCE = (1996816038, 1246200886)
+"""Additive recurrence in units of 2^-32, of which a pixel takes every 64th point, and its 8 x 8 neighbours the others.
+
+Those of a pixel are Roberts' (2018, "The unreasonable effectiveness of quasirandom sequences"), of the two-dimensional
+golden ratio. There are 4096 recurrences of that kind; of this one consecutive points are farthest apart.
+"""
 
 FAINT = 0.5
 """Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced by more than one ray."""
@@ -225,7 +228,7 @@ class _Tracer:
         captured = ~(surface.relit | (surface.specular > 0))
         static_light = free = active & captured & (dr.sum(beam.irradiance) > 0)
         for stopper in proxies.stoppers:
-            free = free & ~stopper.stop(ray, surface.instance, self.pixel * R2[0] + number, free)
+            free = free & ~stopper.stop(ray, surface.instance, self.pixel * RECURRENCE[0] + number, free)
             if proxies.apart:
                 dr.eval(free)
             if stopper is proxies.static:
@@ -266,7 +269,7 @@ class _Tracer:
 
         def stop(stopper: Stopper, beam: Beam, number: Any, active: Any) -> Any:
             ray = _shadow_ray(origin, beam, surface.offset)
-            return stopper.stop(ray, surface.instance, pixel * R2[0] + number, active)
+            return stopper.stop(ray, surface.instance, pixel * RECURRENCE[0] + number, active)
 
         def note(i: Any, word: Any) -> tuple[Any, Any]:
             beam, free, number, stopped = send(i)
@@ -335,7 +338,7 @@ def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
 
 def _sequence(i: Any) -> Any:
     """Point ``i`` of the low-discrepancy sequence, to 24 bits however large ``i`` is."""
-    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in R2])
+    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in RECURRENCE])
 
 
 def _bayer(x: Any, y: Any) -> Any:

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from mitsplat.cli import assets, datasets, detectors, fault
+from mitsplat.cli import assets, datasets, detectors, fault, photographs
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.version import __version__
 
@@ -39,11 +39,11 @@ for _command in (
     detectors.train,
     detectors.evaluate,
     assets.bake,
-    assets.fit,
-    assets.capture,
-    assets.board,
-    assets.mesh,
-    assets.asset,
+    photographs.fit,
+    photographs.capture,
+    photographs.board,
+    photographs.mesh,
+    photographs.asset,
     assets.import_,
     datasets.schema,
     datasets.check,

@@ -1,4 +1,4 @@
-"""What commands share: the seed, the bar or log that shows how far they are, and how they log for machines."""
+"""What commands share: options of assets, the seed, the bar or log of how far they are, and logs for machines."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,6 +25,13 @@ DeviceName = Annotated[
         "--device", metavar="NAME", help="Render on the cpu, or on a GPU: cuda, cuda:1, or auto if there is one."
     ),
 ]
+
+Name = Annotated[str | None, typer.Option(help="Name of the asset; the folder's if absent.")]
+ClassName = Annotated[str | None, typer.Option("--class", help="Class to learn; the name if absent.")]
+Kind = Annotated[Literal["object", "environment"], typer.Option(help="Whether physics moves it.")]
+AssetFolder = Annotated[Path, typer.Option("--out", "-o", help="Asset folder to write.")]
+ShDegree = Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")]
+Faces = Annotated[int, typer.Option(help="Most faces of the mesh.")]
 
 Seed = Annotated[int, typer.Option(help="Decides everything that is random.")]
 

@@ -14,6 +14,11 @@ from mitsplat.capture.capture import Capture
 Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
 """Of each photo its camera, colours (H, W, 3) and mask (H, W), all of the same longest edge."""
 
+_FEW_POINTS = 100
+"""On an object, from which its surface and not only its outline is known."""
+_SPILT = 0.3
+"""Share of the points inside of masks that lie in the support from which masks include it."""
+_LOW = 0.05
 _BLURRED = 0.5
 _NAMED = 5
 _BANDS = ((0.0, 20.0), (20.0, 45.0), (45.0, 90.0))
@@ -30,13 +35,52 @@ def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
         capture: The photos.
         pictures: Of ``capture.photos``, in their order.
     """
-    found = {}
+    found: dict[str, list[str]] = {}
+
+    def blame(cause: str, *thresholds: str) -> None:
+        for name in thresholds:
+            found.setdefault(name, []).append(cause)
+
     if blurred := blurred_photos([photo.name for photo in capture.photos], pictures):
         named = ", ".join(blurred[:_NAMED]) + (f" and {len(blurred) - _NAMED} more" if len(blurred) > _NAMED else "")
-        found["psnr"] = f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({named})"
+        blame(f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({named})", "psnr")
     if capture.up == "z" and (gaps := missing_views(views_from([photo.camera for photo in capture.photos]))):
-        found["mesh_iou"] = found["watertight"] = f"no photo is from {'; from '.join(gaps)}"
-    return found
+        blame(f"no photo is from {'; from '.join(gaps)}", "mesh_iou", "watertight")
+    own = masked_points(capture, pictures)
+    if len(capture.points) and len(own) < _FEW_POINTS:
+        blame(
+            f"photos share only {len(own)} points on it, because it has little texture: dust it or put patterns on it, "
+            "or import a mesh",
+            *("psnr", "mesh_iou", "offset", "surface", "watertight"),
+        )
+    elif capture.table and (share := share_on_support(own)) > _SPILT:
+        blame(
+            f"{share:.0%} of the points that its masks show lie in the surface under it, so that masks include that: "
+            "photograph it on another surface, or pick it",
+            *("splat_iou", "mesh_iou", "offset", "surface", "lost", "watertight"),
+        )
+    return {name: "; ".join(causes) for name, causes in found.items()}
+
+
+def masked_points(capture: Capture, pictures: Pictures) -> Float64Array:
+    """The capture's points (K, 3) that most of the photos which see them show inside of their masks."""
+    inside, seen = np.zeros(len(capture.points)), np.zeros(len(capture.points))
+    for photo, (camera, _, mask) in zip(capture.photos, pictures, strict=True):
+        if mask is None:
+            continue
+        pixels, _ = camera.project(capture.points[photo.seen])
+        shown = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        x, y = pixels[shown].astype(np.int64).T
+        own = photo.seen[shown]
+        seen[own] += 1
+        inside[own] += mask[y, x] >= 0.5
+    return np.asarray(capture.points[2 * inside > seen])
+
+
+def share_on_support(points: Float64Array) -> float:
+    """Share of an object's points (N, 3) that lie in what it stands on, z = 0: as low as its height's twentieth."""
+    height = float(np.quantile(points[:, 2], 0.95))
+    return float((np.abs(points[:, 2]) < _LOW * height).mean()) if height > 0 else 1.0
 
 
 def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:

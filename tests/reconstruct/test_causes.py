@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mitsplat.camera import Camera
-from mitsplat.reconstruct.causes import blurred_photos, missing_views, views_from
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.reconstruct.causes import blurred_photos, find_causes, missing_views, views_from
 from mitsplat.reconstruct.evaluation import Thresholds
 from tests.reconstruct.test_reconstruct import GOOD
 
@@ -70,3 +71,42 @@ def test_a_miss_names_what_was_measured_before_what_helps():
     found = replace(GOOD, psnr=20.0, causes={"psnr": "2 of 9 photos are blurred (a.jpg, b.jpg)", "mesh_iou": "unused"})
     (sentence,) = found.misses(Thresholds())
     assert "is wanted): 2 of 9 photos are blurred (a.jpg, b.jpg); use even light" in sentence
+
+
+def dotted(points, masked):
+    """A capture of points on a table, all seen by all photos, and pictures whose masks show some of them."""
+    photos, pictures = [], []
+    for number, offset in enumerate(np.concatenate([ring(h, ALL_AROUND) for h in (10, 30, 60)])):
+        camera = Camera.look_at(offset, (0, 0, 0.05), width=160, height=120, fov_x=50)
+        photos.append(Photo(f"{number:02}.png", None, camera, seen=np.arange(len(points), dtype=np.int32)))
+        mask = np.zeros((120, 160), np.float32)
+        x, y = camera.project(points[masked])[0].astype(int).T
+        mask[y, x] = 1
+        pictures.append((camera, np.random.default_rng(number).uniform(size=(120, 160, 3)).astype(np.float32), mask))
+    return Capture(tuple(photos), points, np.zeros(points.shape, np.uint8), up="z", table=True), pictures
+
+
+def test_what_masks_show_of_the_support_is_told_and_what_would_change_it():
+    rng = np.random.default_rng(2)
+    body, cloth = (
+        rng.uniform((-0.1, -0.1, 0.01), (0.1, 0.1, 0.1), (300, 3)),
+        rng.uniform(-0.15, 0.15, (200, 3)) * (1, 1, 0),
+    )
+    points = np.concatenate([body, cloth])
+    assert find_causes(*dotted(points, np.arange(500) < 300)) == {}
+    found = find_causes(*dotted(points, np.arange(500) < 500))
+    told = "40% of the points that its masks show lie in the surface under it"
+    assert all(found[name].startswith(told) for name in ("splat_iou", "mesh_iou", "surface", "lost"))
+    (miss,) = replace(GOOD, lost=0.2, causes=found).misses()
+    assert "photograph it on another surface, or pick it; check whether masks leave parts" in miss
+
+
+def test_an_object_without_texture_is_told():
+    rng = np.random.default_rng(2)
+    body, cloth = (
+        rng.uniform((-0.1, -0.1, 0.01), (0.1, 0.1, 0.1), (30, 3)),
+        rng.uniform(-0.15, 0.15, (200, 3)) * (1, 1, 0),
+    )
+    found = find_causes(*dotted(np.concatenate([body, cloth]), np.arange(230) < 30))
+    assert set(found) == {"psnr", "mesh_iou", "offset", "surface", "watertight"}
+    assert found["psnr"].startswith("photos share only 30 points on it")

@@ -61,7 +61,7 @@ Iterations = Annotated[int, typer.Option(help="Steps of the fit, one photo each.
 Budget = Annotated[
     str | None, typer.Option(metavar="TIME", help="Shorten the fit to this time, such as 90s, 10min or 1h.")
 ]
-Edge = Annotated[int, typer.Option(help="Longest edge of the photos in the fit [px].")]
+Edge = Annotated[int, typer.Option(help="Longest edge of the photos in the fit, around an object [px].")]
 Refine = Annotated[
     bool, typer.Option("--refine", help="Refine the mesh by the masks, where photos set aside say that it helps.")
 ]

@@ -386,7 +386,10 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
     for row, error in zip(rows, errors, strict=True):
         axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
         label = f"{row.name} (no error)" if row.rmse == 0 else row.name
-        axes.annotate(label, (row.seconds, error), xytext=(6, 4), textcoords="offset points", fontsize=8)
+        placed: dict[str, Any] = {"xytext": (6, 4)}
+        if row.name.startswith(_CURVE):  # below the points, which lie close together where the curve ends
+            label, placed = row.name.removeprefix(_CURVE), {"xytext": (0, -6), "rotation": -45, "va": "top"}
+        axes.annotate(label, (row.seconds, error), textcoords="offset points", fontsize=8, **placed)
     axes.axhline(tolerance, color="C3", linewidth=0.8, linestyle="--")
     axes.set(xscale="log", yscale="log", xlabel="seconds per image", ylabel="RMSE against exact", title=title)
     axes.margins(x=0.2, y=0.1)

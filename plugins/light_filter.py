@@ -24,8 +24,7 @@ SMALL = 64 / 9
 
 GAIN = 5.0
 """By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3
-pixels. With this, ``python -m benchmarks.light.traced`` finds the wanted error over all shadows, and a third more in
-penumbrae."""
+pixels. With this, ``python -m benchmarks.light.traced`` finds six tenths of a wanted error of 0.03 over all shadows."""
 
 
 NOWHERE = 0xFFFFFFFF

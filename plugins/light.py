@@ -37,11 +37,15 @@ from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
 from mitsplat.plugins.tiles import stable_order
 
-RECURRENCE = (1996816038, 1246200886)
-"""Additive recurrence in units of 2^-32, of which a pixel takes every 64th point, and its 8 x 8 neighbours the others.
+ROBERTS = (3242174889, 2447445414)
+"""Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
+effectiveness of quasirandom sequences"), of which the search for shadows takes a point for each pixel."""
 
-Those of a pixel are Roberts' (2018, "The unreasonable effectiveness of quasirandom sequences"), of the two-dimensional
-golden ratio. There are 4096 recurrences of that kind; of this one consecutive points are farthest apart.
+RECURRENCE = (1996816038, 1246200886)
+"""The same, of which a pixel takes every 64th point, and its 8 x 8 neighbours the others.
+
+Those of a pixel are Roberts', of whose own recurrence every 16th point is nearly the same. There are 4096 of the kind;
+of this one consecutive points are farthest apart.
 """
 
 FAINT = 0.5
@@ -223,7 +227,7 @@ class _Tracer:
         kind = parity(self.pixel % width // BLOCK, self.pixel // width // BLOCK)
         number = self._start(self.pixel) + kind * (BLOCK * BLOCK)
         active = inside & surface.valid
-        beam = self.emitters.sample(receiver(surface.position, surface.normal), _sequence(number), active)
+        beam = self.emitters.sample(receiver(surface.position, surface.normal), _sequence(number, ROBERTS), active)
         ray = _shadow_ray(_origin(surface), beam, surface.offset)
         captured = ~(surface.relit | (surface.specular > 0))
         static_light = free = active & captured & (dr.sum(beam.irradiance) > 0)
@@ -336,9 +340,9 @@ def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
     return ray
 
 
-def _sequence(i: Any) -> Any:
-    """Point ``i`` of the low-discrepancy sequence, to 24 bits however large ``i`` is."""
-    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in RECURRENCE])
+def _sequence(i: Any, recurrence: tuple[int, int] = RECURRENCE) -> Any:
+    """Point ``i`` of a low-discrepancy sequence, to 24 bits however large ``i`` is."""
+    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
 
 
 def _bayer(x: Any, y: Any) -> Any:

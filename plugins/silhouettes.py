@@ -26,7 +26,7 @@ from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH, View
 from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, prefix_ranges
-from mitsplat.plugins.walk import exp2, largest, respond_along
+from mitsplat.plugins.walk import exp2, faintest, largest, respond_along
 from mitsplat.quality import Quality
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
@@ -192,8 +192,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, place: Any, instanc
     slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
     start, stop = dr.gather(mi.UInt32, lists.start, place), dr.gather(mi.UInt32, lists.stop, place)
-    cut = dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
-    near, shared_column = view.near_plane, not view.distortion
+    cut, near, shared_column = faintest(quality), view.near_plane, not view.distortion
 
     def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
         record = dr.gather(

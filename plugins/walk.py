@@ -141,7 +141,7 @@ class Rays:
             start,
             stop,
             near=view.near_plane,
-            cut=dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126),
+            cut=faintest(quality),
             cap=dr.log2(dr.opaque(mi.Float, highest)) if highest < 1 else None,
             end=dr.opaque(mi.Float, quality.transmittance_min),
             column=not view.distortion,
@@ -176,6 +176,11 @@ def walk(
 def largest(values: Sequence[Any]) -> Any:
     """Of the values of a lane's rays, none of them NaN, by which the lane knows when it is done."""
     return reduce(lambda a, b: dr.select(a > b, a, b), values)
+
+
+def faintest(quality: Quality) -> Any:
+    """Logarithm to base 2 of the opacity below which a response does not count, one that :func:`exp2` takes."""
+    return dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
 
 
 def exp2(x: Any) -> Any:

@@ -321,10 +321,7 @@ class Renderer:
                 next_camera=next_camera,
                 lights=lights,
             )
-            # Its few parts are made sooner than threads are woken.
-            mitsuba_scene = mi.load_dict(
-                self.describe(layout, plan.lights, lights is not None, plan.belt), parallel=False
-            )
+            mitsuba_scene = self._load(layout, plan, lights is not None, plan.belt)
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         motion, swept, looks = plan.viewpoint.get("motion"), None, list[_Look]()
@@ -333,7 +330,7 @@ class Renderer:
                 swept = _swept(layers, plan.camera, motion, layout, plan.belt)
             with _timed(seconds, "render"):
                 bands = bands_of(plan.camera, motion, swept)
-                looks = [self._look(band, plan, motion, layout, lights is not None) for band in bands]
+                looks = [self._look(band, plan, motion, layout, lights is not None, mitsuba_scene) for band in bands]
                 if looks:
                     layers = Layers.stacked([(look.layers, look.band.rows) for look in looks])
                     swept = (
@@ -370,13 +367,25 @@ class Renderer:
     def _silhouettes(self, mitsuba_scene: Any, camera: Camera) -> dict[int, Silhouette]:
         return render_silhouettes(self.integrator, mitsuba_scene, camera, source=self.scene.spec.labels.source)
 
-    def _look(self, band: Band, plan: FramePlan, motion: Mapping[str, Any], layout: Layout, replaced: bool) -> _Look:
-        """What the rows of a band show at their moment."""
+    def _load(self, layout: Layout, plan: FramePlan, replaced: bool, belt: Belt | None) -> Any:
+        """Mitsuba's scene of a layout; its few parts are made sooner than threads are woken."""
+        return mi.load_dict(self.describe(layout, plan.lights, replaced, belt), parallel=False)
+
+    def _look(
+        self,
+        band: Band,
+        plan: FramePlan,
+        motion: Mapping[str, Any],
+        layout: Layout,
+        replaced: bool,
+        mitsuba_scene: Any,
+    ) -> _Look:
+        """What the rows of a band show at their moment, of a scene that only a belt changes until then."""
         belt = plan.belt
         if belt is not None:
             belt = replace(belt, time=belt.time + band.time)
             layout = carried_by(belt, layout)
-        mitsuba_scene = mi.load_dict(self.describe(layout, plan.lights, replaced, belt), parallel=False)
+            mitsuba_scene = self._load(layout, plan, replaced, belt)
         layers = render_layers(self.integrator, mitsuba_scene, band.camera, seed=plan.seed)
         ways = _swept(layers, band.camera, motion, layout, belt)
         silhouettes = self._silhouettes(mitsuba_scene, band.camera)

@@ -17,7 +17,7 @@ from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.lost_rays import refuse_lost_rays
 from mitsplat.masks import Silhouette
-from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.device import concatenated, wrapped
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.render.deferred import Deferred
 from mitsplat.splats import Splats
@@ -76,21 +76,15 @@ class Layers(Deferred):
         width = parts[0][0].shape[1]
         counts = [width * (rows.stop - rows.start) for _, rows in parts]
 
-        def joined(values: list[Any]) -> Any:
-            kind = type(values[0])
-            if dr.depth_v(values[0]) == 2:
-                return kind(*[joined(list(column)) for column in zip(*values, strict=True)])
-            out, begin = dr.zeros(kind, sum(counts)), 0
-            for value, count, (_, rows) in zip(values, counts, parts, strict=True):
-                i = dr.arange(mi.UInt32, count)
-                single = dr.width(value) == 1  # what is the same everywhere is one value on the device
-                source = value if single else dr.gather(kind, value, i + dr.opaque(mi.UInt32, width * rows.start))
-                dr.scatter(out, source, i + dr.opaque(mi.UInt32, begin))
-                begin += count
-            return out
+        def taken(value: Any, rows: slice) -> Any:
+            if dr.depth_v(value) == 2:
+                return type(value)(*[taken(channel, rows) for channel in value])
+            place = dr.arange(mi.UInt32, width * (rows.stop - rows.start)) + dr.opaque(mi.UInt32, width * rows.start)
+            # What is the same everywhere is one value on the device.
+            return dr.gather(type(value), value, place if dr.width(value) > 1 else 0 * place)
 
-        known = [part.__dict__["_channels"] for part, _ in parts]
-        channels = {name: joined([channels[name] for channels in known]) for name in known[0]}
+        known = [(part.__dict__["_channels"], rows) for part, rows in parts]
+        channels = {name: concatenated([taken(own[name], rows) for own, rows in known]) for name in known[0][0]}
         errors = [part.order_error for part, _ in parts]
         if errors[0] is not None:
             found = [(error["largest"], error["mean"]) for error in errors if error is not None]

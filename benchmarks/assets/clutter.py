@@ -233,7 +233,7 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out
     gain = (wanted * seen).sum(axis=0) / (seen**2).sum(axis=0)
     errors = [((one ** (1 / 2.2) - np.clip(other * gain, 0, 1) ** (1 / 2.2)) ** 2).mean() for one, other in pairs]
     shares = [
-        iou(photo.picture()[1] >= 0.5, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in capture.photos
+        iou(photo.alpha() >= 0.5, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in capture.photos
     ]
     distances = np.linalg.norm([truth[photo.name].centre for photo in moved.photos], axis=1)
     return {

@@ -65,7 +65,7 @@ class PhotoSpec(_Strict):
     file: str = Field(min_length=1)
     mask: str | None = None
     camera: PhotoCamera
-    gain: tuple[_Gain, _Gain, _Gain] | None = None
+    gain: tuple[_Gain, _Gain, _Gain] | None = Field(None, exclude_if=lambda gain: gain is None)
 
 
 class CaptureSpec(_Strict):
@@ -125,7 +125,11 @@ class Photo:
         rgb = self._read(self.file, "RGB", scale, window)
         if self.gain is not None:
             rgb = np.clip(encode_srgb(decode_srgb(rgb) * self.gain), 0, 1).astype(np.float32)
-        return rgb, None if self.mask is None else self._read(self.mask, "L", scale, window)
+        return rgb, self.alpha(scale, window)
+
+    def alpha(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
+        """The mask of :meth:`picture` alone, for which the photo need not be read."""
+        return None if self.mask is None else self._read(self.mask, "L", scale, window)
 
     def _read(self, path: Path, mode: Literal["RGB", "L"], scale: float, window: Window | None) -> Float32Array:
         try:
@@ -270,12 +274,8 @@ class Capture:
                 rejected=dict(sorted(self.rejected.items())),
                 photos=[_photo_spec(photo, folder) for photo in photos],
             )
-            stored = spec.model_dump()
-            for entry in stored["photos"]:
-                if entry["gain"] is None:
-                    del entry["gain"]
             # Last, so that an interrupted save is not mistaken for a capture.
-            write_text(folder / CAPTURE_FILE, json.dumps(stored, indent=1) + "\n")
+            write_text(folder / CAPTURE_FILE, json.dumps(spec.model_dump(), indent=1) + "\n")
         except OSError as error:
             raise InputError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
         return replace(self, photos=tuple(photos))

@@ -30,6 +30,13 @@ SENSOR = Sensor()
 CURVE_STEPS = 1 << 14
 """Entries of the tone curve's table, evenly spaced in the square root of the input."""
 
+GREY = 118.0
+"""Mean of a metered picture's bytes, of 255: the middle grey of the standard output sensitivity (ISO 12232)."""
+
+_METERED_PIXELS = 1 << 14
+_STOPS = 6.0
+"""How far metering makes a picture brighter or darker at most."""
+
 _LONGEST = 256.0
 """Motion [px] from which on its steps are wider than a pixel."""
 
@@ -85,6 +92,7 @@ def develop(
     sensor: Sensor = SENSOR,
     seed: int = 0,
     swept: tuple[Float32Array, Float32Array] | None = None,
+    metered: bool = False,
 ) -> ByteImage:
     """Linear picture (H, W, 3) to display-encoded bytes, as a camera would develop it.
 
@@ -99,9 +107,10 @@ def develop(
         seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
         swept: How far every pixel moves to the right and down while the shutter is open [px], each (H, W); none if
             absent.
+        metered: Whether the camera exposes by itself, see :func:`metered_exposure`; ``exposure`` is added to that.
     """
     height, width = linear.shape[:2]
-    how: dict[str, Any] = {"tone": tone, "sensor": sensor, "seed": seed, "swept": swept}
+    how: dict[str, Any] = {"tone": tone, "sensor": sensor, "seed": seed, "swept": swept, "metered": metered}
     return develop_layers(device_array(linear), (height, width), draws, **how).image()
 
 
@@ -114,10 +123,13 @@ def develop_layers(
     sensor: Sensor,
     seed: int,
     swept: tuple[Float32Array, Float32Array] | None = None,
+    metered: bool = False,
 ) -> Development:
     """Begin to :func:`develop` a picture of the device (Color3f, flat and row-major over ``shape``)."""
     height, width = shape
     pixel = dr.arange(mi.UInt32, height * width)
+    if metered:
+        draws = {**draws, "exposure": draws.get("exposure", 0.0) + metered_exposure(linear, height * width, tone)}
     linear = _through_lens(linear, pixel, shape, draws)
     if swept is not None:
         linear = _smeared(linear, pixel, shape, swept)
@@ -166,6 +178,33 @@ class Development:
 def _opaque(value: float) -> Any:
     """A value that differs from frame to frame; as a literal it would be part of the kernel, and compiled anew."""
     return dr.opaque(mi.Float, float(value))
+
+
+def metered_exposure(linear: Any, count: int, tone: Tone) -> float:
+    """Exposure [stops] at which a picture's luminance has the mean :data:`GREY` once it is encoded, within 6 stops.
+
+    So a camera that exposes by itself averages what it shows: lamps that are clipped count no more than white paper.
+
+    Args:
+        linear: A picture of the device (Color3f, flat), of which evenly spaced pixels are looked at.
+        count: Its pixels.
+        tone: What it is encoded by.
+    """
+    every = dr.arange(mi.UInt32, 0, count, max(1, count // _METERED_PIXELS))
+    dr.eval(linear)
+    picked = dr.gather(mi.Color3f, linear, every).numpy()
+    luminance = np.maximum(LUMINANCE @ picked, 0.0)
+    curve = 255.0 * np.clip(tone_curve(tone), 0.0, 1.0)
+
+    def mean(stops: float) -> float:
+        step = np.sqrt(np.minimum(luminance * 2.0**stops, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
+        return float(curve[np.rint(step).astype(int)].mean())
+
+    low, high = -_STOPS, _STOPS
+    for _ in range(16):
+        middle = (low + high) / 2
+        low, high = (middle, high) if mean(middle) < GREY else (low, middle)
+    return (low + high) / 2
 
 
 def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mapping[str, float]) -> Any:

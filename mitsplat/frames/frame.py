@@ -349,6 +349,7 @@ class Renderer:
                 sensor=composite.sensor,
                 seed=plan.seed,
                 swept=swept,
+                metered=composite.exposure == "auto",
             )
         with _timed(seconds, "silhouettes"):
             if looks:

@@ -115,6 +115,11 @@ class Composite(StrictModel):
         "proxies", description="What casts traced shadows of objects: their meshes, or the splats of thin, porous ones."
     )
     bounce: bool = Field(True, description="Whether objects get the light that the environment reflects to them.")
+    exposure: Literal["fixed", "auto"] = Field(
+        "fixed",
+        description="As lights are given, or as a camera that exposes by itself: every picture as bright on average. "
+        "randomise.exposure is added.",
+    )
     tone: Literal["neutral", "filmic"] = Field("neutral", description="Tone curve; neutral keeps captured colours.")
     sensor: Sensor = Field(Sensor(), description="Noise of the sensor.")
 

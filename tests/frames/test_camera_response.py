@@ -16,6 +16,7 @@ from scipy import stats
 
 from mitsplat.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
 from mitsplat.frames.camera_response import (
+    GREY,
     SENSOR,
     blurred,
     colour_matrix,
@@ -290,3 +291,23 @@ def test_parameters_of_the_published_shadow_reach_the_picture() -> None:
         picture = light_image(layers, Composite(shadow="image", image_shadow=shadow))
         np.testing.assert_allclose(picture[32, 2], 0.5 * darkest, atol=0.005)
         np.testing.assert_allclose(picture[32, 120], 0.5 + 0.1, atol=0.005)
+
+
+@pytest.mark.parametrize("tone", ["neutral", "filmic"])
+@pytest.mark.parametrize("light", [0.05, 1.0, 20.0])
+def test_metered_pictures_are_grey_on_average_in_any_light(light: float, tone: Any) -> None:
+    grey = np.repeat(np.random.default_rng(0).uniform(0, light, (90, 160, 1)), 3, axis=2).astype(np.float32)
+    assert develop(grey, {}, tone=tone, metered=True).mean() == pytest.approx(GREY, abs=1)
+    assert develop(grey, {"exposure": -1.0}, tone=tone, metered=True).mean() < GREY - 20
+
+
+def test_metering_takes_a_lamp_for_no_more_than_white() -> None:
+    room = np.full((90, 160, 3), 0.1, np.float32)
+    room[:9, :16] = 1000.0
+    lamp, paper = room.copy(), room.copy()
+    paper[:9, :16] = 50.0
+    assert np.array_equal(develop(lamp, {}, metered=True), develop(paper, {}, metered=True))
+
+
+def test_metering_of_darkness_ends() -> None:
+    assert develop(np.zeros((9, 16, 3), np.float32), {}, metered=True).max() == 0

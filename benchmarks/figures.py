@@ -9,7 +9,8 @@ Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` sta
 * ``RESULT FIGURE FORMAT``: one figure, as Python formats it; ``*1000:.1f`` multiplies it before;
 * ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
 * ``caption RESULT ...``: command, machine, load and revision of results;
-* ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results.
+* ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
+* ``detectors``: a table of what the arms of ``benchmarks.detector`` came to.
 
 What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
 """
@@ -26,6 +27,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from benchmarks.detector.table import experiment_table
 from benchmarks.record import MEASURED, RESULTS, ROOT
 from benchmarks.scale.projection import project
 
@@ -160,6 +162,8 @@ def filled(text: str, results: Results) -> str:
             match words:
                 case ["runs"]:
                     return runs((result for result in results.values() if "command" in result), newest)
+                case ["detectors"]:
+                    return experiment_table(results)
                 case ["caption" | "runs" as what, *names] if names:
                     if missing := [name for name in names if "command" not in results.get(name, {})]:
                         raise FigureError(f"no result {missing[0]}")

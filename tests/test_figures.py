@@ -9,10 +9,13 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks import again, figures, record
+from benchmarks.detector.table import experiment_table
 from benchmarks.figures import FigureError, caption, differences, filled, formatted, read_results, unsaid
 from benchmarks.record import figure, name_of, recording, revision
 from mitsplat.checks import doctor
@@ -39,6 +42,22 @@ def test_a_sentence_with_another_figure_is_missed(tmp_path: Path, monkeypatch: p
     (tmp_path / "page.md").write_text("Some words. It takes\n1.3 s. More.\n")
     assert list(unsaid({"one": {"figures": {"seconds": [1.26, "s"]}}})) == []
     assert list(unsaid({"one": {"figures": {"seconds": [1.46, "s"]}}})) == ["page.md should say: It takes 1.5 s."]
+
+
+def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
+    def run(strict: float, samples: list[float]) -> dict[str, Any]:
+        return {"figures": {"map50_95": [strict, ""], "map50": [2 * strict, ""], "samples": [samples, ""]}}
+
+    draws = np.random.default_rng(1).uniform(0.2, 0.6, 200)  # hard and easy scenes: far apart, alike for every arm
+    results = {
+        "detector.experiment-real-0": run(0.25, list(draws - 0.15)),
+        "detector.experiment-synthetic-0": run(0.40, list(draws)),
+        "detector.experiment-synthetic-1": run(0.42, list(draws + 0.02)),
+    }
+    *_, real, synthetic = experiment_table(results).splitlines()
+    low, high = np.percentile(draws, [2.5, 97.5])
+    assert real == f"| `real` | 1 | 0.250 | {low - 0.15:.3f} to {high - 0.15:.3f} | 0.500 | 0.150 to 0.170 |"
+    assert synthetic.startswith("| `synthetic` | 2 | 0.410 | ") and synthetic.endswith("| 0.820 | – |")
 
 
 @pytest.mark.parametrize(

@@ -72,8 +72,8 @@ class BakeResult:
         psnr_object: Over the mesh's pixels alone [dB]; NaN without verification.
         views: The pictures of that comparison.
         surface: The mesh that was baked, all parts of it [m], z up; None where it was not kept.
-        brightness: Mean brightness of the splats relative to the textures of the file, read from it once more; None
-            without textures of its own or under a scene's lights.
+        brightness: Mean brightness of the splats relative to the textures of the file, read from it once more, with
+            the gloss that lies on them; None without textures of its own or under a scene's lights.
         warnings: What a user should know, a sentence each.
     """
 
@@ -243,7 +243,8 @@ def bake_asset(
     )
     brightness = None
     if isinstance(light, str) and (finish is None or finish.colour is None):
-        brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up))
+        gloss = {part.name: part.gloss for part in parts}
+        brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up), gloss)
     if brightness is not None and not _DARKEST < brightness < _BRIGHTEST:
         warnings.append(
             f"the splats are {brightness:.2g} times as bright as the textures of the file: "

@@ -71,12 +71,17 @@ class Part:
     warnings: tuple[str, ...] = ()
 
     @property
+    def gloss(self) -> float:
+        """Reflectance at normal incidence that comes on top of the base colour: of a coat without a colour."""
+        return self.reflectance * (1.0 - self.metallic) if self.shiny else 0.0
+
+    @property
     def specular(self) -> float:
         """Reflectance at normal incidence, grey."""
         if not self.shiny:
             return 0.0
         base = float(self._face_colours(np.full((1, 3), 1.0 / 3.0)).mean())
-        return self.reflectance * (1.0 - self.metallic) + base * self.metallic
+        return self.gloss + base * self.metallic
 
     def _face_colours(self, barycentric: Float64Array) -> Float64Array:
         """Linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, by the nearest texel."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,12 +69,22 @@ def compare_views(
 
 
 def compare_with_textures(
-    mesh: trimesh.Trimesh | trimesh.Scene | str | Path, splats: Splats, world_from_file: Float64Array
+    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    splats: Splats,
+    world_from_file: Float64Array,
+    gloss: Mapping[str, float],
 ) -> float | None:
     """Brightness of the splats relative to the textures of a mesh, at points of its surface; None without textures.
 
-    The texture is looked up by trimesh in the file's own image, past all that is known of materials here. Under light
-    of radiance 1 from everywhere a convex matt surface has its texture's brightness.
+    The texture is looked up by trimesh in the file's own image, past all that is known of its colour here. Under light
+    of radiance 1 from everywhere a convex surface has its texture's brightness and that of its gloss, which is the
+    larger share of what a dark one sends out.
+
+    Args:
+        mesh: Or its file.
+        splats: Baked of it, under such light.
+        world_from_file: Matrix (4, 4) to metres, z up.
+        gloss: Reflectance on top of the texture by the name of a part; 0 where unnamed.
     """
     if isinstance(mesh, str | Path):
         mesh = trimesh.load_scene(mesh)
@@ -95,7 +105,7 @@ def compare_with_textures(
         pose = world_from_file @ transform
         points.append(trimesh.transform_points(at, pose))
         normals.append(geometry.face_normals[face] @ pose[:3, :3].T)
-        colours.append(uv_to_color(uv, image)[:, :3] / 255.0)
+        colours.append(decode_srgb(uv_to_color(uv, image)[:, :3] / 255.0) + gloss.get(str(name), 0.0))
     if not points:
         return None
     place, normal, own = (np.concatenate(values) for values in (points, normals, colours))
@@ -104,5 +114,5 @@ def compare_with_textures(
     outward = Rotation.from_quat(splats.quats[nearest]).as_matrix()[:, :, 2]
     seen = (distance < _NEAR * splats.scales[nearest].max(axis=1)) & (np.einsum("nd,nd->n", outward, normal) > 0.7)
     baked = evaluate_sh(splats.sh[nearest], -outward)
-    expected = decode_srgb(own)[seen].mean() if seen.any() else 0.0
+    expected = own[seen].mean() if seen.any() else 0.0
     return float(decode_srgb(baked)[seen].mean() / expected) if expected > 0 else None

@@ -93,6 +93,18 @@ def test_splats_are_as_bright_as_the_texture_of_the_file(bakes: dict[str, BakeRe
     assert "as bright as the textures of the file" in dark.warnings[0]
 
 
+def test_gloss_on_a_dark_texture_is_no_wrong_brightness(tmp_path: Path) -> None:
+    """Of what a dark scan sends out under white light, much is its gloss; texels that no face shows do not count."""
+    atlas = Image.new("RGB", (8, 8), "white")
+    atlas.paste((58, 58, 58), (0, 0, 4, 8))
+    uv = np.tile([[0.05, 0.1], [0.4, 0.1], [0.2, 0.9]], (12, 1))
+    scan = PBRMaterial(baseColorTexture=atlas, metallicFactor=0.0, roughnessFactor=0.6)
+    box(TextureVisuals(uv=uv, material=scan)).export(tmp_path / "dark.glb")
+    baked = bake_asset(tmp_path / "dark.glb", name="dark", settings=QUICK)
+    assert baked.brightness == pytest.approx(1.0, abs=0.25)
+    assert not baked.warnings
+
+
 def test_report_shows_mesh_beside_splats(bakes: dict[str, BakeResult], tmp_path: Path) -> None:
     page = write_bake_report(tmp_path, bakes["obj"]).read_text()
     assert page.count("<img") == 3

@@ -22,9 +22,10 @@ import numpy as np
 
 from mitsplat.plugins.chosen import ChosenTiles
 from mitsplat.plugins.march import Image, march_apart
+from mitsplat.plugins.pairs import CrowdedError
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
-from mitsplat.plugins.tiles import CrowdedError, bin_gaussians
+from mitsplat.plugins.tiles import bin_gaussians
 from mitsplat.quality import Quality
 
 ZOOM = 2

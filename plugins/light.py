@@ -35,7 +35,7 @@ from mitsplat.plugins.light_tiles import BLOCK, Tiles, block_order, parity
 from mitsplat.plugins.lit_surface import Surface, VisibleSurfaces
 from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
-from mitsplat.plugins.tiles import stable_order
+from mitsplat.plugins.sorting import stable_order
 
 ROBERTS = (3242174889, 2447445414)
 """Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable

@@ -36,10 +36,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.plugins.pairs import CrowdedError
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, View
 from mitsplat.plugins.shares import add_to_tally, new_tally, settle_instances, winner_of_tally
-from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, in_ray_order, some_tiles
+from mitsplat.plugins.tiles import TileLists, bin_gaussians, in_ray_order, some_tiles
 from mitsplat.plugins.walk import Lanes, Pixel, Rays, largest, walk
 from mitsplat.quality import Order, Quality
 

@@ -23,9 +23,10 @@ from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.plugins.gaussian import RECORD
+from mitsplat.plugins.pairs import CrowdedError, prefix_ranges
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH, View
-from mitsplat.plugins.tiles import CrowdedError, TileLists, bin_gaussians, prefix_ranges
+from mitsplat.plugins.tiles import TileLists, bin_gaussians
 from mitsplat.plugins.walk import exp2, faintest, largest, respond_along
 from mitsplat.quality import Quality
 

@@ -23,6 +23,7 @@ from mitsplat.plugins.lit_surface import Seen, VisibleSurfaces
 from mitsplat.plugins.march import Image, largest_and_mean, trace
 from mitsplat.plugins.mirrored import SplatMirror
 from mitsplat.plugins.occlusion import Caster
+from mitsplat.plugins.pairs import CrowdedError
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
 from mitsplat.plugins.proxies import Occluder, Proxies
@@ -31,7 +32,6 @@ from mitsplat.plugins.sensors import view_of
 from mitsplat.plugins.shown import Shown
 from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.plugins.still import StillLayer
-from mitsplat.plugins.tiles import CrowdedError
 from mitsplat.plugins.traits import Traits
 from mitsplat.plugins.visible import Behind, PathTracer, SeenLights, VisibleMeshes, is_clear
 from mitsplat.quality import Quality, resolve_quality

@@ -2,52 +2,29 @@
 
 1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
 2. *Project* what is left to view records (one kernel), see :mod:`mitsplat.plugins.project`.
-3. *Pair* each with the tiles that its cut-off ellipse really meets: the ellipse cuts a span out of every row of tiles.
-4. *Sort* the pairs by tile and by depth there. For the order per tile that is the peak's depth along the ray
-   around which the tile sees most of the Gaussian; for the order per ray it is a lower bound over all rays of the tile,
-   which says when a ray has seen all that can come first.
+3. *Pair* each with the tiles that its cut-off ellipse really meets, see
+   :mod:`mitsplat.plugins.pairs`.
+4. *Sort* the pairs by tile and by depth there, see :mod:`mitsplat.plugins.tile_depths`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mitsplat.errors import MissingResourceError
 from mitsplat.plugins.chosen import ChosenTiles, TileBox
 from mitsplat.plugins.device import concatenated
-from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD, conic_touches_rectangle, ellipse_spans
+from mitsplat.plugins.gaussian import RECORD
+from mitsplat.plugins.pairs import NUMBER_BITS, Pairs, pair_records, prefix_ranges
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import View
+from mitsplat.plugins.sorting import sort_in_threads, stable_order
+from mitsplat.plugins.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
 from mitsplat.quality import Quality
-
-NUMBER_BITS = 26
-"""Bits of the number of a record or pair in what pairs are sorted by."""
-
-PAIRS_MAX = 1 << NUMBER_BITS
-"""Most pairs of a Gaussian and a tile that are held at once, about 40 bytes each."""
-
-DEPTH_BITS = 16
-"""Bits of a depth that pairs are sorted by: 11 of its mantissa tell depths apart that differ by 0.05 %, and 5 of its
-exponent those up to 2^32 times the near plane. Equals stay in the order of the clouds."""
-
-TILES_MAX = 1 << (64 - DEPTH_BITS - NUMBER_BITS)
-"""Most tiles of a view."""
-
-
-class CrowdedError(MissingResourceError):
-    """A view has more pairs than :data:`PAIRS_MAX`, or tiles than :data:`TILES_MAX`: render a part of it."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "the splats cover too much of the image for the memory: render a smaller image, or split the splats"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +128,7 @@ def bin_records(
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    pairs = _pair(dr.detach(records), least, box, view, quality, chosen, for_gradients)
+    pairs = pair_records(dr.detach(records), least, box, view, quality, chosen, for_gradients)
     if pairs is None:
         return _empty(view, chosen, records)
     tiles, own = _numbered(view, chosen)
@@ -161,7 +138,7 @@ def bin_records(
 def _listed(
     records: Any,
     near: Any,
-    pairs: _Pairs,
+    pairs: Pairs,
     least: Any,
     visible: int,
     tiles: int,
@@ -186,7 +163,7 @@ def _listed(
         slots=slots,
         first=pairs.first,
         levels=levels,
-        nearest=_depth_of_level(levels, view),
+        nearest=depth_of_level(levels, view),
         start=start,
         stop=stop,
         least=least,
@@ -221,7 +198,7 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> 
     """
     visible = dr.width(first.records) // RECORD
     both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
-    pairs = _Pairs(_Pairs.key_of(*(concatenated(parts) for parts in zip(*both, strict=True))))
+    pairs = Pairs(Pairs.key_of(*(concatenated(parts) for parts in zip(*both, strict=True))))
     dr.eval(pairs.key)
     records, near = second.records, second.near
     if near is not None and first.near is not None:
@@ -250,8 +227,8 @@ def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
     tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
     record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
     slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
-    level = _level(_least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
-    again, count = _Pairs(_Pairs.key_of(place, level, number)), dr.width(tiles)
+    level = level_of(least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
+    again, count = Pairs(Pairs.key_of(place, level, number)), dr.width(tiles)
     dr.eval(again.key)
     return _listed(lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles)
 
@@ -278,170 +255,6 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
     return place, level, number
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Pairs of a record and a tile, record after record.
-
-    Attributes:
-        key: What they are sorted by, see :meth:`key_of`.
-        record: Number of each one's record, of pairs that are numbered themselves.
-        first: First pair of each record, and the number of pairs; of the same.
-    """
-
-    key: Any
-    record: Any | None = None
-    first: Any | None = None
-
-    @staticmethod
-    def key_of(tile: Any, level: Any, number: Any) -> Any:
-        """Tile, level of depth, and the number of the record, or of the pair, in one."""
-        return mi.UInt64(tile) << (DEPTH_BITS + NUMBER_BITS) | mi.UInt64(level) << NUMBER_BITS | mi.UInt64(number)
-
-
-def _pair(
-    records: Any,
-    least: Any,
-    box: Any,
-    view: View,
-    quality: Quality,
-    chosen: ChosenTiles | TileBox | None,
-    numbered: bool,
-) -> _Pairs | None:
-    """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
-
-    Raises:
-        CrowdedError: If there are more than :data:`PAIRS_MAX`, or their keys have no room for tiles or records.
-    """
-    count = dr.width(least)
-    if count > 1 << NUMBER_BITS or view.tiles_x * view.tiles_y > TILES_MAX:
-        raise CrowdedError
-    order = dr.arange(mi.UInt32, count)
-    x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
-    row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0))
-    if rows == 0:
-        return None
-    # Rows first: one lane finds the spans of one record, and then one lane fills one span.
-    record = dr.gather(mi.ArrayXf, records, order, shape=(RECORD, count))
-    cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
-    owner, first_tile = dr.empty(mi.UInt32, rows), dr.empty(mi.UInt32, rows)
-    length = dr.empty(mi.UInt32, rows)
-    span_of = _spans(record, cut, x0, x1, view)
-
-    def one_row(y: Any) -> tuple[Any]:
-        lo, hi = span_of(y)
-        row = row_of + (y - y0)
-        begin, size = y * view.tiles_x + lo, dr.select(hi > lo, hi - lo, 0)
-        if chosen is not None:
-            begin, size = chosen.among(begin, size)
-        dr.scatter(owner, order, row, mode=dr.ReduceMode.Permute)
-        dr.scatter(first_tile, begin, row, mode=dr.ReduceMode.Permute)
-        dr.scatter(length, size, row, mode=dr.ReduceMode.Permute)
-        return (y + 1,)
-
-    dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
-    dr.eval(owner, first_tile, length)
-    pair_of, pairs = prefix_ranges(length)
-    if pairs == 0:
-        return None
-    record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
-    ellipsoid = dr.gather(mi.Float, least, owner)
-    key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
-
-    def in_view(tile: Any, active: Any = True) -> Any:
-        return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile, active)
-
-    depth_of = _depths(record, ellipsoid, in_view(first_tile, length > 0), view, quality)
-
-    def one_tile(k: Any) -> tuple[Any]:
-        tile, pair = first_tile + k, pair_of + k
-        depth = depth_of(in_view(tile))
-        own = _Pairs.key_of(tile, _level(depth, view), pair if numbered else owner)
-        dr.scatter(key, own, pair, mode=dr.ReduceMode.Permute)
-        if numbered:
-            dr.scatter(number, owner, pair, mode=dr.ReduceMode.Permute)
-        return (k + 1,)
-
-    dr.while_loop((dr.zeros(mi.UInt32, rows),), lambda k: k < length, one_tile, label="pairs")
-    if not numbered:
-        dr.eval(key)
-        return _Pairs(key)
-    first = dr.empty(mi.UInt32, count + 1)
-    end, inside = dr.opaque(mi.UInt32, pairs), row_of < dr.opaque(mi.UInt32, rows)
-    dr.scatter(first, dr.select(inside, dr.gather(mi.UInt32, pair_of, row_of, inside), end), order)
-    dr.scatter(first, end, dr.opaque(mi.UInt32, count))
-    dr.eval(key, number, first)
-    return _Pairs(key, number, first)
-
-
-def prefix_ranges(sizes: Any) -> tuple[Any, int]:
-    """Where each of consecutive ranges begins, and their whole size.
-
-    Raises:
-        CrowdedError: If that is more than :data:`PAIRS_MAX`.
-    """
-    begin, last = dr.prefix_sum(sizes), dr.width(sizes) - 1
-    whole = dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last)
-    # Added as floats too, because a sum of integers would wrap.
-    rough = mi.UInt32(dr.minimum(dr.sum(mi.Float(sizes)), 2.0 * PAIRS_MAX))
-    total, rough = np.array(dr.concat([whole, rough])).tolist()
-    if rough > PAIRS_MAX:
-        raise CrowdedError
-    return begin, total
-
-
-def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any], tuple[Any, Any]]:
-    """Function from a row of tiles to the half-open range of its tiles that a record's cut-off ellipse meets.
-
-    Gaussians at the camera's plane take their whole box. Under lens distortion, rows are no bands of slopes: the tiles
-    of the box are tried one by one.
-    """
-    u0, v0, a, b2, c, opacity, _, _, _, _, e, f, g, h, i, _ = record
-    k2 = opacity - cut
-    conic = a - k2 * g, b2 - k2 * h, c - k2 * i, -k2 * e, -k2 * f, -k2
-    whole = a < 0
-    if not view.distortion:
-        span_between = ellipse_spans(conic)
-        _, (first_v, step_v, height) = view.tile_grid()
-
-    def straight(y: Any) -> tuple[Any, Any]:
-        dv = dr.fma(mi.Float(y), step_v, first_v) - v0
-        lo_u, hi_u, meets = span_between(dv - 0.5 * height, dv + 0.5 * height)
-        lo, hi = view.tile_columns(u0 + lo_u, u0 + hi_u)
-        lo, hi = dr.maximum(lo, x0), dr.minimum(dr.select(meets, hi, 0), x1)
-        return dr.select(whole, x0, lo), dr.select(whole, x1, hi)
-
-    def distorted(y: Any) -> tuple[Any, Any]:
-        def one_tile(x: Any, lo: Any, hi: Any) -> tuple[Any, Any, Any]:
-            lo_u, hi_u, lo_v, hi_v = view.tile_slopes(y * view.tiles_x + x)
-            meets = whole | conic_touches_rectangle(conic, lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
-            return x + 1, dr.select(meets, dr.minimum(lo, x), lo), dr.select(meets, x + 1, hi)
-
-        _, lo, hi = dr.while_loop(
-            (mi.UInt32(x0), mi.UInt32(x1), mi.UInt32(x0)), lambda x, lo, hi: x < x1, one_tile, label="tiles of a row"
-        )
-        return lo, hi
-
-    return distorted if view.distortion else straight
-
-
-def stable_order(key: Any, bits: int) -> Any:
-    """Stable order of keys of so many bits: positions in ``key``.
-
-    A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.
-    """
-    count, order = dr.width(key), None
-    radix = 16 if dr.backend_v(key) == dr.JitBackend.LLVM else 8
-    passes = -(-bits // radix)
-    width = -(-bits // passes)
-    for shift in range(0, bits, width):
-        digit = mi.UInt32((key if order is None else dr.gather(type(key), key, order)) >> shift) & ((1 << width) - 1)
-        dr.eval(digit)
-        permutation = dr.detail.block_mkperm(digit, count, 1 << width)
-        order = permutation if order is None else dr.gather(mi.UInt32, order, permutation)
-        dr.eval(order)
-    return order
-
-
 def _sorted(key: Any, bits: int) -> Any:
     """Keys (UInt64, evaluated) of pairs by their leading ``bits``, above their numbers, by which they ascend already.
 
@@ -455,22 +268,9 @@ def _sorted(key: Any, bits: int) -> Any:
     return in_order
 
 
-def sort_in_threads(values: np.ndarray, threads: int) -> None:
-    """Sort in place, by halves in several threads where that is worth it: all of them take more time than one alone."""
-    if threads == 1 or len(values) < 1 << 16:
-        values.sort()
-        return
-    middle = len(values) // 2
-    values.partition(middle)
-    with ThreadPoolExecutor(1) as pool:
-        half = pool.submit(sort_in_threads, values[:middle], threads // 2)
-        sort_in_threads(values[middle:], threads - threads // 2)
-        half.result()
-
-
 def _first_entries(key: Any, tiles: int) -> Any:
     """Number of the first entry of every tile, and of all entries, by bisection of sorted keys."""
-    wanted = _Pairs.key_of(dr.arange(mi.UInt32, tiles + 1), mi.UInt32(0), mi.UInt32(0))
+    wanted = Pairs.key_of(dr.arange(mi.UInt32, tiles + 1), mi.UInt32(0), mi.UInt32(0))
     pairs = dr.opaque(mi.UInt32, dr.width(key))
 
     def halve(low: Any, high: Any) -> tuple[Any, Any]:
@@ -482,91 +282,3 @@ def _first_entries(key: Any, tiles: int) -> Any:
     first, _ = dr.while_loop(state, lambda low, high: low < high, halve, label="first entries")
     dr.eval(first)
     return first
-
-
-def _level(depth: Any, view: View) -> Any:
-    """Sort key of a depth: the leading bits of its ratio to the near plane, which grow with it."""
-    ratio = dr.clip(depth / view.near_plane, 1.0, 0.9999 * 2.0**32)
-    return (dr.reinterpret_array(mi.UInt32, ratio) - _BITS_OF_1) >> (23 + 5 - DEPTH_BITS)
-
-
-_BITS_OF_1 = 0x3F800000
-
-
-def _depth_of_level(level: Any, view: View) -> Any:
-    """Least depth that has a level; what is nearer than the near plane has level 0."""
-    ratio = dr.reinterpret_array(mi.Float, (level << (23 + 5 - DEPTH_BITS)) + _BITS_OF_1)
-    return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
-
-
-def _depths(record: Any, ellipsoid: Any, first: Any, view: View, quality: Quality) -> Callable[[Any], Any]:
-    """Function from a tile in the row of tiles of the ``first`` one to a record's depth there, by which it is sorted.
-
-    In an undistorted view, most of it is the same for a whole row.
-    """
-    if quality.order == "ray":
-        return lambda tile: _least_depth(record, ellipsoid, view.tile_slopes(tile))
-    if view.distortion:
-        return lambda tile: _depth_where_seen(record, view.tile_slopes(tile))
-    (first_u, step_u, width), (first_v, step_v, height) = view.tile_grid()
-    row = first // view.tiles_x
-    depth_around, begin = _depths_where_seen(record, width, height), row * view.tiles_x
-    middle_u, middle_v = first_u - record[0], dr.fma(mi.Float(row), step_v, first_v) - record[1]
-    return lambda tile: depth_around(dr.fma(mi.Float(tile - begin), step_u, middle_u), middle_v)
-
-
-def _depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
-    """Depth of a Gaussian's peak along the ray around which a tile between some slopes sees most of it."""
-    lo_u, hi_u, lo_v, hi_v = slopes
-    depth_around = _depths_where_seen(record, hi_u - lo_u, hi_v - lo_v)
-    return depth_around(0.5 * (lo_u + hi_u) - record[0], 0.5 * (lo_v + hi_v) - record[1])
-
-
-def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, Any], Any]:
-    """Function from the middle of a tile of such slopes, from the footprint's centre on, to :func:`_depth_where_seen`.
-
-    With M the inverse covariance of the footprint and V that of a tile's pixels, taken for a Gaussian around its middle
-    m, their product has its mean at (I + V M)^-1 m from the footprint's centre: near the centre of what is small
-    against the tile, in the middle of the tile for what is large.
-    """
-    a, b2, c = (record[k] for k in (2, 3, 4))
-    variance_u, variance_v = (dr.square(w) / (12 * LOG2_E_HALF) for w in (width, height))
-    # What is smaller than the tile by more than this is seen at its centre, and would overflow.
-    p11, p22 = 1 + dr.minimum(variance_u * a, 1e15), 1 + dr.minimum(variance_v * c, 1e15)
-    b = dr.clip(0.5 * b2, -1e15 / variance_u, 1e15 / variance_u)
-    inverse = dr.rcp(dr.maximum(p11 * p22 - variance_u * b * (variance_v * b), 1))
-    uu, uv = inverse * p22, inverse * (variance_u * b)
-    vu, vv = inverse * (variance_v * b), inverse * p11
-    half_u, half_v = 0.5 * width, 0.5 * height
-
-    def depth_around(middle_u: Any, middle_v: Any) -> Any:
-        du, dv = uu * middle_u - uv * middle_v, vv * middle_v - vu * middle_u
-        du = dr.clip(du, middle_u - half_u, middle_u + half_u)
-        dv = dr.clip(dv, middle_v - half_v, middle_v + half_v)
-        top, bottom = _depth_fraction(record, du, dv)
-        return dr.select(a < 0, 0, record[9] * dr.maximum(top, 0) / bottom)
-
-    return depth_around
-
-
-def _least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
-    """Lower bound of the depth of a Gaussian's peak along any ray of a tile.
-
-    The numerator of the depth is linear and the denominator convex in the slopes: both are bounded at the corners. Nor
-    can the peak lie in front of the cut-off ellipsoid.
-    """
-    lo_u, hi_u, lo_v, hi_v = slopes
-    least, largest = mi.Float(dr.inf), mi.Float(0)
-    for u in (lo_u, hi_u):
-        for v in (lo_v, hi_v):
-            top, bottom = _depth_fraction(record, u - record[0], v - record[1])
-            least, largest = dr.minimum(least, top), dr.maximum(largest, bottom)
-    bound = dr.maximum(record[9] * dr.maximum(least, 0) / largest, ellipsoid)
-    return dr.select(record[2] < 0, 0, dr.maximum(bound, 0))
-
-
-def _depth_fraction(record: Any, du: Any, dv: Any) -> tuple[Any, Any]:
-    """Numerator and denominator of the depth of a peak, relative to the depth of the centre."""
-    _, _, _, _, _, _, _, _, _, _, e, f, g, h, i, _ = record
-    top = dr.fma(0.5, dr.fma(du, e, dv * f), 1)
-    return top, dr.fma(dv, dr.fma(dv, i, dr.fma(du, h, f)), dr.fma(du, dr.fma(du, g, e), 1))

@@ -14,8 +14,8 @@ import numpy as np
 
 from mitsplat.camera import Camera
 from mitsplat.engine.resources import WorkerMemory
+from mitsplat.plugins.pairs import PAIRS_MAX
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
-from mitsplat.plugins.tiles import PAIRS_MAX
 from mitsplat.quality import KERNELS, Quality, resolve_quality
 from mitsplat.scene.scene import Scene, plan_frame
 from mitsplat.splats import Splats

@@ -121,19 +121,19 @@ def test_a_scene_without_instances_has_no_silhouettes() -> None:
 
 @pytest.mark.parametrize("samples", [1, 2])
 def test_crowded_silhouettes_are_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
-    from mitsplat.plugins import tiles
+    from mitsplat.plugins import pairs
 
     ensure_variant()
     scene = mi.load_dict({"type": "scene", **placed()})
     integrator = make_integrator(quality=Quality(samples=samples), shadow="none")
     whole = render_silhouettes(integrator, scene, camera())
-    monkeypatch.setattr(tiles, "PAIRS_MAX", 3000)
+    monkeypatch.setattr(pairs, "PAIRS_MAX", 3000)
     parts = render_silhouettes(integrator, scene, camera())
     assert set(parts) == set(whole)
     for number, silhouette in whole.items():
         assert parts[number].box == silhouette.box
         np.testing.assert_array_equal(parts[number].mask, silhouette.mask)
-    monkeypatch.setattr(tiles, "PAIRS_MAX", 10)
+    monkeypatch.setattr(pairs, "PAIRS_MAX", 10)
     with pytest.raises(MissingResourceError, match="cover too much of the image"):
         render_silhouettes(integrator, scene, camera())
 

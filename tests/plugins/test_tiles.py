@@ -43,7 +43,7 @@ def test_entries_ascend_by_depth_and_number_and_have_a_place_by_record(lens: dic
 def test_sorts_agree_with_numpy() -> None:
     """In several threads as in one; and the stable radix sort of keys of 64 bits, by which a GPU sorts."""
     ensure_variant()
-    from mitsplat.plugins.tiles import sort_in_threads, stable_order
+    from mitsplat.plugins.sorting import sort_in_threads, stable_order
 
     keys = np.random.default_rng(2).integers(0, 1 << 31, 150_000).astype(np.uint64) // 1000
     for threads in (1, 3, 8):

@@ -219,7 +219,7 @@ TURNING = [turned(0.02 * step) for step in range(6)]
 def test_tiles_sort_by_depth_where_they_see_most_of_a_gaussian() -> None:
     """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
     ensure_variant()
-    from mitsplat.plugins.tiles import _depth_where_seen
+    from mitsplat.plugins.tile_depths import depth_where_seen
 
     box, centre, depth = (0.10, 0.14, -0.02, 0.01), np.array([0.125, -0.012]), 2.0
     tilt = np.array([3.0, -2.0])  # E and F: depth falls and rises across the footprint
@@ -231,7 +231,7 @@ def test_tiles_sort_by_depth_where_they_see_most_of_a_gaussian() -> None:
         mean = np.linalg.solve(inverse + np.linalg.inv(spread), inverse @ centre + np.linalg.inv(spread) @ middle)
         du, dv = mean - centre
         record = [*centre, scaled[0, 0], 2 * scaled[0, 1], scaled[1, 1], 0, 0, 0, 0, depth, *tilt, 0, 0, 0, 0]
-        found = _depth_where_seen([mi.Float(value) for value in record], tuple(mi.Float(side) for side in box))
+        found = depth_where_seen([mi.Float(value) for value in record], tuple(mi.Float(side) for side in box))
         expected = depth * (1 + (tilt @ (du, dv)) / 2) / (1 + tilt @ (du, dv))
         assert np.array(found).item() == pytest.approx(expected, rel=1e-5)
         assert abs(expected - depth) > 1e-4

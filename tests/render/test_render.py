@@ -438,12 +438,12 @@ def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples:
     quality = replace(PRESETS["exact"], samples=samples)
     camera = replace(CAMERA, height=27)
     whole = render_splats(splats, camera, quality=quality)
-    monkeypatch.setattr(tiles, "PAIRS_MAX", 1500)
+    monkeypatch.setattr(pairs, "PAIRS_MAX", 1500)
     parts = render_splats(splats, camera, quality=quality)
     assert joined
     for name in ("rgb", "alpha", "depth"):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=2e-6)
-    monkeypatch.setattr(tiles, "PAIRS_MAX", 10)
+    monkeypatch.setattr(pairs, "PAIRS_MAX", 10)
     with pytest.raises(MissingResourceError, match="cover too much of the image"):
         render_splats(splats, camera, quality=quality)
 

@@ -429,7 +429,7 @@ def test_nothing_to_see_is_black_and_empty() -> None:
 
 @pytest.mark.parametrize("samples", [1, 2])
 def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
-    from mitsplat.plugins import march, tiles
+    from mitsplat.plugins import march, pairs
 
     joined = []
     join = march.Image.joined

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     ("cli",),
     ("detector", "report", "view"),
-    ("audit", "checks"),
+    ("audit", "checks", "surroundings"),
     ("dataset", "importing"),
     ("bake", "formats", "reconstruct"),
     ("fit", "frames"),

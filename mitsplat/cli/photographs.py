@@ -271,8 +271,8 @@ def mesh(
 ) -> None:
     """Make an asset of SPLATS that were fitted to CAPTURE.
 
-    The object is isolated by its masks, its surface found, and both are judged by held-out photos in report.html. If a
-    threshold is missed, the exit status is 4.
+    The object is isolated by its masks, its surface found, and both are judged by held-out photos in report.html. An
+    environment is kept whole, and level surfaces in it are found. If a threshold is missed, the exit status is 4.
     """
     from mitsplat.asset import read_mesh
     from mitsplat.reconstruct.pipeline import AssetJob, make_asset
@@ -280,6 +280,7 @@ def mesh(
     from mitsplat.reconstruct.registration import invert_transform
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
+    from mitsplat.surroundings import make_surroundings
 
     if take is None and (normalisation is not None or units is not None):
         raise InputError("--normalisation and --units say where an imported mesh belongs: give --import as well")
@@ -297,7 +298,8 @@ def mesh(
     )
     take_device(device)
     with progress_bar("steps") as progress:
-        done = make_asset(capture, splats, out, job, progress=progress)
+        make = make_asset if kind == "object" else make_surroundings
+        done = make(capture, splats, out, job, progress=progress)
     _tell_asset(done)
 
 
@@ -315,7 +317,9 @@ def asset(
     pick: Picks = None,
     pick_not: PicksNot = None,
     box: Box = None,
-    gaussians: Gaussians = 30000,
+    gaussians: Annotated[
+        int | None, typer.Option(help="Most Gaussians; 30000 of an object, 60000 of surroundings if absent.")
+    ] = None,
     iterations: Iterations = 3000,
     budget: Budget = None,
     edge: Edge = 800,
@@ -327,7 +331,8 @@ def asset(
     """Make an asset of PHOTOS.
 
     Cameras, splats, isolation, mesh and verdict: `capture`, `fit` and `mesh` in one. Runs again where it stopped;
-    report.html shows what came of it. If a threshold is missed, the exit status is 4.
+    report.html shows what came of it. Of an environment, level surfaces are found, and a scene file beside its folder
+    drops things on the one that photos look at. If a threshold is missed, the exit status is 4.
     """
     from mitsplat.capture.pipeline import CaptureSettings
     from mitsplat.fit.trainer import FitSettings
@@ -335,7 +340,10 @@ def asset(
     from mitsplat.reconstruct.reconstruct import ReconstructSettings
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
+    from mitsplat.surroundings import make_photo_surroundings
 
+    whole = kind == "environment"
+    make = make_photo_surroundings if whole else make_photo_asset
     job = AssetJob(
         name=name or out.resolve().name,
         class_name=class_name,
@@ -346,7 +354,7 @@ def asset(
     )
     take_device(device)
     with progress_bar("steps") as progress:
-        done = make_photo_asset(
+        done = make(
             photos,
             out,
             job,
@@ -361,9 +369,10 @@ def asset(
                 box=box,
             ),
             fit=FitSettings(
-                gaussians=gaussians,
+                gaussians=gaussians or (60_000 if whole else 30_000),
                 iterations=iterations,
                 budget=None if budget is None else _seconds(budget),
+                masks="off" if whole else "alpha",
                 size=edge,
                 seed=seed,
             ),
@@ -390,6 +399,8 @@ def _tell_asset(done: AssetResult) -> None:
         typer.echo(f"warning: {warning}")
     typer.echo(f"photos: {found.photos} of {found.photos + found.rejected} with a camera; units: {found.units}")
     typer.echo(f"splats: {found.gaussians}; mesh: {found.faces} faces, {closed}")
+    for what, text in found.rows.items():
+        typer.echo(f"{what[0].lower()}{what[1:]}: {text}")
     if found.refinement is not None:
         typer.echo(f"refinement: {found.refinement}")
     figures = {
@@ -401,6 +412,8 @@ def _tell_asset(done: AssetResult) -> None:
     }
     typer.echo("; ".join(f"{name} {value}" for name, value in figures.items() if value is not None))
     typer.echo(f"report: {done.folder / 'report.html'}")
+    if done.scene is not None:
+        typer.echo(f"scene: {done.scene}")
     if done.shortcoming is not None:
         raise PartialResultError(f"{done.folder}: {done.shortcoming}")
 

@@ -129,6 +129,8 @@ class Verdict:
         causes: What was measured of the photos, one clause each, by the threshold that it makes an asset miss.
         surface: What the mesh of an object was reconstructed from, or None where it was not.
         surface_faults: Why finer surfaces were not kept, one clause each.
+        rows: Further figures in words, by what they are of.
+        findings: What else is missed, a sentence each with advice.
     """
 
     photos: int
@@ -150,9 +152,12 @@ class Verdict:
     causes: Mapping[str, str] = field(default_factory=dict)
     surface: str | None = None
     surface_faults: tuple[str, ...] = ()
+    rows: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "surface_faults", tuple(self.surface_faults))  # files have lists
+        for name in ("surface_faults", "findings"):  # files have lists
+            object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @property
     def registered(self) -> float:
@@ -186,7 +191,7 @@ class Verdict:
             )
         if self.solid and not self.watertight:
             found.append(f"the mesh is open (a closed one is wanted): {self._advice('watertight')}")
-        return tuple(found)
+        return (*found, *self.findings)
 
     def _advice(self, name: str) -> str:
         """What would help, behind what was measured."""

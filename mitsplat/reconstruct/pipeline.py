@@ -7,6 +7,7 @@ own inputs. The last stage is kept by a hash of everything that decides it, in `
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -64,17 +65,33 @@ class AssetResult:
         verdict: Its figures.
         kept: Whether an earlier run had made it of the same inputs.
         warnings: What there is to say about its photographs, one sentence each.
+        scene: File of a scene that has it, if one was written.
     """
 
     folder: Path
     verdict: Verdict
     kept: bool
     warnings: tuple[str, ...] = ()
+    scene: Path | None = None
 
     @property
     def shortcoming(self) -> str | None:
         """The thresholds that were missed and what would help, as one sentence, or None."""
         return "; ".join(self.verdict.misses()) or None
+
+
+Maker = Callable[[Capture, Splats, AssetJob, float | None, str | None, Progress | None], Reconstruction]
+"""Makes an asset of a capture and splats: given the job, the fit's held-out PSNR [dB] and what the scale is by."""
+
+
+def reconstruct_job(
+    capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
+) -> Reconstruction:
+    """A :data:`Maker`: :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset` as a job says."""
+    return reconstruct_asset(
+        capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
+        imported=job.imported, psnr=psnr, progress=progress,
+    )  # fmt: skip
 
 
 def read_fit(path: Path) -> tuple[Path, float | None]:
@@ -101,6 +118,7 @@ def make_photo_asset(
     *,
     capture: CaptureSettings,
     fit: FitSettings,
+    make: Maker = reconstruct_job,
     progress: Progress | None = None,
 ) -> AssetResult:
     """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
@@ -111,6 +129,7 @@ def make_photo_asset(
         job: What to make.
         capture: How cameras, scale and masks are found.
         fit: How splats are fitted.
+        make: The last stage.
         progress: Told what is being done.
 
     Raises:
@@ -126,12 +145,19 @@ def make_photo_asset(
             progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
 
     fit_capture(found, out / "fit", fit, overwrite=True, progress=fitting)
-    done = make_asset(out / "capture", out / "fit", out, job, progress=progress)
+    done = make_asset(out / "capture", out / "fit", out, job, make=make, source=taken.source, progress=progress)
     return replace(done, warnings=taken.warnings)
 
 
 def make_asset(
-    capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
+    capture_folder: Path,
+    fit: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    make: Maker = reconstruct_job,
+    source: str | None = None,
+    progress: Progress | None = None,
 ) -> AssetResult:
     """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
 
@@ -140,6 +166,8 @@ def make_asset(
         fit: Folder that ``mitsplat fit`` wrote, or a splat file in the capture's frame.
         out: Folder of the asset.
         job: What to make.
+        make: How.
+        source: What the capture's scale and gravity are by, a clause.
         progress: Told what is being done.
 
     Raises:
@@ -152,17 +180,7 @@ def make_asset(
     if done is not None:
         return done
     (out / VERDICT_FILE).unlink(missing_ok=True)
-    result = reconstruct_asset(
-        capture,
-        Splats.load(splat_file),
-        name=job.name,
-        class_name=job.class_name,
-        kind=job.kind,
-        settings=job.settings,
-        imported=job.imported,
-        psnr=psnr,
-        progress=progress,
-    )
+    result = make(capture, Splats.load(splat_file), job, psnr, source, progress)
     result.asset.save(out)
     write_asset_report(out, capture, result)
     # Last, so that an interrupted run is not mistaken for a finished one.
@@ -171,7 +189,7 @@ def make_asset(
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
-    record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict)}
+    record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict), **result.record}
     record["asset_from_capture"] = result.asset_from_capture.tolist()
     if result.isolation is not None:
         record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -73,6 +73,8 @@ class Reconstruction:
         alignment: Where a registered mesh was found.
         refinement: What came of refining the mesh, in the capture's frame, or None where that was not asked for.
         asset_from_capture: Where the capture's frame is in the asset's, a similarity, shape (4, 4).
+        sections: Further sections of the report, HTML.
+        record: What else is kept beside the verdict, JSON.
     """
 
     asset: Asset
@@ -82,6 +84,8 @@ class Reconstruction:
     alignment: Alignment | None
     refinement: RefinedMesh | None
     asset_from_capture: Float64Array
+    sections: tuple[str, ...] = ()
+    record: Mapping[str, Any] = field(default_factory=dict)
 
 
 def reconstruct_asset(

@@ -43,6 +43,7 @@ def write_asset_report(folder: Path, capture: Capture, result: Reconstruction) -
     parts = [
         f"<h1>{html.escape(name)}</h1>",
         _verdict(result),
+        *result.sections,
         _held_out(result.held_out),
         _cameras(capture),
         _photos(capture),
@@ -80,6 +81,7 @@ def _verdict(result: Reconstruction) -> str:
             f"{removed.outside} outside the masks, {removed.unseen} unseen, {removed.needles} needles, "
             f"{removed.floaters} floaters"
         )
+    rows |= found.rows
     told = verdict_of(misses, "Every threshold is met.", rows)
     return f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>{told}</section>'
 

@@ -1,0 +1,189 @@
+"""A support from above: what stands on it, where it is free, and what photos hardly show of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import binary_closing, binary_dilation, binary_erosion, label
+
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+from mitsplat.camera import Camera, direction
+from mitsplat.splats import Splats
+from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views
+from mitsplat.surroundings.supports import Support
+
+CELLS = 80
+"""Cells along the longer side."""
+ENOUGH = 3
+"""Photos that must show a place."""
+_OFF = 0.012
+"""Height up to which what a photo shows is the support, as a share of the typical depth."""
+_TALL = 0.6
+"""Height up to which what is above a support stands on it, as a share of the typical depth."""
+_SMALLEST_HOLE = 0.005
+"""Area of a hole that is worth a word, as a share of the support's."""
+_HOLES = 3
+_TURNS, _HEIGHTS = 8, (35.0, 65.0)
+_LOOK = 120
+"""Longest edge of the pictures by which views of a hole are tried [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hole:
+    """A part of a support that too few photos show.
+
+    Attributes:
+        middle: In the support's frame, x and y.
+        area: Of it.
+        near: Name of the photo whose camera is nearest to where it would be seen from, or None if nothing shows it.
+        height: Of that place above the horizon of the hole [degrees].
+        shown: Share of the hole that can be seen from there.
+    """
+
+    middle: tuple[float, float]
+    area: float
+    near: str | None
+    height: float
+    shown: float
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Cells of a support, first axis x.
+
+    Attributes:
+        cell: Edges along x and y, shape (2,).
+        photos: How many photos show a cell, (X, Y).
+        covered: Whether something stands there, (X, Y).
+    """
+
+    cell: Float64Array
+    photos: Int64Array
+    covered: BoolArray
+
+    @property
+    def hidden(self) -> BoolArray:
+        """Free cells that fewer than :data:`ENOUGH` photos show, (X, Y)."""
+        return (self.photos < ENOUGH) & ~self.covered
+
+    @property
+    def free(self) -> BoolArray:
+        """Cells that are seen and have nothing on or beside them, nor the edge, (X, Y)."""
+        good = (self.photos >= ENOUGH) & ~binary_dilation(self.covered, np.ones((3, 3)))
+        return np.asarray(binary_erosion(good))
+
+    def middle(self, cells: npt.ArrayLike) -> Float64Array:
+        """Where cells (N, 2) have their middles in the support's frame, (N, 2)."""
+        return np.asarray(
+            (np.asarray(cells, dtype=np.float64) + 0.5) * self.cell - np.array(self.photos.shape) * self.cell / 2
+        )
+
+
+def find_coverage(support: Support, views: Sequence[DepthView], points: SurfacePoints, scale: float) -> Coverage:
+    """Look at a support in all photos.
+
+    Args:
+        support: Where.
+        views: Of the photos.
+        points: What they see.
+        scale: Their typical depth.
+    """
+    longer = max(support.size)
+    shape = np.maximum(np.rint(np.array(support.size) / longer * CELLS), 1).astype(int)
+    cell = np.array(support.size) / shape
+    photos: Int64Array = np.zeros(shape, dtype=np.int64)
+    empty = Coverage(cell, photos, np.zeros(shape, dtype=bool))
+    flat = empty.middle(np.argwhere(np.ones(shape)))
+    world = _placed(support, flat)
+    for view in views:
+        depth, surface = view.look(world)
+        height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
+        # Height over the support of what the ray to a cell ends at.
+        above = height * (1 - surface / depth)
+        photos += (np.abs(above) < _OFF * scale).reshape(shape)
+    local = (points.places - support.pose[:3, 3]) @ support.pose[:3, :3]
+    standing = (local[:, 2] > _OFF * scale) & (local[:, 2] < _TALL * scale)
+    index = np.floor(local[standing, :2] / cell + shape / 2).astype(np.int64)
+    index = index[((index >= 0) & (index < shape)).all(axis=1)]
+    covered = np.zeros(shape, dtype=bool)
+    covered[tuple(index.T)] = True
+    return Coverage(
+        cell, photos, np.asarray(binary_closing(np.pad(covered, 3), np.ones((3, 3)), iterations=2)[3:-3, 3:-3])
+    )
+
+
+def _placed(support: Support, flat: Float64Array) -> Float64Array:
+    """Points (N, 2) of a support's frame in the place, (N, 3)."""
+    return np.asarray(flat @ support.pose[:3, :2].T + support.pose[:3, 3])
+
+
+def free_rectangle(free: BoolArray) -> tuple[int, int, int, int] | None:
+    """First and last but one row and column of the largest rectangle of True cells, or None where there are none."""
+    best, area = None, 0
+    run = np.zeros(free.shape[1], dtype=np.int64)
+    for row in range(free.shape[0]):
+        run = np.where(free[row], run + 1, 0)
+        for first in range(free.shape[1]):
+            depth = np.minimum.accumulate(run[first:])
+            sizes = depth * np.arange(1, len(depth) + 1)
+            last = int(sizes.argmax())
+            if sizes[last] > area:
+                area = int(sizes[last])
+                best = (row + 1 - int(depth[last]), row + 1, first, first + last + 1)
+    return best
+
+
+def find_holes(
+    support: Support, coverage: Coverage, splats: Splats, cameras: Sequence[tuple[str, Camera]]
+) -> list[Hole]:
+    """The largest holes of a support, and from where each would be seen.
+
+    Args:
+        support: Where.
+        coverage: Of it.
+        splats: Of the place.
+        cameras: Names of the photos, and their cameras.
+    """
+    parts, count = label(coverage.hidden)
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
+    least = _SMALLEST_HOLE * coverage.hidden.size
+    found = []
+    for number in np.argsort(-sizes, kind="stable")[:_HOLES]:
+        if sizes[number] < least:
+            break
+        flat = coverage.middle(np.argwhere(parts == number + 1))
+        found.append(_hole(support, flat, float(sizes[number] * coverage.cell.prod()), splats, cameras))
+    return found
+
+
+def _hole(
+    support: Support, flat: Float64Array, area: float, splats: Splats, cameras: Sequence[tuple[str, Camera]]
+) -> Hole:
+    cells, middle = _placed(support, flat), _placed(support, flat.mean(axis=0)[None])[0]
+    centres = np.array([camera.centre for _, camera in cameras])
+    away = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    first = cameras[0][1]
+    edge = max(first.width, first.height)
+    best, chosen, height = 0.0, None, 0.0
+    tried, degrees = [], []
+    for elevation in _HEIGHTS:
+        for turn in range(_TURNS):
+            outward = support.pose[:3, :3] @ direction(2 * np.pi * turn / _TURNS, float(np.sin(np.radians(elevation))))
+            pose = Camera.look_at(
+                middle + away * outward, middle, width=_LOOK, height=_LOOK, fov_x=60, near=0.05 * away
+            )
+            tried.append(pose)
+            degrees.append(elevation)
+    for view, elevation in zip(depth_views(splats, tried, min(_LOOK, edge)), degrees, strict=True):
+        depth, surface = view.look(cells)
+        # Where nobody looked there may be no splats: what matters is that nothing is before it.
+        shown = float(np.nanmean(surface > 0.97 * depth)) if np.isfinite(depth).any() else 0.0
+        if shown > best + 0.05:
+            best, chosen, height = shown, view.camera.centre, elevation
+    near = None
+    if chosen is not None:
+        near = cameras[int(np.linalg.norm(centres - chosen, axis=1).argmin())][0]
+    return Hole((float(flat[:, 0].mean()), float(flat[:, 1].mean())), area, near, height, best)

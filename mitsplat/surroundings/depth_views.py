@@ -1,0 +1,104 @@
+"""What photos see of a place: the depth of its splats from their cameras, and points on surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.render.layers import render_splats
+from mitsplat.splats import Splats
+
+SIZE = 240
+"""Longest edge of the pictures [px]."""
+_OPAQUE = 0.5
+_STEP = 2
+"""Pixels from one to the next point, and half of those over which a normal is taken."""
+_BENT = 0.05
+"""Share of the depth by which neighbours may differ for a normal."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """Depth from a camera.
+
+    Attributes:
+        camera: At the size of the picture.
+        depth: Along the optical axis, infinite where nothing opaque is, (H, W).
+    """
+
+    camera: Camera
+    depth: Float32Array
+
+    def look(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Depth of points (N, 3) and of the surface in their pixels, (N,) each; NaN for points that are not in view."""
+        pixels, z = self.camera.project(points)
+        x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(np.int64).T
+        inside = (z > self.camera.near) & (x >= 0) & (y >= 0) & (x < self.camera.width) & (y < self.camera.height)
+        shown = np.full(len(points), np.nan)
+        shown[inside] = self.depth[y[inside], x[inside]]
+        return np.where(inside, z, np.nan), shown
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points on what photos see, as many of each photo as it has opaque pixels.
+
+    Attributes:
+        places: Shape (N, 3).
+        normals: Unit normals towards the camera, (N, 3).
+        central: Whether a point is in the middle half of its photo, (N,).
+    """
+
+    places: Float64Array
+    normals: Float64Array
+    central: BoolArray
+
+    def transformed(self, motion: Float64Array) -> SurfacePoints:
+        """The points after a rigid motion (4, 4)."""
+        turn = motion[:3, :3].T
+        return SurfacePoints(self.places @ turn + motion[:3, 3], self.normals @ turn, self.central)
+
+
+def depth_views(splats: Splats, cameras: Sequence[Camera], size: int = SIZE) -> list[DepthView]:
+    """Depths of splats from cameras, the longest edge ``size`` px at most."""
+    views = []
+    for camera in cameras:
+        scale = min(1.0, size / max(camera.width, camera.height))
+        small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        layers = render_splats(splats, small, quality="balanced")
+        seen = (layers.alpha > _OPAQUE) & (layers.depth > 0)
+        views.append(DepthView(small, np.where(seen, layers.depth, np.inf).astype(np.float32)))
+    return views
+
+
+def surface_points(views: Sequence[DepthView]) -> SurfacePoints:
+    """Points and normals of the surfaces in all views, without their edges."""
+    places, normals, central = [], [], []
+    for view in views:
+        height, width = view.depth.shape
+        y, x = np.mgrid[0:height, 0:width] + 0.5
+        slopes = view.camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+        rays = np.column_stack([slopes, np.ones(len(slopes))]).reshape(height, width, 3)
+        depth = np.where(np.isfinite(view.depth), view.depth, np.nan).astype(np.float64)
+        local = rays * depth[..., None]
+        step, inner = 2 * _STEP, slice(_STEP, -_STEP)
+        across, down = local[inner, step:] - local[inner, :-step], local[step:, inner] - local[:-step, inner]
+        normal = np.cross(down, across)
+        length = np.linalg.norm(normal, axis=-1)
+        middle = depth[inner, inner]
+        smooth = (np.abs(across[..., 2]) < _BENT * middle) & (np.abs(down[..., 2]) < _BENT * middle) & (length > 0)
+        grid = np.zeros_like(smooth)
+        grid[::_STEP, ::_STEP] = True
+        kept = smooth & grid  # comparisons with NaN are false
+        turn = view.camera.world_from_camera[:3, :3].T
+        near = np.abs(np.stack([x[inner, inner] / width, y[inner, inner] / height]) - 0.5).max(axis=0) < 0.25
+        places.append(local[inner, inner][kept] @ turn + view.camera.centre)
+        normals.append(normal[kept] / length[kept, None] @ turn)
+        central.append(near[kept])
+    if not places:
+        return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=bool))
+    return SurfacePoints(np.concatenate(places), np.concatenate(normals), np.concatenate(central))

@@ -1,0 +1,298 @@
+"""From a capture and a fit of a whole place to an environment: cleaned, level, with supports, a verdict and a scene."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.metric_frame import meeting_point
+from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.files import write_text
+from mitsplat.fit.trainer import FitSettings
+from mitsplat.html import rgb_image
+from mitsplat.progress import Progress
+from mitsplat.reconstruct.evaluation import VERDICT_FILE, sized_photo
+from mitsplat.reconstruct.pipeline import AssetJob, AssetResult, make_asset, make_photo_asset
+from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
+from mitsplat.reconstruct.surface import reconstruct_surface
+from mitsplat.splats import Splats
+from mitsplat.surroundings.coverage import ENOUGH, Coverage, Hole, find_coverage, find_holes, free_rectangle
+from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.floaters import remove_floaters
+from mitsplat.surroundings.ready_scene import Region, scene_text
+from mitsplat.surroundings.supports import Support, find_supports, flattened
+
+_NEAR = 3.0
+"""Distance from what the cameras look at, in their own, beyond which is background: shown, but no part of the mesh."""
+_TURNED = 30.0
+"""Angle to the capture's vertical up to which a surface may be the support [degrees]."""
+_LEVEL = 2.0
+"""Angle to the support up to which other surfaces are level [degrees]."""
+_ROUGH = 0.03
+"""Height of the mesh over a support that is flattened, as a share of the typical depth."""
+_HIDDEN = 0.1
+"""Largest share of the support that too few photos may show."""
+_SMALLEST_REGION = 0.1
+"""Least edge of a place that things can be dropped on [m]."""
+
+
+def make_surroundings(
+    capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
+) -> AssetResult:
+    """Write the environment of a capture and a fit, as :func:`mitsplat.reconstruct.pipeline.make_asset`, and a scene.
+
+    The scene file lies beside the asset's folder and has its name; one that was changed by hand is kept.
+    """
+    before = _recorded_scene(out)
+    return _with_scene(
+        make_asset(capture_folder, fit, out, job, make=reconstruct_surroundings, progress=progress), before
+    )
+
+
+def make_photo_surroundings(
+    photos: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    capture: CaptureSettings,
+    fit: FitSettings,
+    progress: Progress | None = None,
+) -> AssetResult:
+    """Make an environment of a folder of photographs, as :func:`mitsplat.reconstruct.pipeline.make_photo_asset`."""
+    before = _recorded_scene(out)
+    done = make_photo_asset(
+        photos, out, job, capture=capture, fit=fit, make=reconstruct_surroundings, progress=progress
+    )
+    return _with_scene(done, before)
+
+
+def reconstruct_surroundings(
+    capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
+) -> Reconstruction:
+    """Make an environment of splats that were fitted to a capture.
+
+    Args:
+        capture: Photos with cameras.
+        splats: In the capture's frame.
+        job: What to make.
+        psnr: Held-out PSNR that the fit reported [dB].
+        source: What the capture's scale and gravity are by.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: As :func:`mitsplat.reconstruct.reconstruct.reconstruct_asset`.
+    """
+    if progress is not None:
+        progress(0, 1, "removing floaters and finding supports")
+    cameras = [photo.camera for photo in capture.training]
+    scale = _typical_depth(capture)
+    splats, removed = remove_floaters(splats, capture.training, scale)
+    points = surface_points(depth_views(splats, cameras))
+    found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_TURNED)
+    motion: Float64Array = np.eye(4)
+    if found:
+        motion = np.asarray(np.linalg.inv(found[0].pose))
+        capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
+        points = points.transformed(motion)
+        found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
+    cameras = [photo.camera for photo in capture.training]
+    beyond = _beyond(splats, cameras)
+    imported = job.imported
+    if imported is None:
+        mesh = _mesh(splats.select(~beyond), capture.training, job, found, scale, progress)
+        imported = ImportedMesh(mesh, np.eye(4))
+    made = reconstruct_asset(
+        capture, splats, name=job.name, class_name=job.class_name, kind="environment", settings=job.settings,
+        imported=imported, psnr=psnr, progress=progress,
+    )  # fmt: skip
+    # A size squares the asset with its mesh: that turn is taken back, as the support lies along the axes.
+    factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
+    back = np.eye(4)
+    back[:3, :3] = made.asset_from_capture[:3, :3].T / factor
+    larger = np.diag([factor, factor, factor, 1.0])
+    made = replace(made, asset=made.asset.transformed(back), asset_from_capture=larger @ motion)
+    error = "" if capture.scale_error is None else f" ± {capture.scale_error:.2%}"
+    rows = {
+        "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
+        + (f", by {source}" if source else ""),
+        "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
+        "Background": f"{int(beyond.sum())} Gaussians far beyond what the cameras look at, which are kept",
+    }
+    findings, sections, record = list[str](), list[str](), dict[str, Any]()
+    if found:
+        views = depth_views(splats, cameras)
+        coverage = find_coverage(found[0], views, points, scale)
+        named = [(photo.name, photo.camera) for photo in capture.training]
+        holes = find_holes(found[0], coverage, splats, named)
+        supports = [support.transformed(larger) for support in found]
+        region = _region(coverage, found[0], factor)
+        unit = "m" if made.asset.units == "metre" else "units"
+        rows |= _rows(supports, coverage, holes, region, factor, unit)
+        findings += _findings(coverage, holes, region, factor, unit, metric=made.asset.units == "metre")
+        sections.append(_map(found[0], coverage, splats))
+        record["supports"] = [
+            {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
+        ]
+        if region is not None and made.asset.units == "metre":
+            seen = [photo.camera for photo in capture.transformed(larger).photos]
+            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen)
+    else:
+        findings.append(
+            "no level surface was found for things to stand on (one is wanted): photograph the table from above as "
+            "well, and put texture on it"
+        )
+    if made.asset.units != "metre":
+        findings.append(
+            "how large it is is unknown, so that there is no scene file: lay a board of `mitsplat board` on the table, "
+            "or give --scale-from"
+        )
+    errors = [float(((view.render - view.photo) ** 2).mean()) for view in made.held_out]
+    shown = float(np.mean([-10 * np.log10(max(error, 1e-12)) for error in errors])) if errors else psnr
+    # As the asset is rendered, not as the fit saw it.
+    verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
+    return replace(made, verdict=verdict, sections=tuple(sections), record=record)
+
+
+def _typical_depth(capture: Capture) -> float:
+    """Median over the photos of the median depth of the points that they see."""
+    depths = [photo.camera.project(capture.points[photo.seen])[1] for photo in capture.training]
+    known = [float(np.median(depth)) for depth in depths if len(depth)]
+    return float(np.median(known)) if known else 1.0
+
+
+def _beyond(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
+    """Which Gaussians (N,) are far beyond what the cameras look at."""
+    centres = np.array([camera.centre for camera in cameras])
+    focus = meeting_point(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
+    away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
+    return np.asarray(np.linalg.norm(splats.means - focus, axis=1) > _NEAR * away)
+
+
+def _mesh(
+    splats: Splats,
+    photos: Sequence[Photo],
+    job: AssetJob,
+    supports: Sequence[Support],
+    scale: float,
+    progress: Progress | None,
+) -> trimesh.Trimesh:
+    cameras = [sized_photo(photo, job.settings.view_size)[0] for photo in photos]
+    mesh = reconstruct_surface(splats, cameras, settings=job.settings.surface, progress=progress)
+    return flattened(mesh, supports, _ROUGH * scale)
+
+
+def _region(coverage: Coverage, support: Support, factor: float) -> Region | None:
+    """The largest free rectangle of the support [m or units], in its frame."""
+    cells = free_rectangle(coverage.free)
+    if cells is None:
+        return None
+    low = coverage.middle(np.array([[cells[0] - 0.5, cells[2] - 0.5]]))[0] * factor
+    high = coverage.middle(np.array([[cells[1] - 0.5, cells[3] - 0.5]]))[0] * factor
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+
+def _rows(
+    supports: Sequence[Support],
+    coverage: Coverage,
+    holes: Sequence[Hole],
+    region: Region | None,
+    factor: float,
+    unit: str,
+) -> dict[str, str]:
+    first = supports[0]
+    rows = {
+        "Support": f"{first.size[0]:.3g} x {first.size[1]:.3g} {unit}, {first.filled:.0%} of it seen as flat, rough by "
+        f"{first.roughness:.2g} {unit}; {first.looked_at:.0%} of the photos' middles show it"
+    }
+    if len(supports) > 1:
+        rows["Other level surfaces"] = "; ".join(
+            f"{s.size[0]:.3g} x {s.size[1]:.3g} {unit} at z = {s.height:.3g} {unit}" for s in supports[1:]
+        )
+    if region is not None:
+        rows["Free to drop on"] = (
+            f"{region[1] - region[0]:.3g} x {region[3] - region[2]:.3g} {unit}, x {region[0]:.3g} to {region[1]:.3g}, "
+            f"y {region[2]:.3g} to {region[3]:.3g}"
+        )
+    rows["Hardly seen"] = f"{coverage.hidden.mean():.1%} of the support is in fewer than {ENOUGH} photos"
+    if holes:
+        rows["Holes"] = "; ".join(_told(hole, factor, unit) for hole in holes)
+    return rows
+
+
+def _told(hole: Hole, factor: float, unit: str) -> str:
+    """A hole, and from where it would be seen, a clause."""
+    x, y = (factor * value for value in hole.middle)
+    place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
+    if hole.near is None:
+        return f"{place}, which things hide from everywhere: move them"
+    return f"{place}: photograph it from near {hole.near}, {hole.height:.0f} degrees above it (shows {hole.shown:.0%})"
+
+
+def _findings(
+    coverage: Coverage, holes: Sequence[Hole], region: Region | None, factor: float, unit: str, *, metric: bool
+) -> list[str]:
+    found = []
+    if coverage.hidden.mean() > _HIDDEN:
+        places = "; ".join(_told(hole, factor, unit) for hole in holes) or "it is in many small parts: add photos"
+        found.append(
+            f"{coverage.hidden.mean():.0%} of the support is in fewer than {ENOUGH} photos (at most {_HIDDEN:.0%} is "
+            f"wanted): {places}"
+        )
+    if region is None or (metric and min(region[1] - region[0], region[3] - region[2]) < _SMALLEST_REGION):
+        found.append(
+            f"no free place of {_SMALLEST_REGION:g} x {_SMALLEST_REGION:g} m is left on the support: clear it, or "
+            "write the scene's region by hand"
+        )
+    return found
+
+
+def _map(support: Support, coverage: Coverage, splats: Splats) -> str:
+    """The support from above, with what is covered, free and hardly seen."""
+    tint = np.full((*coverage.photos.shape, 3), 0.85)
+    tint[coverage.free] = (0.55, 0.8, 0.55)
+    tint[coverage.covered] = (0.35, 0.4, 0.5)
+    tint[coverage.hidden] = (0.85, 0.3, 0.25)
+    picture = np.repeat(np.repeat(tint.transpose(1, 0, 2)[::-1], 5, axis=0), 5, axis=1)
+    note = (
+        "The surface that things stand on, from above, x to the right and y up: green is free, dark is covered, red is "
+        f"in fewer than {ENOUGH} photos."
+    )
+    return (
+        f'<section aria-labelledby="support"><h2 id="support">Support</h2><p>{html.escape(note)}</p><figure>'
+        f'<img alt="support from above" src="{rgb_image(picture, 420)}"></figure></section>'
+    )
+
+
+def _scene_file(out: Path) -> Path:
+    return out.resolve().parent / f"{out.resolve().name}.yaml"
+
+
+def _recorded_scene(out: Path) -> str | None:
+    """The scene that the asset's verdict holds, if any."""
+    try:
+        scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return scene.replace("{folder}", out.resolve().name) if isinstance(scene, str) else None
+
+
+def _with_scene(done: AssetResult, before: str | None) -> AssetResult:
+    """The result, with its scene file on disk; one that neither this run nor the last one wrote is kept."""
+    text, path = _recorded_scene(done.folder), _scene_file(done.folder)
+    if text is None:
+        return done
+    if path.exists() and path.read_text() not in (text, before):
+        changed = f"{path}: holds another scene and is kept as it is; remove it to have it written anew"
+        return replace(done, scene=path, warnings=(*done.warnings, changed))
+    write_text(path, text)
+    return replace(done, scene=path)

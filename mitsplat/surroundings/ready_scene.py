@@ -1,0 +1,112 @@
+"""A scene file that drops things where a photographed support is free, seen as photos saw it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mitsplat.arrays import Float64Array
+from mitsplat.camera import Camera
+from mitsplat.surroundings.supports import Support
+
+_MARGIN = 0.05
+"""Room between the drop region and what is around it, at most [m]."""
+_WIDEST = 0.6
+"""Longest side of the drop region [m]."""
+_GAP = 40.0
+"""Directions without photos from which the scene has none either [degrees]."""
+_THICK = 0.04
+"""Of the boxes [m]."""
+
+Region = tuple[float, float, float, float]
+"""Least and largest x, least and largest y [m]."""
+
+
+def scene_text(name: str, folder: str, supports: Sequence[Support], free: Region, cameras: Sequence[Camera]) -> str:
+    """A scene file.
+
+    Args:
+        name: Of the environment.
+        folder: Of its asset, as the scene file names it.
+        supports: In the asset's frame [m]; things are dropped on the first, whose top is z = 0.
+        free: Part of that where nothing stands.
+        cameras: Of the photos, in the same frame.
+    """
+    margin = min(_MARGIN, 0.25 * min(free[1] - free[0], free[3] - free[2]))
+    spans = []
+    for low, high in (free[:2], free[2:]):
+        half = min((high - low) / 2 - margin, _WIDEST / 2)
+        spans.append(((low + high) / 2 - half, (low + high) / 2 + half))
+    (x0, x1), (y0, y1) = spans
+    target = np.array([(x0 + x1) / 2, (y0 + y1) / 2, 0.02])
+    near, far, low, high, start, end = _seen_from(cameras, target)
+    middle = cameras[len(cameras) // 2]
+    fov = float(np.degrees(2 * np.arctan(middle.width / 2 / middle.fx)))
+    boxes = "\n".join(
+        f"  - {{name: {_name(number)}, box: {{size: [{_m(s.size[0])}, {_m(s.size[1])}, {_THICK}], "
+        f"position: [{_m(s.pose[0, 3])}, {_m(s.pose[1, 3])}, {_m(s.height - _THICK / 2)}], "
+        f"rotate: [0, 0, {s.angle:.2f}]}}}}"
+        for number, s in enumerate(supports)
+    )
+    return _SCENE.format(
+        name=name, folder=folder, boxes=boxes, x0=_m(x0), x1=_m(x1), y0=_m(y0), y1=_m(y1), margin=_m(margin),
+        tx=_m(target[0]), ty=_m(target[1]), near=_m(near), far=_m(far), low=f"{low:.0f}", high=f"{high:.0f}",
+        start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
+    )  # fmt: skip
+
+
+def _seen_from(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, float, float, float, float, float]:
+    """Range of distances [m], of heights and of directions [degrees] that most photos of a place have."""
+    away = np.array([camera.centre for camera in cameras]) - target
+    distance = np.linalg.norm(away, axis=1)
+    height = np.degrees(np.arcsin(np.clip(away[:, 2] / distance, -1, 1)))
+    turn = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])))
+    gaps = np.diff(np.append(turn, turn[0] + 360))
+    widest = int(gaps.argmax())
+    start, end = 0.0, 360.0
+    if gaps[widest] > _GAP:
+        start = float(np.append(turn, turn[0] + 360)[widest + 1]) % 360
+        end = start + 360 - float(gaps[widest])
+    near, far = np.quantile(distance, (0.15, 0.7))
+    low, high = np.quantile(height, (0.2, 0.9)).clip(10, 80)
+    return float(near), max(float(far), 1.05 * float(near)), float(low), max(float(high), float(low) + 2), start, end
+
+
+def _name(number: int) -> str:
+    return "support" if number == 0 else f"surface{number}"
+
+
+def _m(length: float) -> str:
+    """A length to a tenth of a millimetre."""
+    return f"{round(float(length), 4) + 0.0:g}"
+
+
+_SCENE = """\
+# Solids of random materials dropped where {name} is free. Put assets of your own in their place.
+name: {name}
+environment: {folder}
+
+shapes:
+  # Level surfaces that were found in it; the splats show them, and these carry what falls there.
+{boxes}
+
+objects:
+  - {{pool: primitives, count: [3, 6]}}
+region: {{min: [{x0}, {y0}, 0.04], max: [{x1}, {y1}, 0.25]}}
+enclosure: {{margin: {margin}}}
+settle: {{stepper: mujoco}}
+
+camera:  # about as the photos were taken
+  kind: hemisphere
+  target: [{tx}, {ty}, 0.02]
+  radius: [{near}, {far}]
+  elevation: [{low}, {high}]
+  azimuth: [{start}, {end}]
+  accept: {{clearance: 0.1}}
+  intrinsics: {{fov_x: {fov}}}
+lights:  # of a room; put those of yours in their place
+  - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
+  - {{kind: environment, radiance: 0.4}}
+output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
+"""

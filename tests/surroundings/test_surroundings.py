@@ -1,0 +1,240 @@
+"""A place whose table, things and gaps are known, from its splats to an environment and a scene file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsplat.arrays import Float64Array
+from mitsplat.asset import Asset
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.checks.preflight import check_scene
+from mitsplat.reconstruct.evaluation import show_asset
+from mitsplat.reconstruct.pipeline import AssetJob, AssetResult
+from mitsplat.reconstruct.reconstruct import ReconstructSettings
+from mitsplat.reconstruct.surface import SurfaceSettings
+from mitsplat.scene.scene import load_scene
+from mitsplat.splats import Splats
+from mitsplat.surroundings import make_surroundings
+from mitsplat.surroundings.coverage import ENOUGH, find_coverage, find_holes, free_rectangle
+from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
+from mitsplat.surroundings.supports import find_supports, fit_plane
+
+TABLE, HEIGHT = (1.2, 0.7), 0.11
+"""Of the table [m], whose middle is above the origin; the floor is 0.8 m below it."""
+BOX = (0.3, 0.2, 0.2)
+"""Stands in the table's corner at +x, +y [m]."""
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def sheet(size: tuple[float, float], step: float, seed: int) -> Splats:
+    """Flat Gaussians over a rectangle in z = 0, of mottled colours."""
+    rng = np.random.default_rng(seed)
+    x, y = (np.arange(-edge / 2 + step / 2, edge / 2, step) for edge in size)
+    means = np.stack(np.meshgrid(x, y, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    sh = rng.uniform(-0.8, 0.8, (len(means), 1, 3)).repeat(1, axis=1)
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (len(means), 1)),
+        scales=np.tile(np.array([0.7 * step, 0.7 * step, 1e-3], dtype=np.float32), (len(means), 1)),
+        opacities=np.full(len(means), 0.95, dtype=np.float32),
+        sh=sh.astype(np.float32),
+    )
+
+
+def placed(splats: Splats, middle: tuple[float, float, float], axis: int = 2) -> Splats:
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.roll(np.eye(3), axis - 2, axis=0)
+    matrix[:3, 3] = middle
+    return splats.transformed(matrix)
+
+
+def place() -> Splats:
+    """Table, a box on it, and the floor."""
+    corner = (TABLE[0] / 2 - BOX[0] / 2, TABLE[1] / 2 - BOX[1] / 2)
+    sides = [
+        placed(sheet((BOX[1], BOX[2]), 0.02, 3), (corner[0] - BOX[0] / 2, corner[1], HEIGHT + BOX[2] / 2), 0),
+        placed(sheet((BOX[2], BOX[0]), 0.02, 4), (corner[0], corner[1] - BOX[1] / 2, HEIGHT + BOX[2] / 2), 1),
+        placed(sheet(BOX[:2], 0.02, 5), (*corner, HEIGHT + BOX[2])),
+    ]
+    table, floor = placed(sheet(TABLE, 0.02, 1), (0, 0, HEIGHT)), placed(sheet((3, 3), 0.06, 2), (0, 0, HEIGHT - 0.8))
+    return Splats.concatenate([table, floor, *sides])
+
+
+def cameras() -> list[Camera]:
+    """From the side of -y, none of which looks at what lies to the right beyond x = 0.45."""
+    found = []
+    for number in range(24):
+        turn, height = np.radians(-150 + 5 * number), np.radians((30, 50, 70)[number % 3])
+        eye = 0.9 * np.array([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)])
+        found.append(Camera.look_at(eye + np.array([0, 0, HEIGHT]), (-0.1, 0, HEIGHT), width=160, height=120, fov_x=65))
+    return found
+
+
+@pytest.fixture(scope="module")
+def splats() -> Splats:
+    return place()
+
+
+@pytest.fixture(scope="module")
+def captured(splats: Splats, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    folder = tmp_path_factory.mktemp("photos")
+    photos = []
+    for number, view in enumerate(show_asset(splats, None, cameras())):
+        file = folder / f"photo{number:02}.png"
+        Image.fromarray(np.rint(255 * view.render.clip(0, 1)).astype(np.uint8)).save(file)
+        photos.append(Photo(file.name, file, view.camera, seen=np.arange(4, dtype=np.int32)))
+    points = np.array([[x, y, HEIGHT] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
+    return Capture(tuple(photos), points, np.full((4, 3), 128, dtype=np.uint8), units="metre", up="z")
+
+
+def test_the_table_is_found_with_its_edges(splats: Splats) -> None:
+    found = find_supports(surface_points(depth_views(splats, cameras())), UP, 0.9, within=30)
+    table = found[0]
+    assert abs(table.height - HEIGHT) < 1e-3 and table.tilt < 0.2
+    assert np.allclose(table.size, TABLE, atol=0.05)
+    assert np.allclose(table.pose[:2, 3], 0, atol=0.03)
+    assert table.looked_at > 0.5
+
+
+def test_a_leaning_table_is_found_as_it_leans(splats: Splats) -> None:
+    lean = np.eye(4)
+    lean[1:3, 1:3] = [[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]
+    turned = [replace(camera, world_from_camera=lean @ camera.world_from_camera) for camera in cameras()]
+    points = surface_points(depth_views(splats.transformed(lean), turned))
+    assert find_supports(points, UP, 0.9, within=30)[0].pose[:3, 2] == pytest.approx(lean[:3, 2], abs=0.003)
+    assert not [one for one in find_supports(points, UP, 0.9, within=5) if one.looked_at > 0.1]
+
+
+def test_a_plane_is_fitted_past_what_stands_on_it() -> None:
+    rng = np.random.default_rng(1)
+    flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), rng.normal(0, 1e-3, 4000)])
+    clutter = np.column_stack([rng.uniform(0, 1, (1500, 2)), rng.uniform(0, 0.02, 1500)])
+    normal, height, spread = fit_plane(np.concatenate([flat, clutter]), UP, 0.004, 0.02)
+    assert np.degrees(np.arccos(normal[2])) < 0.1 and abs(height) < 5e-4
+    assert spread < 3e-3
+
+
+def test_what_stands_on_it_is_covered_and_what_nobody_saw_is_named(splats: Splats) -> None:
+    shown = [camera for camera in cameras() if camera.centre[0] < -0.2]
+    views = depth_views(splats, shown)
+    points = surface_points(depth_views(splats, cameras()))
+    table = find_supports(points, UP, 0.9, within=5)[0]
+    coverage = find_coverage(table, views, points, 0.9)
+    middles = coverage.middle(np.argwhere(np.ones(coverage.photos.shape))).reshape(*coverage.photos.shape, 2)
+    x, y = middles[..., 0], middles[..., 1]
+    inside = (x > TABLE[0] / 2 - BOX[0] + 0.03) & (y > TABLE[1] / 2 - BOX[1] + 0.03)
+    assert coverage.covered[inside & (x < 0.54) & (y < 0.29)].mean() > 0.95
+    assert not coverage.covered[(x < 0.1) & (y < 0)].any()
+    assert coverage.photos[(np.abs(x + 0.1) < 0.1) & (np.abs(y) < 0.1)].min() >= ENOUGH
+    named = [(str(number), camera) for number, camera in enumerate(cameras())]
+    holes = find_holes(table, coverage, splats, named)
+    if coverage.hidden.any():
+        assert all(hole.near is not None and hole.shown > 0.5 for hole in holes)
+    behind = np.zeros_like(coverage.covered)
+    behind[60:70, 5:20] = True
+    gap = replace(coverage, photos=np.where(behind, 0, coverage.photos + ENOUGH), covered=coverage.covered & ~behind)
+    (hole,) = find_holes(table, gap, splats, named)
+    assert hole.area == pytest.approx(behind.sum() * coverage.cell.prod()) and hole.shown > 0.9
+
+
+def test_the_largest_free_rectangle_is_that_of_all_rectangles() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        free = rng.random((7, 9)) < 0.7
+        areas = [
+            (b - a) * (d - c)
+            for a in range(7) for b in range(a + 1, 8) for c in range(9) for d in range(c + 1, 10)
+            if free[a:b, c:d].all()
+        ]  # fmt: skip
+        found = free_rectangle(free)
+        assert found is not None and free[found[0] : found[1], found[2] : found[3]].all()
+        assert (found[1] - found[0]) * (found[3] - found[2]) == max(areas)
+    assert free_rectangle(np.zeros((3, 3), dtype=bool)) is None
+
+
+def speck(place: Float64Array, size: float, opacity: float) -> Splats:
+    one = sheet((0.02, 0.02), 0.02, 9)
+    scales = np.full((1, 3), size, dtype=np.float32)
+    return replace(one, means=np.float32(place[None]), scales=scales, opacities=np.float32([opacity]))
+
+
+def test_specks_in_free_space_and_haze_go_and_surfaces_stay(splats: Splats, captured: Capture) -> None:
+    camera = captured.photos[9].camera
+    close, amid = camera.centre + 0.1 * camera.world_from_camera[:3, 2], np.array([-0.1, 0, HEIGHT + 0.3])
+    dirty = Splats.concatenate(
+        [splats, speck(close, 0.01, 0.9), speck(amid, 0.01, 0.4), speck(np.array([0, 0, 0.5]), 2.5, 0.9)]
+    )
+    cleaned, removed = remove_floaters(dirty, captured.training, 0.9)
+    assert removed["haze"] == 1 and removed["specks"] >= 2
+    for place in (close, amid):
+        assert not (np.linalg.norm(cleaned.means - place, axis=1) < 1e-3).any()
+    assert len(splats) - len(cleaned) < 0.02 * len(splats) + removed["in no photo"]
+    floating, _ = find_unsupported(splats, depth_views(splats, [p.camera for p in captured.training]), 0.27)
+    assert floating.mean() < 0.01
+
+
+@pytest.fixture(scope="module")
+def made(splats: Splats, captured: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssetResult]:
+    folder = tmp_path_factory.mktemp("made")
+    captured.save(folder / "capture")
+    (folder / "fit").mkdir()
+    splats.save(folder / "fit" / "splats.ply")
+    (folder / "fit" / "fit.json").write_text('{"psnr": 31.5}')
+    settings = ReconstructSettings(surface=SurfaceSettings(voxels=64, faces=3000), view_size=160, verdict_size=160)
+    job = AssetJob(name="cell", kind="environment", settings=settings)
+    return folder, make_surroundings(folder / "capture", folder / "fit", folder / "cell", job)
+
+
+def test_the_asset_has_its_table_in_z_0(made: tuple[Path, AssetResult]) -> None:
+    folder, done = made
+    asset = Asset.load(folder / "cell")
+    record = json.loads((folder / "cell" / "verdict.json").read_text())
+    support = record["supports"][0]
+    assert np.allclose(support["pose"], np.eye(4), atol=1e-6) and np.allclose(support["size"], TABLE, atol=0.05)
+    expected = np.eye(4)
+    expected[2, 3] = -HEIGHT
+    assert np.allclose(record["asset_from_capture"], expected, atol=0.03)
+    assert record["asset_from_capture"][2][3] == pytest.approx(-HEIGHT, abs=1e-3)
+    assert asset.mesh is not None and asset.kind == "environment" and asset.capture_light == "scene"
+    middle = np.abs(asset.mesh.vertices[:, :2]).max(axis=1) < 0.2
+    assert np.abs(asset.mesh.vertices[middle & (asset.mesh.vertices[:, 2] > -0.1), 2]).max() < 1e-6
+    assert done.verdict.psnr is not None and done.verdict.psnr > 35  # its own pictures, not what the fit reported
+    assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
+
+
+def test_its_scene_is_valid_and_drops_beside_the_box(made: tuple[Path, AssetResult]) -> None:
+    folder, done = made
+    assert done.scene == folder / "cell.yaml"
+    scene = load_scene(folder / "cell.yaml")
+    assert scene.spec.region.max[0] < TABLE[0] / 2 and scene.spec.region.min[0] > -TABLE[0] / 2
+    corner = np.array([TABLE[0] / 2 - BOX[0], TABLE[1] / 2 - BOX[1]])
+    assert (np.array(scene.spec.region.max[:2]) < corner).any()
+
+
+@pytest.mark.slow
+def test_its_scene_has_nothing_questionable(made: tuple[Path, AssetResult]) -> None:
+    assert [finding for finding in check_scene(load_scene(made[0] / "cell.yaml")) if not finding.ok] == []
+
+
+def test_a_changed_scene_is_kept_and_a_lost_one_written_again(made: tuple[Path, AssetResult]) -> None:
+    folder, _done = made
+    text = (folder / "cell.yaml").read_text()
+    job = AssetJob(
+        name="cell", kind="environment",
+        settings=ReconstructSettings(surface=SurfaceSettings(voxels=64, faces=3000), view_size=160, verdict_size=160),
+    )  # fmt: skip
+    arguments = folder / "capture", folder / "fit", folder / "cell", job
+    (folder / "cell.yaml").unlink()
+    assert make_surroundings(*arguments).kept and (folder / "cell.yaml").read_text() == text
+    (folder / "cell.yaml").write_text(text + "seed: 3\n")
+    again = make_surroundings(*arguments)
+    assert "is kept as it is" in again.warnings[-1] and (folder / "cell.yaml").read_text().endswith("seed: 3\n")
+    (folder / "cell.yaml").write_text(text)

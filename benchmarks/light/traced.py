@@ -25,10 +25,10 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
 from mitsplat.frames.camera_response import develop, light_image
-from mitsplat.frames.frame import Renderer, light_properties, plan_frame
+from mitsplat.frames.frame import Renderer, light_properties
 from mitsplat.quality import resolve_quality
 from mitsplat.render.layers import Layers, ensure_variant, make_integrator, render_layers
-from mitsplat.scene.scene import FramePlan, layout_of
+from mitsplat.scene.scene import FramePlan, layout_of, plan_frame
 
 ensure_variant()
 import drjit as dr  # noqa: E402
@@ -82,16 +82,49 @@ class Pictures:
         image = develop(linear, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed)
         return image.astype(np.float32)
 
-    def render(self, integrator: Any, seed: int) -> tuple[list[Layers], list[float]]:
-        """Layers and processor seconds of each frame, after one that compiles."""
-        render_layers(integrator, *self.frames[0], seed=seed)
-        layers, seconds = [], []
-        for frame in self.frames:
-            start = time.process_time()
-            layers.append(render_layers(integrator, *frame, seed=seed))
-            dr.sync_thread()
-            seconds.append(time.process_time() - start)
-        return layers, seconds
+    def render(self, number: int, integrator: Any, seed: int) -> tuple[Layers, float]:
+        """Layers and processor seconds of a frame."""
+        start = time.process_time()
+        layers = render_layers(integrator, *self.frames[number], seed=seed)
+        dr.sync_thread()
+        return layers, time.process_time() - start
+
+
+class Row:
+    """One way to trace light: what it costs and how far off it is, frame by frame."""
+
+    def __init__(self, name: str, by_neighbours: bool, integrator: Any) -> None:
+        self.name, self.by_neighbours, self.integrator = name, by_neighbours, integrator
+        self.seconds: list[float] = []
+        self.errors: dict[str, list[float]] = {"objects": [], "shadows": [], "picture": []}
+
+    def render(self, pictures: Pictures, number: int) -> tuple[Layers, float]:
+        """Layers and processor seconds of a frame."""
+        with filtered(self.by_neighbours):
+            return pictures.render(number, self.integrator, 1)
+
+    def compare(self, pictures: Pictures, number: int, truth: Layers, without: float) -> None:
+        """Add a frame, which takes so many seconds without light."""
+        layers, seconds = self.render(pictures, number)
+        self.seconds.append(seconds - without)
+        apart = pictures.developed(number, layers) - pictures.developed(number, truth)
+        off = layers.light.mean(axis=-1) - truth.light.mean(axis=-1)
+        objects = truth.instance > 0
+        shadow = ~objects & (truth.light.mean(axis=-1) < 0.99)
+        for where, squares in (("picture", apart**2), ("objects", off[objects] ** 2), ("shadows", off[shadow] ** 2)):
+            self.errors[where].append(float(np.mean(squares)))
+
+    def tell(self) -> None:
+        """Print and keep it."""
+        cost = float(np.median(self.seconds))
+        rms = {where: float(np.sqrt(np.mean(values))) for where, values in self.errors.items()}
+        psnr = 20 * np.log10(255 / rms.pop("picture"))
+        figure(cost, "s", self.name, "cpu")
+        figure(psnr, "dB", self.name, "picture")
+        for where, error in rms.items():
+            figure(error, "", self.name, where)
+        errors_said = "   ".join(f"{where} {error:.4f}" for where, error in rms.items())
+        print(f"{self.name:32} {cost:6.2f} CPU s   {errors_said}   picture {psnr:.1f} dB", flush=True)
 
 
 def main() -> None:
@@ -105,40 +138,27 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> None:
-    """Print and keep the rows."""
+    """Print and keep the rows, whose times are taken in turns: other work on the machine delays all of them alike."""
     pictures = Pictures(args.scene, args.frames)
-    with filtered(False):
-        exact, _ = pictures.render(pictures.integrator(shadow_error=0, shadow_samples=args.truth), 0)
-    without = pictures.render(pictures.integrator(shadow="none"), 0)[1]
+    rows = [Row(f"{n} rays everywhere", False, _everywhere(pictures, n)) for n in (1, 4, 16, 64)]
+    rows += [Row(f"{n} rays everywhere, filtered", True, _everywhere(pictures, n)) for n in (4, 16)]
+    rows += [Row(f"error {e}", True, pictures.integrator(shadow_error=e)) for e in (0.1, 0.06, 0.03, 0.015)]
+    dark, exact = pictures.integrator(shadow="none"), _everywhere(pictures, args.truth)
+    for row in rows:
+        row.render(pictures, 0)  # compiles
+    pictures.render(0, dark, 1)
+    for number in range(args.frames):
+        with filtered(False):
+            truth, _ = pictures.render(number, exact, 0)
+        without = float(np.median([pictures.render(number, dark, 1)[1] for _ in range(3)]))
+        for row in rows:
+            row.compare(pictures, number, truth, without)
+    for row in rows:
+        row.tell()
 
-    def row(name: str, by_neighbours: bool, **properties: Any) -> None:
-        with filtered(by_neighbours):
-            found, seconds = pictures.render(pictures.integrator(**properties), 1)
-        cost = float(np.median(np.subtract(seconds, without)))
-        errors: dict[str, list[float]] = {"objects": [], "shadows": [], "picture": []}
-        for number, (layers, truth) in enumerate(zip(found, exact, strict=True)):
-            apart = pictures.developed(number, layers) - pictures.developed(number, truth)
-            errors["picture"].append(np.mean(apart**2))
-            off = layers.light.mean(axis=-1) - truth.light.mean(axis=-1)
-            objects = truth.instance > 0
-            shadow = ~objects & (truth.light.mean(axis=-1) < 0.99)
-            errors["objects"].append(np.mean(off[objects] ** 2))
-            errors["shadows"].append(np.mean(off[shadow] ** 2))
-        rms = {where: float(np.sqrt(np.mean(values))) for where, values in errors.items()}
-        psnr = 20 * np.log10(255 / rms.pop("picture"))
-        figure(cost, "s", name, "cpu")
-        figure(psnr, "dB", name, "picture")
-        for where, error in rms.items():
-            figure(error, "", name, where)
-        errors_said = "   ".join(f"{where} {error:.4f}" for where, error in rms.items())
-        print(f"{name:32} {cost:6.2f} CPU s   {errors_said}   picture {psnr:.1f} dB", flush=True)
 
-    for rays in (1, 4, 16, 64):
-        row(f"{rays} rays everywhere", False, shadow_error=0, shadow_samples=rays)
-    for rays in (4, 16):
-        row(f"{rays} rays everywhere, filtered", True, shadow_error=0, shadow_samples=rays)
-    for error in (0.1, 0.06, 0.03, 0.015):
-        row(f"error {error}", True, shadow_error=error)
+def _everywhere(pictures: Pictures, rays: int) -> Any:
+    return pictures.integrator(shadow_error=0, shadow_samples=rays)
 
 
 if __name__ == "__main__":

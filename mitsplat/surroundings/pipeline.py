@@ -36,6 +36,8 @@ _NEAR = 3.0
 """Distance from what the cameras look at, in their own, beyond which is background: shown, but no part of the mesh."""
 _TURNED = 30.0
 """Angle to the capture's vertical up to which a surface may be the support [degrees]."""
+_ANYHOW = 55.0
+"""The same to one of the six axes, by which every direction is looked in, where nothing says where up is [degrees]."""
 _LEVEL = 2.0
 """Angle to the support up to which other surfaces are level [degrees]."""
 _ROUGH = 0.03
@@ -99,6 +101,10 @@ def reconstruct_surroundings(
     splats, removed = remove_floaters(splats, capture.training, scale)
     points = surface_points(depth_views(splats, cameras))
     found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_TURNED)
+    if not found and capture.up == "unknown":
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        anyhow = (find_supports(points, axis, scale, within=_ANYHOW) for axis in axes)
+        found = max(anyhow, key=lambda supports: supports[0].looked_at if supports else 0.0)
     motion: Float64Array = np.eye(4)
     if found:
         motion = np.asarray(np.linalg.inv(found[0].pose))

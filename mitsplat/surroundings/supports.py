@@ -26,6 +26,7 @@ _TOLERANCE = 0.008
 _SMALLEST = 0.02
 """Share of the upward points from which a plane is looked into."""
 _MOST = 6
+"""Planes that are looked for."""
 _CELL = 0.01
 """Edge of the cells that parts of a plane are found by, as a share of the typical depth."""
 _RIM = 0.5
@@ -110,7 +111,8 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
         inside = left & (np.abs(places @ normal - height) < _TOLERANCE * scale)
         inside &= normals @ normal > np.cos(np.radians(_SAME))
         left &= np.abs(places @ normal - height) >= 2 * _TOLERANCE * scale
-        found += _parts(places[inside], weights[inside], normal, height, spread, up, scale)
+        if inside.any():
+            found += _parts(places[inside], weights[inside], normal, height, spread, up, scale)
     found = [support for support in found if support.filled >= _FILLED]
     return sorted(found, key=lambda support: -support.looked_at)
 

@@ -25,6 +25,7 @@ from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.coverage import ENOUGH, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
+from mitsplat.surroundings.pipeline import reconstruct_surroundings
 from mitsplat.surroundings.supports import find_supports, fit_plane
 
 TABLE, HEIGHT = (1.2, 0.7), 0.11
@@ -32,6 +33,7 @@ TABLE, HEIGHT = (1.2, 0.7), 0.11
 BOX = (0.3, 0.2, 0.2)
 """Stands in the table's corner at +x, +y [m]."""
 UP = np.array([0.0, 0.0, 1.0])
+SMALL = ReconstructSettings(surface=SurfaceSettings(voxels=64, faces=3000), view_size=160, verdict_size=160)
 
 
 def sheet(size: tuple[float, float], step: float, seed: int) -> Splats:
@@ -188,8 +190,7 @@ def made(splats: Splats, captured: Capture, tmp_path_factory: pytest.TempPathFac
     (folder / "fit").mkdir()
     splats.save(folder / "fit" / "splats.ply")
     (folder / "fit" / "fit.json").write_text('{"psnr": 31.5}')
-    settings = ReconstructSettings(surface=SurfaceSettings(voxels=64, faces=3000), view_size=160, verdict_size=160)
-    job = AssetJob(name="cell", kind="environment", settings=settings)
+    job = AssetJob(name="cell", kind="environment", settings=SMALL)
     return folder, make_surroundings(folder / "capture", folder / "fit", folder / "cell", job)
 
 
@@ -210,6 +211,17 @@ def test_the_asset_has_its_table_in_z_0(made: tuple[Path, AssetResult]) -> None:
     assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
 
 
+def test_up_is_the_tables_where_nothing_says_where_it_is(splats: Splats, captured: Capture) -> None:
+    fallen = np.eye(4)
+    fallen[:3, :3] = np.roll(np.eye(3), 1, axis=0)
+    capture = replace(captured.transformed(fallen), up="unknown", units="unknown")
+    job = AssetJob(name="cell", kind="environment", settings=SMALL)
+    found = reconstruct_surroundings(capture, splats.transformed(fallen), job, None, None, None)
+    assert (found.asset_from_capture @ fallen)[2] == pytest.approx([0, 0, 1, -HEIGHT], abs=2e-3)
+    assert "scene" not in found.record
+    assert any("how large it is is unknown" in sentence for sentence in found.verdict.misses())
+
+
 def test_its_scene_is_valid_and_drops_beside_the_box(made: tuple[Path, AssetResult]) -> None:
     folder, done = made
     assert done.scene == folder / "cell.yaml"
@@ -227,10 +239,7 @@ def test_its_scene_has_nothing_questionable(made: tuple[Path, AssetResult]) -> N
 def test_a_changed_scene_is_kept_and_a_lost_one_written_again(made: tuple[Path, AssetResult]) -> None:
     folder, _done = made
     text = (folder / "cell.yaml").read_text()
-    job = AssetJob(
-        name="cell", kind="environment",
-        settings=ReconstructSettings(surface=SurfaceSettings(voxels=64, faces=3000), view_size=160, verdict_size=160),
-    )  # fmt: skip
+    job = AssetJob(name="cell", kind="environment", settings=SMALL)
     arguments = folder / "capture", folder / "fit", folder / "cell", job
     (folder / "cell.yaml").unlink()
     assert make_surroundings(*arguments).kept and (folder / "cell.yaml").read_text() == text

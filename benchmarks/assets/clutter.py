@@ -277,7 +277,7 @@ def measure(args: argparse.Namespace) -> int:
     named, poses = by_name(views), None
     if args.known_poses:
         poses = args.out / "transforms.json"
-        poses.write_text(json.dumps(_transforms(named)))
+        poses.write_text(json.dumps(transforms(named)))
     picks: tuple[str, ...] = ()
     if args.beside:
         name, camera = next(iter(named.items()))
@@ -309,7 +309,7 @@ def measure(args: argparse.Namespace) -> int:
     return missed
 
 
-def _transforms(views: Mapping[str, Camera]) -> dict[str, Any]:
+def transforms(views: Mapping[str, Camera]) -> dict[str, Any]:
     """Cameras as a ``transforms.json`` has them."""
     one = next(iter(views.values()))
     frames = [

@@ -113,8 +113,8 @@ def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def speckled(mesh: trimesh.Trimesh) -> Any:
-    """The solid with matt speckles of 3 and 10 mm on its vertices."""
+def speckled(mesh: trimesh.Trimesh, *, contrast: float = 1.6, finish: Mapping[str, Any] | None = None) -> Any:
+    """The solid with speckles of 3 and 10 mm on its vertices, matt or with the ``finish`` of a principled BSDF."""
     from mitsplat.plugins.device import plain_mesh
 
     fine = mesh.subdivide_to_size(0.0012)
@@ -127,9 +127,13 @@ def speckled(mesh: trimesh.Trimesh) -> Any:
         shade += 0.5 * np.stack([map_coordinates(grid[..., c], places.T, order=1) for c in range(3)], axis=1)
     properties = mi.Properties()
     colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": colour})
+    matt = {"type": "diffuse", "reflectance": colour}
+    properties["bsdf"] = mi.load_dict(
+        matt if finish is None else {"type": "principled", "base_color": colour, **finish}
+    )
     shape = plain_mesh(fine, properties)
-    shape.add_attribute("vertex_color", 3, np.ravel(np.clip(1.6 * shade - 0.3, 0.03, 0.9)).astype(np.float32))
+    painted = np.clip(0.5 + contrast * (shade - 0.5), 0.03, 0.9)
+    shape.add_attribute("vertex_color", 3, np.ravel(painted).astype(np.float32))
     return shape
 
 

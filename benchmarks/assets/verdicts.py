@@ -348,23 +348,28 @@ def _tell(name: str, found: Mapping[str, Any]) -> None:
 
 
 def summarise(results: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print and keep rank correlations, and where verdict and truth agree."""
+    """Print and keep rank correlations, and where verdict and truth agree on the assets that were made."""
     for name, truth in STANDS_FOR:
         value, low, high, count = rank(list(results.values()), name, truth)
         print(f"{name:12} for {truth:10} {value:6.2f}  [{low:.2f}, {high:.2f}] of {count}")
         for key, one in (("correlation", value), ("low", low), ("high", high), ("captures", count)):
             figure(one, "", "rank", name, truth, key)
-    passed = {name for name, found in results.items() if found["truth"] is not None and not found["misses"]}
-    good = {name for name, found in results.items() if found["truth"] is not None and is_good(found["truth"])}
-    figure(len(results), "", "captures")
-    figure(len(passed), "", "passed")
-    figure(len(good), "", "good")
-    figure(1 - len(passed ^ good) / len(results), "", "agreement")
-    for what, names in (("false passes", passed - good), ("false misses", good - passed)):
+    refused = [name for name, found in results.items() if found["truth"] is None]
+    made = {name: found for name, found in results.items() if found["truth"] is not None}
+    passed = {name for name, found in made.items() if not found["misses"]}
+    good = {name for name, found in made.items() if is_good(found["truth"])}
+    share = 1 - len(passed ^ good) / max(1, len(made))
+    for what, value in (("assets", len(made)), ("passed", len(passed)), ("good", len(good)), ("agreement", share)):
+        figure(value, "", what)
+        print(f"{what}: {value:.3g}")
+    for what, names in (
+        ("refused", refused),
+        ("false passes", [name for name in made if name in passed - good]),
+        ("false misses", [name for name in made if name in good - passed]),
+    ):
         figure(len(names), "", what)
-        figure(", ".join(name for name in results if name in names) or "none", "", what, "named")
-        print(f"{what}: {', '.join(sorted(names)) or 'none'}")
-    print(f"verdict and truth agree on {1 - len(passed ^ good) / len(results):.0%} of {len(results)}")
+        figure(", ".join(names) or "none", "", what, "named")
+        print(f"{what}: {', '.join(names) or 'none'}")
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ class Pairs:
 
 def pair_records(
     records: Any,
+    near: Any | None,
     least: Any,
     box: Any,
     view: View,
@@ -108,7 +109,7 @@ def pair_records(
     def in_view(tile: Any, active: Any = True) -> Any:
         return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile, active)
 
-    depth_of = depths_by_tile(record, ellipsoid, in_view(first_tile, length > 0), view, quality)
+    depth_of = depths_by_tile(record, near, ellipsoid, in_view(first_tile, length > 0), view, quality)
 
     def one_tile(k: Any) -> tuple[Any]:
         tile, pair = first_tile + k, pair_of + k

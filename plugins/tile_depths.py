@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.plugins.gaussian import LOG2_E_HALF
+from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD
 from mitsplat.plugins.rays import View
 from mitsplat.quality import Quality
 
@@ -36,20 +36,54 @@ def depth_of_level(level: Any, view: View) -> Any:
     return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
 
-def depths_by_tile(record: Any, ellipsoid: Any, first: Any, view: View, quality: Quality) -> Callable[[Any], Any]:
+def depths_by_tile(
+    record: Any, near: Any | None, ellipsoid: Any, first: Any, view: View, quality: Quality
+) -> Callable[[Any], Any]:
     """Function from a tile in the row of tiles of the ``first`` one to a record's depth there, by which it is sorted.
 
-    In an undistorted view, most of it is the same for a whole row.
+    In an undistorted view, most of it is the same for a whole row. ``near`` is as in
+    :class:`mitsplat.plugins.tiles.TileLists`.
     """
     if quality.order == "ray":
         return lambda tile: least_depth(record, ellipsoid, view.tile_slopes(tile))
+    at_camera = None if near is None else _depths_at_camera(record, near)
     if view.distortion:
-        return lambda tile: depth_where_seen(record, view.tile_slopes(tile))
+
+        def depth_of(tile: Any) -> Any:
+            slopes = view.tile_slopes(tile)
+            depth = depth_where_seen(record, slopes)
+            if at_camera is None:
+                return depth
+            lo_u, hi_u, lo_v, hi_v = slopes
+            return dr.select(record[2] < 0, at_camera(0.5 * (lo_u + hi_u), 0.5 * (lo_v + hi_v)), depth)
+
+        return depth_of
     (first_u, step_u, width), (first_v, step_v, height) = view.tile_grid()
     row = first // view.tiles_x
     depth_around, begin = _depths_where_seen(record, width, height), row * view.tiles_x
-    middle_u, middle_v = first_u - record[0], dr.fma(mi.Float(row), step_v, first_v) - record[1]
-    return lambda tile: depth_around(dr.fma(mi.Float(tile - begin), step_u, middle_u), middle_v)
+    v = dr.fma(mi.Float(row), step_v, first_v)
+
+    def depth_in_row(tile: Any) -> Any:
+        u = dr.fma(mi.Float(tile - begin), step_u, first_u)
+        depth = depth_around(u - record[0], v - record[1])
+        return depth if at_camera is None else dr.select(record[2] < 0, at_camera(u, v), depth)
+
+    return depth_in_row
+
+
+def _depths_at_camera(record: Any, near: Any) -> Callable[[Any, Any], Any]:
+    """Function from slopes to the depth of the peak there, of Gaussians that reach the camera's plane.
+
+    They are large against a tile, so that its middle stands for it.
+    """
+    row = dr.select(record[2] < 0, mi.UInt32(record[0]), 0)
+    k = dr.gather(mi.ArrayXf, near, row, shape=(RECORD, dr.width(row)))
+
+    def depth_at(u: Any, v: Any) -> Any:
+        bottom = (k[6] * u + k[7] * v + k[9]) * u + (k[8] * v + k[10]) * v + k[11]
+        return dr.maximum((k[12] * u + k[13] * v + k[14]) / bottom, 0)
+
+    return depth_at
 
 
 def depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
@@ -81,7 +115,7 @@ def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, A
         du = dr.clip(du, middle_u - half_u, middle_u + half_u)
         dv = dr.clip(dv, middle_v - half_v, middle_v + half_v)
         top, bottom = _depth_fraction(record, du, dv)
-        return dr.select(a < 0, 0, record[9] * dr.maximum(top, 0) / bottom)
+        return record[9] * dr.maximum(top, 0) / bottom
 
     return depth_around
 

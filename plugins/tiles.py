@@ -128,7 +128,7 @@ def bin_records(
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    pairs = pair_records(dr.detach(records), least, box, view, quality, chosen, for_gradients)
+    pairs = pair_records(dr.detach(records), near, least, box, view, quality, chosen, for_gradients)
     if pairs is None:
         return _empty(view, chosen, records)
     tiles, own = _numbered(view, chosen)

@@ -427,6 +427,24 @@ def test_nothing_to_see_is_black_and_empty() -> None:
         assert not layers.rgb.any() and not layers.alpha.any() and not layers.depth.any() and not layers.instance.any()
 
 
+@pytest.mark.parametrize("distortion", [(), (0.05, 0.0, 0.0, 0.0)])
+def test_what_reaches_the_camera_from_behind_a_wall_stays_behind_it(distortion: tuple[float, ...]) -> None:
+    x, y = np.meshgrid(np.linspace(-1.2, 1.2, 49), np.linspace(-0.9, 0.9, 37))
+    wall = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    count = len(wall) + 1
+    splats = Splats(
+        means=np.vstack([wall, [0.3, 0.2, 2.4]]).astype(np.float32),
+        quats=np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)),
+        scales=np.vstack([np.tile([0.07, 0.07, 0.002], (count - 1, 1)), [0.9, 0.7, 0.8]]).astype(np.float32),
+        opacities=np.full(count, 0.98, np.float32),
+        sh=np.concatenate([np.full((count - 1, 1, 3), 1.2), np.full((1, 1, 3), -1.2)]).astype(np.float32),
+    )
+    camera = replace(CAMERA, world_from_camera=np.eye(4), distortion=distortion)
+    fast, exact = (render_splats(splats, camera, quality=name).rgb for name in ("fast", "exact"))
+    assert exact.min() > 0.66  # the dark Gaussian, whose ellipsoid holds the camera, is hidden
+    np.testing.assert_allclose(fast, exact, atol=0.02)
+
+
 @pytest.mark.parametrize("samples", [1, 2])
 def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
     from mitsplat.plugins import march, pairs

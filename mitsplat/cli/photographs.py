@@ -369,7 +369,7 @@ def asset(
                 box=box,
             ),
             fit=FitSettings(
-                gaussians=gaussians or (60_000 if whole else 30_000),
+                gaussians=gaussians if gaussians is not None else 60_000 if whole else 30_000,
                 iterations=iterations,
                 budget=None if budget is None else _seconds(budget),
                 masks="off" if whole else "alpha",

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from PIL import Image, ImageSequence
 from ruamel.yaml import YAML
 
 from mitsplat import device as devices
+from mitsplat import surroundings
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings
 from mitsplat.capture.capture import Capture
@@ -710,22 +711,29 @@ def finished(folder: Path, **changes: Any) -> AssetResult:
     return AssetResult(folder, replace(figures, **changes), kept=False)
 
 
+@pytest.mark.parametrize(
+    ("kind", "maker"), [("object", (pipeline, "make_asset")), ("environment", (surroundings, "make_surroundings"))]
+)
 def test_mesh_passes_every_option_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
+    maker: tuple[Any, str],
 ) -> None:
     box_asset("nut").mesh.export(tmp_path / "cad.stl")
     (tmp_path / "matrix.txt").write_text("2 0 0 1\n0 2 0 0\n0 0 2 0\n")
     calls = Calls(finished(tmp_path / "nut"))
-    monkeypatch.setattr(pipeline, "make_asset", calls)
+    monkeypatch.setattr(*maker, calls)
     status = run(
-        "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", "environment",
+        "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", kind,
         "--faces", 500, "--voxels", 64, "--dissent", 1, "--size", 0.1, "--import", tmp_path / "cad.stl",
         "--normalisation", tmp_path / "matrix.txt", "--units", 0.001,
     )  # fmt: skip
     assert status == 0
     capture, fit_folder, out, job = calls.args
     assert (capture, fit_folder, out) == (Path("capture"), Path("fit"), tmp_path / "nut")
-    assert (job.name, job.class_name, job.kind, job.settings.size) == ("m6", "nut", "environment", 0.1)
+    assert (job.name, job.class_name, job.kind, job.settings.size) == ("m6", "nut", kind, 0.1)
     assert job.settings.surface == SurfaceSettings(voxels=64, faces=500, dissent=1)
     assert job.imported.metres_per_unit == 0.001
     np.testing.assert_allclose(job.imported.capture_from_mesh @ [1, 0, 0, 1], [0, 0, 0, 1], atol=1e-12)
@@ -743,22 +751,35 @@ def test_a_missed_threshold_is_status_4_and_a_sentence(
     assert run("mesh", "capture", "fit", "-o", tmp_path, "--units", 0.001) == 2
 
 
-def test_asset_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "maker", "masks"),
+    [
+        ("object", (pipeline, "make_photo_asset"), "alpha"),
+        ("environment", (surroundings, "make_photo_surroundings"), "off"),
+    ],
+)
+def test_asset_passes_every_option_on(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    kind: Literal["object", "environment"],
+    maker: tuple[Any, str],
+    masks: Literal["alpha", "off"],
+) -> None:
     calls = Calls(finished(tmp_path))
-    monkeypatch.setattr(pipeline, "make_photo_asset", calls)
+    monkeypatch.setattr(*maker, calls)
     status = run(
-        "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", "environment", "--size", 0.1,
+        "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", kind, "--size", 0.1,
         "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--gaussians", 70,
         "--iterations", 80, "--budget", "1.5min", "--edge", 90, "--faces", 500, "--seed", 4,
     )  # fmt: skip
     assert status == 0
     photos, out, job = calls.args
     assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
-    assert (job.kind, job.settings.size, job.settings.surface.faces) == ("environment", 0.1, 500)
+    assert (job.kind, job.settings.size, job.settings.surface.faces) == (kind, 0.1, 500)
     assert calls.kwargs["capture"] == CaptureSettings(
-        kind="environment", scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
+        kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
     )
-    assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4)
+    assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4, masks=masks)
 
 
 def test_every_command_and_option_is_documented() -> None:

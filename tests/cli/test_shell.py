@@ -222,8 +222,9 @@ def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Pat
     Status 4 is that of a tiny fit, which misses the thresholds of an asset.
     """
     given, out, _ = captured
-    shutil.copytree(given, desk / "photos/mug")
-    for place in ("captures/mug", "assets/mug/capture"):
+    for name in ("mug", "cell"):
+        shutil.copytree(given, desk / "photos" / name)
+    for place in ("captures/mug", "assets/mug/capture", "assets/cell/capture"):
         shutil.copytree(out, desk / place)
     for words in SHOWN:
         if words[1] in PHOTOGRAPHS or "assets/mug" in words:

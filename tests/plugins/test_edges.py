@@ -187,7 +187,7 @@ def test_both_sides_of_a_border_have_their_own_light() -> None:
 
 
 def test_what_is_too_crowded_is_looked_at_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mitsplat.plugins import edges, tiles
+    from mitsplat.plugins import edges, pairs
 
     scene = scene_of()
     whole = layers_of(scene, CAMERA, FINE)
@@ -195,7 +195,7 @@ def test_what_is_too_crowded_is_looked_at_in_parts(monkeypatch: pytest.MonkeyPat
 
     def crowded(*given: Any, chosen: Any) -> Any:
         if chosen.count > 20:
-            raise tiles.CrowdedError
+            raise pairs.CrowdedError
         sizes.append(chosen.count)
         return bins(*given, chosen=chosen)
 

@@ -232,7 +232,7 @@ def test_photos_go_through_all_stages(
     def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:
         overwritten.append(overwrite)
 
-    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, *, make: object, progress: object) -> AssetResult:
+    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, **_: object) -> AssetResult:
         assert (capture, fit) == (out / "capture", out / "fit")
         return AssetResult(out, GOOD, kept=False)
 

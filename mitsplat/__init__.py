@@ -20,7 +20,7 @@ from mitsplat.version import __version__ as __version__
 use_bundled_llvm()
 hide_full_gpus()
 
-_importing = threading.Lock()
+_importing = threading.RLock()
 _HOME = {
     "Asset": "asset",
     "Camera": "camera",
@@ -87,11 +87,12 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        if not _HOME[name].startswith("detector."):
-            # Whole before several threads ask for it: Mitsuba puts another module in its place as it is imported.
-            with _importing:
+        # By one thread at a time: Mitsuba puts another module in its place as it is imported, and modules that wait for
+        # each other in several threads are refused as a deadlock.
+        with _importing:
+            if not _HOME[name].startswith("detector."):
                 importlib.import_module("mitsuba")
-        return getattr(importlib.import_module(f"mitsplat.{_HOME[name]}"), name)
+            return getattr(importlib.import_module(f"mitsplat.{_HOME[name]}"), name)
     raise AttributeError(f"module 'mitsplat' has no attribute {name!r}")
 
 

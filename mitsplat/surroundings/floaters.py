@@ -1,9 +1,9 @@
 """Gaussians that photographs do not bear out: haze, what hangs where they look through, and what none of them shows.
 
 A fit may explain what differs from photo to photo by haze, or by specks close to a camera. Haze is Gaussians so large
-that they reach through much of the place. A fit sees none that reaches a camera's plane (``plugins/backward.py``), and
-so does not know them from many of its photos; a renderer shows them. Specks stand in free space: other photos see
-surfaces behind them (space carving, Kutulakos and Seitz 2000).
+that they reach through much of the place; a fit does not know it from those photos whose camera's plane it reaches
+(``plugins/backward.py``). Specks stand in free space: other photos see surfaces behind them (space carving, Kutulakos
+and Seitz 2000).
 Nothing goes that makes the photos come out worse.
 """
 

@@ -187,6 +187,14 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def transformed(self, matrix: npt.ArrayLike) -> Camera:
+        """The camera after a similarity transform (4, 4), its near distance scaled."""
+        matrix = np.asarray(matrix, dtype=np.float64)
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        pose = matrix @ self.world_from_camera
+        pose[:3, :3] /= scale
+        return replace(self, world_from_camera=pose, near=self.near * scale)
+
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of a part of the image, which begins at a pixel and may reach beyond the border."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)

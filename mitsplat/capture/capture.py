@@ -222,15 +222,9 @@ class Capture:
             scale > 0 and np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, scale**2 * np.eye(3), atol=1e-9 * scale**2)
         ):
             raise ValueError("a capture is moved by rotation, uniform scale and translation only")
-
-        def moved(camera: Camera) -> Camera:
-            pose = matrix @ camera.world_from_camera
-            pose[:3, :3] /= scale
-            return replace(camera, world_from_camera=pose, near=camera.near * scale)
-
         return replace(
             self,
-            photos=tuple(replace(photo, camera=moved(photo.camera)) for photo in self.photos),
+            photos=tuple(replace(photo, camera=photo.camera.transformed(matrix)) for photo in self.photos),
             points=self.points @ matrix[:3, :3].T + matrix[:3, 3],
             table=False,
         )

@@ -13,6 +13,7 @@ from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.colour import encode_srgb
+from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation
 from mitsplat.reconstruct.silhouette_refinement import RefinedMesh
@@ -258,7 +259,7 @@ def judge(
         photos=len(capture.photos),
         rejected=len(capture.rejected),
         psnr=psnr,
-        psnr_object=_mean([-10 * float(np.log10(max(error, 1e-12))) for error in errors]),
+        psnr_object=_mean([psnr_of(error) for error in errors]),
         splat_iou=_mean([iou(view.alpha >= 0.5, mask) for view, mask in masked]),
         mesh_iou=None if mesh is None else _mean([iou(view.mesh, mask) for view, mask in masked]),
         offset=None if offset is None else offset.shift,

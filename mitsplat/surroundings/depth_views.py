@@ -33,6 +33,10 @@ class DepthView:
     camera: Camera
     depth: Float32Array
 
+    def transformed(self, motion: Float64Array) -> DepthView:
+        """What the camera sees after it and the place moved rigidly (4, 4)."""
+        return DepthView(self.camera.transformed(motion), self.depth)
+
     def look(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Depth of points (N, 3) and of the surface in their pixels, (N,) each; NaN for points that are not in view."""
         pixels, z = self.camera.project(points)

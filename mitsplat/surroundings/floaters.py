@@ -15,7 +15,8 @@ import numpy as np
 
 from mitsplat.arrays import BoolArray, Int64Array
 from mitsplat.capture.capture import Photo
-from mitsplat.reconstruct.evaluation import show_held_out
+from mitsplat.fit.image_metrics import psnr
+from mitsplat.reconstruct.evaluation import HeldOutView, show_held_out
 from mitsplat.splats import Splats
 from mitsplat.surroundings.depth_views import DepthView, depth_views
 
@@ -63,9 +64,12 @@ def remove_floaters(splats: Splats, photos: Sequence[Photo], scale: float) -> tu
 
 
 def _psnr(splats: Splats, photos: Sequence[Photo]) -> float:
-    """Mean PSNR of photos [dB]."""
-    views = show_held_out(splats, None, photos, _SIZE)
-    return float(np.mean([-10 * np.log10(max(float(((v.render - v.photo) ** 2).mean()), 1e-12)) for v in views]))
+    return mean_psnr(show_held_out(splats, None, photos, _SIZE))
+
+
+def mean_psnr(views: Sequence[HeldOutView]) -> float:
+    """Mean PSNR of renders against their photos [dB]."""
+    return float(np.mean([psnr(view.render, view.photo) for view in views]))
 
 
 def find_unsupported(splats: Splats, views: Sequence[DepthView], near: float) -> tuple[BoolArray, BoolArray]:

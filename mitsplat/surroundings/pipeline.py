@@ -28,7 +28,7 @@ from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import ENOUGH, Coverage, Hole, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.floaters import remove_floaters
+from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.supports import Support, find_supports, flattened
 
@@ -99,7 +99,8 @@ def reconstruct_surroundings(
     cameras = [photo.camera for photo in capture.training]
     scale = _typical_depth(capture)
     splats, removed = remove_floaters(splats, capture.training, scale)
-    points = surface_points(depth_views(splats, cameras))
+    views = depth_views(splats, cameras)
+    points = surface_points(views)
     found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_TURNED)
     if not found and capture.up == "unknown":
         axes = np.concatenate([np.eye(3), -np.eye(3)])
@@ -109,7 +110,7 @@ def reconstruct_surroundings(
     if found:
         motion = np.asarray(np.linalg.inv(found[0].pose))
         capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
-        points = points.transformed(motion)
+        points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
     cameras = [photo.camera for photo in capture.training]
     beyond = _beyond(splats, cameras)
@@ -136,7 +137,6 @@ def reconstruct_surroundings(
     }
     findings, sections, record = list[str](), list[str](), dict[str, Any]()
     if found:
-        views = depth_views(splats, cameras)
         coverage = find_coverage(found[0], views, points, scale)
         named = [(photo.name, photo.camera) for photo in capture.training]
         holes = find_holes(found[0], coverage, splats, named)
@@ -162,9 +162,8 @@ def reconstruct_surroundings(
             "how large it is is unknown, so that there is no scene file: lay a board of `mitsplat board` on the table, "
             "or give --scale-from"
         )
-    errors = [float(((view.render - view.photo) ** 2).mean()) for view in made.held_out]
-    shown = float(np.mean([-10 * np.log10(max(error, 1e-12)) for error in errors])) if errors else psnr
     # As the asset is rendered, not as the fit saw it.
+    shown = mean_psnr(made.held_out) if made.held_out else psnr
     verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
 

@@ -328,3 +328,9 @@ def general_response(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
         return [dr.dot(p, p), 2 * dr.dot(p, q), dr.dot(q, q), 2 * dr.dot(p, r), 2 * dr.dot(q, r), dr.dot(r, r)]
 
     return [*quadratic(c1, c2, c3), *quadratic(w1, w2, w3), *(scale * dr.dot(wm, w) for w in (w1, w2, w3))]
+
+
+def general_depth(k: Any, u: Any, v: Any) -> tuple[Any, Any]:
+    """1 / |W d|^2, and the depth of the peak along the ray of slopes u and v, by what `general_response` returns."""
+    inverse = dr.rcp((k[6] * u + k[7] * v + k[9]) * u + (k[8] * v + k[10]) * v + k[11])
+    return inverse, (k[12] * u + k[13] * v + k[14]) * inverse

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD
+from mitsplat.plugins.gaussian import LOG2_E_HALF, RECORD, general_depth
 from mitsplat.plugins.rays import View
 from mitsplat.quality import Quality
 
@@ -46,44 +46,33 @@ def depths_by_tile(
     """
     if quality.order == "ray":
         return lambda tile: least_depth(record, ellipsoid, view.tile_slopes(tile))
-    at_camera = None if near is None else _depths_at_camera(record, near)
     if view.distortion:
 
-        def depth_of(tile: Any) -> Any:
-            slopes = view.tile_slopes(tile)
-            depth = depth_where_seen(record, slopes)
-            if at_camera is None:
-                return depth
-            lo_u, hi_u, lo_v, hi_v = slopes
-            return dr.select(record[2] < 0, at_camera(0.5 * (lo_u + hi_u), 0.5 * (lo_v + hi_v)), depth)
+        def usual(tile: Any) -> tuple[Any, Any, Any]:
+            lo_u, hi_u, lo_v, hi_v = slopes = view.tile_slopes(tile)
+            return 0.5 * (lo_u + hi_u), 0.5 * (lo_v + hi_v), depth_where_seen(record, slopes)
+    else:
+        (first_u, step_u, width), (first_v, step_v, height) = view.tile_grid()
+        row = first // view.tiles_x
+        depth_around, begin = _depths_where_seen(record, width, height), row * view.tiles_x
+        v = dr.fma(mi.Float(row), step_v, first_v)
 
-        return depth_of
-    (first_u, step_u, width), (first_v, step_v, height) = view.tile_grid()
-    row = first // view.tiles_x
-    depth_around, begin = _depths_where_seen(record, width, height), row * view.tiles_x
-    v = dr.fma(mi.Float(row), step_v, first_v)
+        def usual(tile: Any) -> tuple[Any, Any, Any]:
+            u = dr.fma(mi.Float(tile - begin), step_u, first_u)
+            return u, v, depth_around(u - record[0], v - record[1])
 
-    def depth_in_row(tile: Any) -> Any:
-        u = dr.fma(mi.Float(tile - begin), step_u, first_u)
-        depth = depth_around(u - record[0], v - record[1])
-        return depth if at_camera is None else dr.select(record[2] < 0, at_camera(u, v), depth)
+    if near is None:
+        return lambda tile: usual(tile)[2]
+    at_camera = record[2] < 0
+    number = dr.select(at_camera, mi.UInt32(record[0]), 0)
+    general = dr.gather(mi.ArrayXf, near, number, shape=(RECORD, dr.width(number)))
 
-    return depth_in_row
+    def depth_of(tile: Any) -> Any:
+        u, v, depth = usual(tile)
+        # Those that reach the camera's plane are large against a tile: its middle stands for it.
+        return dr.select(at_camera, dr.maximum(general_depth(general, u, v)[1], 0), depth)
 
-
-def _depths_at_camera(record: Any, near: Any) -> Callable[[Any, Any], Any]:
-    """Function from slopes to the depth of the peak there, of Gaussians that reach the camera's plane.
-
-    They are large against a tile, so that its middle stands for it.
-    """
-    row = dr.select(record[2] < 0, mi.UInt32(record[0]), 0)
-    k = dr.gather(mi.ArrayXf, near, row, shape=(RECORD, dr.width(row)))
-
-    def depth_at(u: Any, v: Any) -> Any:
-        bottom = (k[6] * u + k[7] * v + k[9]) * u + (k[8] * v + k[10]) * v + k[11]
-        return dr.maximum((k[12] * u + k[13] * v + k[14]) / bottom, 0)
-
-    return depth_at
+    return depth_of
 
 
 def depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:

@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.plugins.gaussian import RECORD
+from mitsplat.plugins.gaussian import RECORD, general_depth
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
 from mitsplat.plugins.tiles import TileLists
 from mitsplat.quality import KERNELS, Order, Quality
@@ -242,9 +242,9 @@ def respond_along(
         k = dr.gather(mi.ArrayXf, lists.near, mi.UInt32(row), shape=(RECORD, dr.width(row)))
         found: list[Any] = []
         for u, v in zip(us, vs, strict=True):
-            inverse = dr.rcp((k[6] * u + k[7] * v + k[9]) * u + (k[8] * v + k[10]) * v + k[11])
+            inverse, depth = general_depth(k, u, v)
             numerator = (k[0] * u + k[1] * v + k[3]) * u + (k[2] * v + k[4]) * v + k[5]
-            found += [opacity - numerator * inverse, (k[12] * u + k[13] * v + k[14]) * inverse]
+            found += [opacity - numerator * inverse, depth]
         return found, row
 
     if lists.near is not None:

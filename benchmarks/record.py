@@ -107,7 +107,7 @@ def recording(
         folder: Where to.
     """
     figures: dict[str, list[Any]] = {}
-    at, load, cpu = revision(), os.getloadavg()[0], _cpu_seconds()
+    at, load, cpu = revision(), os.getloadavg()[0], cpu_seconds()
     start = time.monotonic()
     _open.append(figures)
     try:
@@ -125,7 +125,7 @@ def recording(
             "machine": machine(gpu),
             "load": {"start": round(load, 1), "end": round(os.getloadavg()[0], 1)},
             "seconds": round(time.monotonic() - start, 1),
-            "cpu_seconds": round(_cpu_seconds() - cpu, 1),
+            "cpu_seconds": round(cpu_seconds() - cpu, 1),
         },
         figures,
         folder,
@@ -181,7 +181,7 @@ def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def _cpu_seconds() -> float:
+def cpu_seconds() -> float:
     """Of this process and of its children that have ended [s]."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)

@@ -24,13 +24,12 @@ import trimesh
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from benchmarks.assets.judged import on_truth, tell_wanted
 from benchmarks.assets.known import chamfer, solid, speckled
 from benchmarks.assets.photographing import by_name, paint, photograph, show_where, speckle
-from benchmarks.record import figure, recording
+from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.reconstruct.evaluation import iou, show_asset
@@ -214,11 +213,8 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out
     Splats are compared with photos that were held out, seen by the true cameras, where the true solid is seen; the
     photos' true exposures are taken back, and each channel of the splats has one gain for all photos.
     """
-    capture = Capture.load(asset / "capture")
-    made, verdict = Asset.load(asset), json.loads((asset / "verdict.json").read_text())
-    moved = capture.transformed(verdict["asset_from_capture"])
-    found = np.array([photo.camera.centre for photo in moved.photos])
-    truth_from_asset, residuals = fit_similarity(found, np.array([truth[photo.name].centre for photo in moved.photos]))
+    made = Asset.load(asset)
+    moved, truth_from_asset, residuals = on_truth(asset, truth)
     scale = float(np.cbrt(np.linalg.det(truth_from_asset[:3, :3])))
     surface = trimesh.load_mesh(asset / "mesh.ply")
     surface.apply_transform(truth_from_asset)
@@ -232,12 +228,10 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out
     wanted, seen = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     gain = (wanted * seen).sum(axis=0) / (seen**2).sum(axis=0)
     errors = [((one ** (1 / 2.2) - np.clip(other * gain, 0, 1) ** (1 / 2.2)) ** 2).mean() for one, other in pairs]
-    shares = [
-        iou(photo.alpha() >= 0.5, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in capture.photos
-    ]
+    shares = [iou(photo.alpha() >= 0.5, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in moved.photos]
     distances = np.linalg.norm([truth[photo.name].centre for photo in moved.photos], axis=1)
     return {
-        "photos kept, %": 100 * len(capture.photos) / len(truth),
+        "photos kept, %": 100 * len(moved.photos) / len(truth),
         "worst camera, % of its distance": 100 * float((np.linalg.norm(residuals, axis=1) / distances).max()),
         "least IoU of a mask with the truth": min(shares),
         "mean IoU of the masks with the truth": float(np.mean(shares)),
@@ -298,15 +292,7 @@ def measure(args: argparse.Namespace) -> int:
     )
     for sentence in done.verdict.misses():
         print(f"  verdict: {sentence}", file=sys.stderr)
-    missed, found = 0, compare(args.out / "asset", named, mesh, args.out)
-    for name, wanted in WANTED.items():
-        least = name in LEAST
-        met = found[name] >= wanted if least else found[name] <= wanted
-        missed += not met
-        figure(found[name], "", name)
-        figure(wanted, "", "wanted", name)
-        print(f"{name:45} {found[name]:8.3f}  {'>=' if least else '<='} {wanted:g}{'' if met else '  missed'}")
-    return missed
+    return tell_wanted(compare(args.out / "asset", named, mesh, args.out), WANTED, LEAST)
 
 
 def transforms(views: Mapping[str, Camera]) -> dict[str, Any]:

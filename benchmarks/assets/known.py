@@ -24,6 +24,7 @@ import trimesh
 from scipy.ndimage import map_coordinates
 
 from benchmarks.assets import photographing
+from benchmarks.assets.judged import tell_wanted
 from benchmarks.assets.photographing import Sensors, by_name, paint, photograph, speckle
 from benchmarks.record import figure, recording
 from mitsplat.camera import Camera
@@ -253,15 +254,7 @@ def measure(args: argparse.Namespace) -> int:
         (done.verdict.faces, "faces"),
     ):
         figure(count, "", what)
-    missed = 0
-    for name, wanted in WANTED.items():
-        least = name in LEAST
-        met = found[name] >= wanted if least else found[name] <= wanted
-        missed += not met
-        figure(found[name], "", name)
-        figure(wanted, "", "wanted", name)
-        print(f"{name:45} {found[name]:8.3f}  {'>=' if least else '<='} {wanted:g}{'' if met else '  missed'}")
-    return missed
+    return tell_wanted(found, WANTED, LEAST)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """A furnished room that is photographed by hand, to an environment with its table, against the truth.
 
-    python -m benchmarks.assets.room OUT [--views 150] [--width 480] [--gaussians 60000] [--iterations 4000]
+    python -m benchmarks.assets.room OUT [--views 150] [--width 480] [--gaussians 60000] [--iterations 3000]
 
 A table with things on it stands at a wall of a papered room with a cabinet; a ChArUco board lies on the table, and the
 exposure drifts. ``mitsplat asset --kind environment`` makes an environment and a scene of the path-traced pictures, in
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import resource
 import shutil
 import sys
 from collections.abc import Mapping
@@ -27,15 +26,15 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.assets import photographing
 from benchmarks.assets.clutter import exposures, mottled
+from benchmarks.assets.judged import on_truth, tell_wanted
 from benchmarks.assets.known import BOARD
 from benchmarks.assets.photographing import by_name, paint, photograph
-from benchmarks.record import figure, recording
+from benchmarks.record import cpu_seconds, figure, recording
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.capture.pipeline import CaptureSettings, capture_photos
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.reconstruct.evaluation import VERDICT_FILE
 from mitsplat.reconstruct.pipeline import AssetJob
 from mitsplat.render.layers import ensure_variant
 from mitsplat.scene.scene import load_scene
@@ -184,13 +183,11 @@ def room() -> dict[str, Any]:
 
 def compare(asset: Path, truth: Mapping[str, Camera]) -> dict[str, float]:
     """What an environment is off: its cameras are laid on the true ones, and its support goes where they take it."""
-    capture, verdict = Capture.load(asset / "capture"), json.loads((asset / "verdict.json").read_text())
-    moved = capture.transformed(verdict["asset_from_capture"])
-    found = np.array([photo.camera.centre for photo in moved.photos])
-    matrix, residuals = fit_similarity(found, np.array([truth[photo.name].centre for photo in moved.photos]))
+    verdict = json.loads((asset / VERDICT_FILE).read_text())
+    moved, matrix, residuals = on_truth(asset, truth)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     figures = {
-        "photos registered, %": 100 * len(capture.photos) / len(truth),
+        "photos registered, %": 100 * len(moved.photos) / len(truth),
         "worst camera, mm": 1000 * float(np.linalg.norm(residuals, axis=1).max()),
         "scale error, %": 100 * abs(1 / scale - 1),
         "held-out PSNR, dB": float(verdict["psnr"]),
@@ -275,21 +272,7 @@ def measure(args: argparse.Namespace) -> int:
     for name, seconds in spent.items():
         figure(seconds, "s CPU", name)
         print(f"{name:30} {seconds:8.1f} CPU s")
-    missed = 0
-    for name, wanted in WANTED.items():
-        least, value = name in LEAST, found.get(name, float("nan"))
-        met = value >= wanted if least else value <= wanted
-        missed += not met
-        figure(value, "", name)
-        figure(wanted, "", "wanted", name)
-        print(f"{name:30} {value:8.3f}  {'>=' if least else '<='} {wanted:g}{'' if met else '  missed'}")
-    return missed
-
-
-def cpu_seconds() -> float:
-    """CPU time of this process and of those it waited for [s]."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    return tell_wanted(found, WANTED, LEAST)
 
 
 if __name__ == "__main__":

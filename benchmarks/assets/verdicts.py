@@ -28,13 +28,12 @@ from scipy.ndimage import shift
 from scipy.stats import bootstrap, spearmanr
 
 from benchmarks.assets.clutter import room, transforms, walk
+from benchmarks.assets.judged import on_truth
 from benchmarks.assets.known import BOARD, chamfer, solid, speckled, table_scene
 from benchmarks.assets.photographing import by_name, photograph, show_where
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera, spiral
-from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
@@ -219,12 +218,7 @@ def take(case: Case, mesh: trimesh.Trimesh, folder: Path) -> None:
 
 def truth_of(case: Case, mesh: trimesh.Trimesh, folder: Path) -> dict[str, float]:
     """What an asset is off, put where the similarity of its cameras says: a share, dB or %."""
-    capture = Capture.load(folder / "asset" / "capture")
-    record = json.loads((folder / "asset" / VERDICT_FILE).read_text())
-    named = by_name(cameras(case))
-    moved = capture.transformed(record["asset_from_capture"])
-    found = np.array([photo.camera.centre for photo in moved.photos])
-    matrix, _ = fit_similarity(found, np.array([named[photo.name].centre for photo in moved.photos]))
+    _, matrix, _ = on_truth(folder / "asset", by_name(cameras(case)))
     made = Asset.load(folder / "asset").transformed(matrix)
     views, colours, overlaps = views_around(mesh), [], []
     for name, view in zip(by_name(views), show_asset(made.splats, made.mesh, views), strict=True):

@@ -1,0 +1,43 @@
+"""What was made of photographs, against what is wanted and against the cameras that took them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.record import figure
+from mitsplat.arrays import Float64Array
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.metric_frame import fit_similarity
+from mitsplat.reconstruct.evaluation import VERDICT_FILE
+
+
+def on_truth(asset: Path, truth: Mapping[str, Camera]) -> tuple[Capture, Float64Array, Float64Array]:
+    """The capture in its asset's frame, the similarity (4, 4) that lays its cameras on the true ones, and what is left.
+
+    Args:
+        asset: Folder that ``mitsplat asset`` wrote.
+        truth: Cameras by the names of their photos.
+    """
+    verdict = json.loads((asset / VERDICT_FILE).read_text())
+    moved = Capture.load(asset / "capture").transformed(verdict["asset_from_capture"])
+    found = np.array([photo.camera.centre for photo in moved.photos])
+    matrix, residuals = fit_similarity(found, np.array([truth[photo.name].centre for photo in moved.photos]))
+    return moved, matrix, residuals
+
+
+def tell_wanted(found: Mapping[str, float], wanted: Mapping[str, float], least: Container[str]) -> int:
+    """Print and keep figures beside what is wanted of them, ``least`` or most; how many miss it, absent ones too."""
+    missed = 0
+    for name, limit in wanted.items():
+        value = found.get(name, float("nan"))
+        met = value >= limit if name in least else value <= limit
+        missed += not met
+        figure(value, "", name)
+        figure(limit, "", "wanted", name)
+        print(f"{name:45} {value:8.3f}  {'>=' if name in least else '<='} {limit:g}{'' if met else '  missed'}")
+    return missed

@@ -13,8 +13,8 @@ less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitspla
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
 Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take next to no light,
-see :mod:`mitsplat.plugins.light_tiles`. All else gets ``FIRST_RAYS``, and as many more as the wanted standard error of
-the filtered ratio asks for.
+see :mod:`mitsplat.plugins.light_tiles`. All else gets ``FIRST_RAYS``, and as many more as the wanted error of light asks
+for, as it looks in the picture.
 """
 
 from __future__ import annotations
@@ -66,12 +66,15 @@ class Accuracy:
     """How many shadow rays are spent.
 
     Attributes:
-        error: Standard error of the filtered light ratio that rays are spent for; 0 spends ``most`` everywhere.
+        error: Standard error of light that is half of white for which rays are spent, and as much to the eye of all
+            other light; 0 spends ``most`` everywhere.
         most: Most rays per pixel.
+        metered: Whether the picture is shown as bright on average as if half of its light arrived.
     """
 
     error: float
     most: int
+    metered: bool = False
 
 
 def light_factor(
@@ -125,8 +128,16 @@ def light_factor(
     rows = points.rows(order)
     rays = points.shared(dr.opaque(mi.UInt32, first), rows)
     estimate = tracer.trace(rows, Estimate.nothing(dr.width(points.owner)), rays, first, points.turn(rows))
+    special = dr.compress(here.relit | (here.specular > 0))
+    unshadowed = dr.full(mi.Float, 1, dr.width(index))
+    if dr.width(special):
+        open_light, mirrored, tent = _open_light(emitters, points, special)
+        relit = dr.gather(mi.Bool, here.relit, special)
+        dr.scatter(unshadowed, dr.sum(open_light / reference) / 3, special, relit)
+        dr.eval(unshadowed)
     if first < accuracy.most:
-        wanted = light_filter.rays_for(points.summed(estimate), accuracy.error)
+        pixels = dr.width(needed) if accuracy.metered else 0
+        wanted = light_filter.rays_for(points.summed(estimate), accuracy.error, unshadowed, pixels)
         more = dr.gather(mi.Float, wanted, order) > dr.opaque(mi.Float, first)
         rows = points.rows(dr.gather(mi.UInt32, order, dr.compress(more)))
         if dr.width(rows):
@@ -141,12 +152,10 @@ def light_factor(
     light = mi.Color3f(*[v + dr.zeros(mi.Float, dr.width(needed)) for v in light])
     dr.eval(light, share, shine, glare)
     dr.scatter(light, share, index)
-    special = dr.compress(here.relit | (here.specular > 0))
     if dr.width(special):
         own, pixels = gathered(here, special), dr.gather(mi.UInt32, index, special)
         part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
         dr.eval(own, part, shine, glare)
-        open_light, mirrored, tent = _open_light(emitters, points, special)
         # Where no ray came from where the lobe is, as much of it arrives as of all light. (dr.mean would write the
         # width of the array into the kernel.)
         mirrored *= dr.select(glare > 0, shine / glare, dr.sum(part) / 3) * (dr.pi / reference)

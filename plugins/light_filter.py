@@ -26,6 +26,20 @@ GAIN = 5.0
 """By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3
 pixels. With this, ``python -m benchmarks.light.traced`` finds six tenths of a wanted error of 0.03 over all shadows."""
 
+HALF = 0.5
+"""Light, as a share of white, at which a wanted error is the standard error that is wanted of it."""
+
+DARKEST = 0.05
+"""Light below which none is looked at more closely."""
+
+DISPLAY = 1 / 2.2
+"""Exponent that displayed light has, of which the eye and a file see even steps."""
+
+BRIGHTEST, DIMMEST = 64.0, 1 / 64
+"""What a camera that exposes by itself multiplies light by at the most and the least."""
+
+_STEPS = 4096
+"""Of displayed light, sums of which do not depend on the number of threads."""
 
 NOWHERE = 0xFFFFFFFF
 """Place of a pixel at which no light was traced."""
@@ -90,11 +104,27 @@ class LightFilter:
         dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
         dr.eval(self.place)
 
-    def rays_for(self, estimate: Estimate, error: float) -> Any:
-        """Rays per pixel of ``index`` after which the filtered share of light has a standard error of ``error``."""
-        _, variance, shared = self._share(estimate)
+    def rays_for(self, estimate: Estimate, error: float, unshadowed: Any, metered: int = 0) -> Any:
+        """Rays per pixel of ``index`` after which light errs no more to the eye than by ``error`` at half of white.
+
+        Elsewhere the standard error may be as many steps of the display: less in the dark, more where it is bright.
+
+        Args:
+            estimate: From the rays so far.
+            error: Standard error of light that is HALF.
+            unshadowed: Light without occluders at each pixel, of which rays say what share arrives; 1 is white.
+            metered: Pixels of a picture that is exposed so that the mean of it looks HALF, those without a place here
+                being lit by 1; 0 if it is exposed for white.
+        """
+        share, variance, shared = self._share(estimate)
         gain = dr.fma((GAIN - 1) / (SMALL - 1), shared - 1, 1)
-        return estimate.rays * variance / (gain * error * error)
+        light = unshadowed * share
+        if metered:
+            exposure = _metered(light, metered)
+            light, unshadowed = light * exposure, unshadowed * exposure
+        # What a step of the display is of the share that arrives, for one of light that is HALF.
+        allowed = error * dr.power(dr.clip(light, DARKEST, 1) / HALF, 1 - DISPLAY)
+        return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
     def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any, Any]:
         """The first four sums of the estimate per ray, averaged over neighbours, at the pixels of ``index``."""
@@ -185,6 +215,15 @@ class LightFilter:
         _, weights, squares, *sums = dr.while_loop(state, lambda step, *_: step < 2 * last, add, label="light filter")
         averages = [own + total / weights for own, total in zip(values, sums, strict=True)]
         return averages, weights * weights / (squares * own_rays)
+
+
+def _metered(light: Any, pixels: int) -> Any:
+    """What light is multiplied by for the mean of a picture to look HALF: light here, and 1 at its other pixels."""
+    looks = dr.sum(mi.UInt64(dr.minimum(dr.power(dr.maximum(light, 0), DISPLAY), 4) * _STEPS + 0.5))
+    looks += dr.opaque(mi.UInt64, (pixels - dr.width(light)) * _STEPS)
+    mean = mi.Float(looks) / dr.opaque(mi.Float, pixels * _STEPS)
+    exposure = HALF * dr.power(dr.maximum(mean, 1e-6), -1 / DISPLAY)
+    return dr.clip(exposure, DIMMEST, BRIGHTEST)
 
 
 _TRAITS = 12

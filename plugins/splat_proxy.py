@@ -106,8 +106,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - shadow_error
        - |float|
-       - Standard error of the light ratio for which shadow rays are spent, above 0 and below 1; or 0 for
-         ``shadow_samples`` at every pixel. (Default: 0.03)
+       - Standard error of light that is half of white for which shadow rays are spent, and as much to the eye of all
+         other light, above 0 and below 1; or 0 for ``shadow_samples`` at every pixel. (Default: 0.03)
+
+     * - metered
+       - |bool|
+       - Whether the picture will be exposed by the light in it, which ``shadow_error`` then refers to. (Default:
+         false)
 
      * - shadow_samples
        - |int|
@@ -183,6 +188,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.shadow_error = given.number("shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
             given.refuse("shadow_error", "be in [0, 1)", self.shadow_error)
+        self.metered = given.truth("metered", False)
         self.shadow_samples = given.whole("shadow_samples", 64, 1, 4096)
         self.bounce, self.highlight = given.truth("bounce", True), given.truth("highlight", True)
         self.hide_emitters = given.truth("hide_emitters", False)
@@ -231,13 +237,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """
         contents = self._read(scene)
         views = view_of(sensor).apertures(self.quality.lens_rings)
-        accuracy = Accuracy(self.shadow_error, self.shadow_samples)
+        accuracy = Accuracy(self.shadow_error, self.shadow_samples, self.metered)
         paths = -(-self.mesh_samples // len(views))
         layers, errors = self._layers(contents, scene, views[0], accuracy, paths, seed), []
         errors.append(layers.pop("order_error"))
         if len(views) > 1:
             # The mean of n views has sqrt(n) times less noise than each of them.
-            coarse = Accuracy(self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views)))
+            error, most = self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views))
+            coarse = Accuracy(error, most, self.metered)
             blurred = {name: layers[name] for name in ("rgb", "alpha", "captured")}
             for number, view in enumerate(views[1:], start=1):
                 seen = self._layers(contents, scene, view, coarse, paths, seed + number)

@@ -541,6 +541,7 @@ def light_properties(scene: Scene, place: Place = NOWHERE) -> dict[str, Any]:
     return {
         "shadow": "none" if composite.shadow == "none" else "traced",
         "shadow_error": composite.shadow_error,
+        "metered": composite.exposure == "auto",
         "occluders": composite.occluders,
         "bounce": composite.bounce,
         "highlight": composite.highlight,

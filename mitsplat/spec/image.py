@@ -107,7 +107,11 @@ class Composite(StrictModel):
         "traced", description="Shadow rays, the image-space approximation, or no shadow."
     )
     shadow_error: float = Field(
-        0.03, gt=0, lt=1, description="Standard error of traced light for which shadow rays are spent."
+        0.03,
+        gt=0,
+        lt=1,
+        description="Standard error, where half of the light arrives, for which shadow rays are spent; elsewhere as "
+        "much to the eye.",
     )
     image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of shadow: image.")
     highlight: bool = Field(True, description="Whether highlights of the scene's lights are added.")

@@ -80,7 +80,7 @@ def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
         fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
         fields |= {"position": dr.zeros(mi.Point3f, count), "normal": up, "trait": mi.Float(trait)}
         fields |= {"offset": mi.Float(1), "known": dr.full(mi.Bool, True, count)}
-        rays = LightFilter(Surface(**fields), view, pixel).rays_for(estimate, 0.03)
+        rays = LightFilter(Surface(**fields), view, pixel).rays_for(estimate, 0.03, mi.Float(1))
         return float(np.array(rays)[40])
 
     def twin(like: float, gain: float) -> float:

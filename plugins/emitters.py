@@ -49,7 +49,7 @@ class Beam:
 
     Attributes:
         direction: Unit vector towards the light.
-        reach: Distance to the emitter [m], infinite for a sky.
+        reach: How far away what stops the light may be [m]: to the emitter, or as far as a sky can be hidden.
         irradiance: Estimate (Color3f) of the irradiance, were this the only ray and nothing in its way.
     """
 
@@ -65,8 +65,12 @@ class Emitters:
     environment map is sampled half so and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
     """
 
-    def __init__(self, scene: Any, reference: Sequence[float]) -> None:
-        """The emitters of ``scene``, of which there must be one or more; ``reference`` is a point [m]."""
+    def __init__(self, scene: Any, reference: Sequence[float], sky_reach: float = np.inf) -> None:
+        """The emitters of ``scene``, of which there must be one or more; ``reference`` is a point [m].
+
+        What is farther than ``sky_reach`` [m] from a point does not hide the sky from it.
+        """
+        self.sky_reach = dr.opaque(mi.Float, sky_reach)
         emitters = scene.emitters()
         self.pointers = scene.emitters_dr()
         skies = [i for i, e in enumerate(emitters) if _is_sky(e)]
@@ -123,7 +127,8 @@ class Emitters:
             irradiance = dr.select(is_sky, dr.select(density > 0, sky * (cosine / density), 0), irradiance)
         # The distance to a light at infinity comes from the extent of visible meshes, which proxies are not part of.
         infinite = dr.gather(mi.UInt32, self.infinite, index, active) > 0
-        return Beam(direction, dr.select(infinite, dr.inf, sample.dist), irradiance / chance)
+        reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, sample.dist))
+        return Beam(direction, reach, irradiance / chance)
 
     @staticmethod
     def _sky_radiance(si: Any, direction: Any, emitter: Any, active: Any = True) -> Any:

@@ -13,8 +13,8 @@ less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitspla
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
 Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take next to no light,
-see :mod:`mitsplat.plugins.light_tiles`. All else gets ``FIRST_RAYS``, and as many more as the wanted error of light asks
-for, as it looks in the picture.
+see :mod:`mitsplat.plugins.light_tiles`. All else gets ``FIRST_RAYS``, and as many more as the wanted error of light, as
+it looks in the picture, asks for.
 """
 
 from __future__ import annotations
@@ -86,6 +86,7 @@ def light_factor(
     seed: int,
     point: tuple[float, ...],
     reference: Any,
+    sky_reach: float = float("inf"),
     grid: RadianceGrid | None = None,
 ) -> tuple[Any, Any]:
     """Light factor and highlight (Color3f) of every visible point, see the module docstring.
@@ -102,9 +103,10 @@ def light_factor(
         seed: Offset into the low-discrepancy sequence.
         point: Where in the scene rays are shared out among emitters by how much light they send [m].
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
+        sky_reach: What is farther than this from a point does not hide the sky from it [m].
         grid: Captured colours of the surroundings, for the light that they reflect to objects; None leaves it out.
     """
-    emitters, view = Emitters(scene, point), visible.view
+    emitters, view = Emitters(scene, point, sky_reach), visible.view
     everything = visible.at(dr.arange(mi.UInt32, view.width * view.height))
     needed, light = everything.valid, mi.Color3f(1)
     if accuracy.error > 0:

@@ -136,6 +136,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - Irradiance under which uniformly captured colours are shown unchanged [W/m^2]: pi where radiance 1 is the white
          of the surroundings, as in baked ones. (Default: 0, that of an unoccluded horizontal surface at ``reference``)
 
+     * - sky_reach
+       - |float|
+       - How far away what hides the sky from a point may be [m]: less than the walls of a room lets a sky stand for the
+         light that these reflect. (Default: 0, any distance)
+
      * - reference
        - |point|
        - A place in the middle of what is lit. (Default: origin)
@@ -197,6 +202,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self.white = given.number("white", 0.0)
         if not 0 <= self.white < np.inf:
             given.refuse("white", "be >= 0", self.white)
+        self.sky_reach = given.number("sky_reach", 0.0)
+        if not 0 <= self.sky_reach < np.inf:
+            given.refuse("sky_reach", "be >= 0", self.sky_reach)
         self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
@@ -294,6 +302,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 seed=seed,
                 point=self.reference,
                 reference=white,
+                sky_reach=self.sky_reach or np.inf,
                 grid=contents.grid if self.bounce else None,
             )
         if not self.highlight:

@@ -22,12 +22,11 @@ from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds, stated_pose, walls_beside
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
 from mitsplat.sight import solid_around
 from mitsplat.spec.lights import LocalLight
 from mitsplat.spec.objects import Arrangement
 from mitsplat.spec.shapes import Region
-from mitsplat.spec.spec import BACKDROP
 
 MOST_OBJECTS = 65535
 """Instance ids have 16 bits."""
@@ -266,7 +265,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
 
 def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
     """Views and lights from behind a backdrop's walls."""
-    walls = [shape.box for shape in scene.spec.shapes if shape.box and shape.name.startswith(f"{BACKDROP}wall ")]
+    walls = backdrop_walls(scene.spec)
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
 
     def behind(point: Iterable[float]) -> bool:

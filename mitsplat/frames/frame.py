@@ -49,6 +49,7 @@ from mitsplat.scene.conveyor import Belt, carried, carried_by, carried_instances
 from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.lights import written_out
 from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
+from mitsplat.scene.walls import backdrop_distance
 from mitsplat.spec.lights import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.splats import Splats
 from mitsplat.variant import ensure_variant, one_at_a_time
@@ -546,6 +547,8 @@ def light_properties(scene: Scene, place: Place = NOWHERE) -> dict[str, Any]:
         "bounce": composite.bounce,
         "highlight": composite.highlight,
         "reference": list(reference_point(scene)),
+        # A sky in a room stands for what walls reflect, which they must not hide; things near each other do.
+        "sky_reach": backdrop_distance(scene.spec, reference_point(scene)) / 2,
         "white": white_irradiance(scene, place),
         # What no splat covers is the grey of mitsplat.frames.camera_response, which draws no light source.
         "hide_emitters": True,

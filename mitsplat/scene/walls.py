@@ -108,6 +108,22 @@ def backdrop_shapes(room: Backdrop) -> list[Shape]:
     ]
 
 
+def backdrop_distance(spec: SceneSpec, point: Vec3) -> float:
+    """How far walls and ceiling of a backdrop are from a point [m]; 0 if there are none."""
+
+    def distance(box: Box) -> float:
+        pose = stated_pose(box)
+        own = pose[:3, :3].T @ (np.asarray(point) - pose[:3, 3])
+        return float(np.linalg.norm(np.maximum(np.abs(own) - np.asarray(box.size) / 2, 0)))
+
+    return min((distance(box) for box in backdrop_walls(spec)), default=0.0)
+
+
+def backdrop_walls(spec: SceneSpec) -> list[Box]:
+    """Walls and ceiling of a backdrop."""
+    return [shape.box for shape in spec.shapes if shape.box and shape.name.startswith(f"{BACKDROP}wall ")]
+
+
 def finish_name(shape: str) -> str:
     """What a shape shares its material with: all walls of a backdrop have one."""
     return f"{BACKDROP}walls" if shape.startswith(f"{BACKDROP}wall ") else shape

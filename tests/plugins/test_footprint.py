@@ -90,3 +90,36 @@ def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
 
     assert wanted(dr.zeros(mi.Float, count)) == pytest.approx(twin(SMALL, GAIN), rel=1e-4)
     assert wanted(pixel) == pytest.approx(twin(1, 1), rel=1e-4)
+
+
+def test_rays_follow_how_light_looks() -> None:
+    """In equal steps of the display: fewest where it is bright, and where a dark picture is exposed for, more."""
+    make_integrator()
+    camera = down_camera(size=9)
+    view = View(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    count = 81
+    fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+    fields |= {"position": dr.zeros(mi.Point3f, count), "normal": mi.Vector3f(0, 0, 1), "offset": mi.Float(1)}
+    fields |= {"known": dr.full(mi.Bool, True, count)}
+    light_filter = LightFilter(Surface(**fields), view, dr.arange(mi.UInt32, count))
+
+    def wanted(unshadowed: float, share: float = 0.5, **options: Any) -> float:
+        estimate = Estimate(
+            *[mi.Color3f(v * dr.ones(mi.Float, count)) for v in (4 * share, 4.0)],
+            *[dr.full(mi.Float, v, count) for v in (0.0, 0.0, 36.0, 4.0)],
+        )
+        return float(np.array(light_filter.rays_for(estimate, 0.03, mi.Float(unshadowed), **options))[40])
+
+    at_half = wanted(1.0)
+    # The slope of v^(1/2.2) at v is that at a half times (v / 0.5)^(1/2.2 - 1).
+    for light in (0.06, 0.2, 0.5):
+        steps = (light / 0.5) * (light / 0.5) ** (1 / 2.2 - 1)
+        assert wanted(2 * light) / at_half == pytest.approx(steps**2, rel=1e-4)
+    assert wanted(0.02) / at_half == pytest.approx((0.02 * (0.05 / 0.5) ** (1 / 2.2 - 1)) ** 2, rel=1e-4)
+    for light in (0.03, 0.3, 3.0):  # as bright as any other, however much light there is
+        assert wanted(light, metered=count) == pytest.approx(at_half, rel=2e-3)
+    # Nine in ten pixels of a picture are lit by 1, as bright as if a half of it arrived.
+    mean = (9 * 1 + 0.1 ** (1 / 2.2)) / 10
+    own = 0.1 * 0.5 * mean**-2.2
+    steps = (own / 0.5) ** (1 / 2.2)
+    assert wanted(0.2, metered=10 * count) / at_half == pytest.approx(steps**2, rel=2e-3)

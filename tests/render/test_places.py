@@ -14,6 +14,7 @@ import pytest
 
 from mitsplat.dataset.prospects import doubts
 from mitsplat.errors import InputError
+from mitsplat.frames.frame import light_properties
 from mitsplat.render.places import Finish, draw_place, environment_at
 from mitsplat.scene.scene import load_scene
 from tests.conftest import WriteScene, box_asset
@@ -215,6 +216,7 @@ def test_a_backdrop_is_a_room_around_its_inside(scene_data: SceneData, write_sce
         "backdrop wall -x"
     )
     assert [finding.text for finding in doubts(scene) if not finding.ok] == []
+    assert light_properties(scene)["sky_reach"] == pytest.approx((1 - 0.2 * np.sin(np.pi / 6)) / 2)
     scene_data["backdrop"] = {"size": [0.7, 0.7, 0.9], "position": [0, 0, -0.2], "sides": ["+x", "-y"]}
     found = [finding.text for finding in doubts(load_scene(write_scene(scene_data))) if not finding.ok]
     assert "of 12 views 6 are from behind a wall of the backdrop, which hides everything" in found

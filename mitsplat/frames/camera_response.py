@@ -100,8 +100,8 @@ def develop(
         linear: Linear sRGB, 1 = display white.
         draws: ``exposure`` [stops], ``vignetting`` [stops in the corners], ``chromatic_aberration`` [px in the
             corners, red outwards and blue inwards], ``motion_blur`` [px] along ``motion_angle``
-            [degrees], ``iso``, ``white_balance`` [K], ``hue`` [degrees], ``saturation``, ``jpeg`` [quality]; what is
-            missing changes nothing.
+            [degrees], ``iso``, ``white_balance`` [K], ``hue`` [degrees], ``saturation``, ``sharpening`` [share of what
+            exceeds a blur of 1 px], ``jpeg`` [quality]; what is missing changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
         sensor: What turns ``iso`` into noise.
         seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
@@ -152,7 +152,8 @@ def develop_layers(
         value = dr.gather(mi.UInt32, table, entry)
         dr.scatter(data, mi.UInt8(value), 3 * pixel + c, mode=dr.ReduceMode.Permute)
     dr.eval(data)
-    return Development(data, shape, round(draws["jpeg"]) if "jpeg" in draws else None)
+    jpeg = round(draws["jpeg"]) if "jpeg" in draws else None
+    return Development(data, shape, draws.get("sharpening", 0.0), jpeg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,16 +163,21 @@ class Development:
     Attributes:
         data: Its bytes on the device, flat and row-major, red, green, blue.
         shape: Height and width [px].
+        sharpening: How many times is added what the encoded picture has beyond its Gaussian blur of 1 px (unsharp mask).
         jpeg: Quality of the JPEG file that it has been, if any.
     """
 
     data: Any
     shape: tuple[int, int]
+    sharpening: float
     jpeg: int | None
 
     def image(self) -> ByteImage:
         """The picture (H, W, 3) on the host, when it is done."""
         image = self.data.numpy().reshape(*self.shape, 3)
+        if self.sharpening:
+            blur = cv2.GaussianBlur(image, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
+            image = np.asarray(cv2.addWeighted(image, 1 + self.sharpening, blur, -self.sharpening, 0), dtype=np.uint8)
         return image if self.jpeg is None else _compressed(image, self.jpeg)
 
 

@@ -46,7 +46,7 @@ from mitsplat.yaml_input import key_place, load_yaml
 
 _DRAWN = (
     *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
-    *("white_balance", "hue", "saturation", "jpeg"),
+    *("white_balance", "hue", "saturation", "sharpening", "jpeg"),
 )
 """What is drawn anew for every frame."""
 
@@ -333,7 +333,7 @@ def plan_frame(
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))
             for name in _DRAWN
             if (bounds := (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)) is not None
-            and (name != "chromatic_aberration" or any(bounds))
+            and (name not in ("chromatic_aberration", "sharpening") or any(bounds))
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
         viewpoint=here.drawn,

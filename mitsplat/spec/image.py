@@ -40,6 +40,11 @@ class Randomise(StrictModel):
     motion_blur: NonNegativeRange = Field(
         (0.0, 0.0), description="Length of the camera's motion in the image, in a direction drawn anew [px]."
     )
+    sharpening: NonNegativeRange = Field(
+        (0.0, 0.0),
+        exclude_if=lambda sharpening: sharpening == (0.0, 0.0),
+        description="How many times the camera adds what the picture has beyond its blur of 1 px, noise too.",
+    )
     jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(ordered)] | None = Field(
         None, description="Quality of a JPEG compression before the image is written; none if absent."
     )

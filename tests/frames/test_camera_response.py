@@ -234,6 +234,19 @@ def test_motion_keeps_even_pictures_and_smears_points() -> None:
     assert np.flatnonzero(smeared.any(axis=1)).tolist() == [10]
 
 
+def test_sharpening_overshoots_an_edge_by_its_share_of_what_a_blur_takes() -> None:
+    """Next to a step the blur takes the weight that a Gaussian has beyond it."""
+    even = np.full((9, 21, 3), 0.3, np.float32)
+    assert np.array_equal(develop(even, {"sharpening": 2.0}), develop(even, {}))
+    even[:, 10:] = 0.1
+    plain, sharp = (develop(even, draws)[4, :, 0].astype(float) for draws in ({}, {"sharpening": 0.8}))
+    weights = np.exp(-0.5 * np.arange(-3, 4) ** 2)
+    missed = (weights[4:].sum() / weights.sum()) * (plain[9] - plain[10])
+    assert sharp[9] - plain[9] == pytest.approx(0.8 * missed, abs=1.5)
+    assert plain[10] - sharp[10] == pytest.approx(0.8 * missed, abs=1.5)
+    assert np.array_equal(sharp[:6], plain[:6]) and np.array_equal(sharp[14:], plain[14:])
+
+
 def test_jpeg_of_low_quality_loses_detail_and_keeps_the_channels() -> None:
     rng = np.random.default_rng(0)
     linear = np.clip(0.3 + 0.1 * rng.normal(size=(64, 64, 1)) * (1, 1, 1) + (0.2, 0, 0), 0, 1).astype(np.float32)

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
 
-from benchmarks.detector.experiment import read_arms, write_scene
+from benchmarks.detector.experiment import read_arms, scenes_of, write_scene
 from benchmarks.record import RESULTS
 
 
@@ -72,7 +72,7 @@ def main() -> None:
     rendered: set[str] = set()
     with ThreadPoolExecutor(len(options.devices) * options.jobs) as pool:
         for arm in sorted(chosen, key=lambda arm: "scenes" in arms[arm]):
-            for scene in arms[arm].get("scenes", []):
+            for scene in scenes_of(arms[arm]):
                 if scene in rendered or time.monotonic() > ends:
                     continue
                 rendered.add(scene)

@@ -16,6 +16,7 @@ import fcntl
 import json
 import re
 import shutil
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,15 @@ def read_arms() -> dict[str, Any]:
     return dict(YAML(typ="safe").load((HERE / "arms.yaml").read_text()))
 
 
+def scenes_of(arm: Mapping[str, Any]) -> list[str]:
+    """The scenes that an arm learns from, by name: their changes, joined by ``+``."""
+    return ["+".join([scene, *([arm["change"]] if "change" in arm else [])]) for scene in arm.get("scenes", [])]
+
+
 def write_scene(work: Path, name: str) -> Path:
     """The scene of a name: ``groceries.yaml`` with its changes, by dotted key; null takes away."""
     scene, plan = YAML(typ="safe").load((HERE / "groceries.yaml").read_text()), read_arms()
-    for key, value in [row for change in plan["scenes"][name] for row in plan["changes"][change].items()]:
+    for key, value in [row for change in name.split("+") for row in plan["changes"][change].items()]:
         *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
         place = scene
         for step in way:
@@ -101,10 +107,10 @@ def measure(options: argparse.Namespace) -> None:
     plan = read_arms()
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
-    rendered = [work / "data" / scene for scene in arm.pop("scenes", [])]
-    learns_photographs = arm.pop("real", False)
+    rendered = [work / "data" / scene for scene in scenes_of(arm)]
+    learns_photographs = arm.get("real", False)
     settings = TrainSettings(
-        **(plan["train"] | arm),
+        **(plan["train"] | arm.get("train", {})),
         weights=options.weights,
         seed=options.seed,
         device=options.device,

@@ -7,8 +7,9 @@ drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes a
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import matplotlib
 import numpy as np
@@ -24,17 +25,18 @@ WORDS = re.split(
     "LEMON APPLE GRAPE SALSA CHILI BROTH NOODLES fresh natural classic organic original best family extra NET WT 340 g",
 )
 FONTS = sorted(Path(matplotlib.get_data_path(), "fonts/ttf").glob("DejaVu*Bold*.ttf"))
+Colours: TypeAlias = list[tuple[int, int, int]]
 _PIXELS_PER_METRE = 3000.0
 
 
 def make_package(seed: int) -> trimesh.Trimesh:
-    """A closed, convex mesh [m], z up, with a texture."""
+    """A closed mesh [m], z up, with a texture."""
     rng = np.random.default_rng(seed)
     kind: Callable[[np.random.Generator], trimesh.Trimesh] = (_box, _can, _bottle)[seed % 3]
     return kind(rng)
 
 
-def _colours(rng: np.random.Generator) -> list[tuple[int, int, int]]:
+def _colours(rng: np.random.Generator) -> Colours:
     """Background, second colour, and ink, which differ in value."""
     hues = (rng.random() + np.array([0, rng.uniform(0.1, 0.6), rng.random()])) % 1
     values = np.clip([rng.uniform(0.2, 1), rng.uniform(0.2, 1), rng.choice([0.05, 0.98])], 0, 1)
@@ -45,34 +47,92 @@ def _colours(rng: np.random.Generator) -> list[tuple[int, int, int]]:
     return [tuple(round(255 * v) for v in row) for row in rgb]  # type: ignore[misc]
 
 
-def _label(width: float, height: float, rng: np.random.Generator, colours: list[tuple[int, int, int]]) -> Image.Image:
-    """A printed side of so many metres."""
+def _label(width: float, height: float, rng: np.random.Generator, colours: Colours) -> Image.Image:
+    """A printed side of so many metres: fields of colour, a picture of what is in it, a title, a badge, small print."""
     size = max(round(width * _PIXELS_PER_METRE), 8), max(round(height * _PIXELS_PER_METRE), 8)
     image = Image.new("RGB", size, colours[0])
     draw = ImageDraw.Draw(image)
-    for _ in range(rng.integers(1, 5)):
-        colour = colours[1] if rng.random() < 0.7 else tuple(int(v) for v in rng.integers(0, 256, 3))
-        x, y = rng.uniform(0, 1, 2) * size
-        w, h = rng.uniform(0.15, 0.8, 2) * size
-        shape = rng.integers(4)
-        if shape == 0:
-            draw.rectangle((0, y, size[0], y + 0.3 * h), fill=colour)
-        elif shape == 1:
-            draw.ellipse((x - w / 2, y - h / 2, x + w / 2, y + h / 2), fill=colour)
-        elif shape == 2:
-            draw.polygon([(x, y), (x + w, y + 0.2 * h), (x + 0.3 * w, y + h)], fill=colour)
-        else:
-            step = max(size[0] / rng.integers(6, 16), 2.0)
-            for left in np.arange(0, size[0], step):
-                draw.rectangle((left, y, left + 0.4 * step, y + 0.4 * h), fill=colour)
-    for line in range(rng.integers(1, 5)):
-        word = str(rng.choice(WORDS))
-        letter = (0.28 if line == 0 else rng.uniform(0.06, 0.15)) * min(size[1], 1.5 * size[0])
-        letter = min(letter, 1.3 * size[0] / len(word))
-        font = ImageFont.truetype(str(FONTS[rng.integers(len(FONTS))]), max(int(letter), 6))
-        x, y = rng.uniform(0.0, 0.35) * size[0], rng.uniform(0.02, 0.85) * size[1]
-        draw.text((x, y), word, font=font, fill=colours[2] if rng.random() < 0.8 else colours[1])
+    for _ in range(rng.integers(1, 4)):
+        _field(draw, size, rng, colours[1] if rng.random() < 0.7 else _any_colour(rng))
+    if rng.random() < 0.7:
+        _heap(draw, size, rng)
+    if rng.random() < 0.4:
+        x, y = rng.uniform(0.2, 0.8, 2) * size
+        radius = rng.uniform(0.1, 0.3) * min(size)
+        field = (x - 1.4 * radius, y - radius, x + 1.4 * radius, y + radius)
+        draw.ellipse(field, fill=_any_colour(rng), outline=colours[2], width=max(round(0.1 * radius), 1))
+        _write(image, str(rng.choice(WORDS)), (x, y), 0.5 * radius, 2 * radius, rng, colours[2], None)
+    ink, edge = (colours[2], colours[1]) if rng.random() < 0.8 else (colours[1], colours[2])
+    x, y = rng.uniform(0.4, 0.6) * size[0], rng.uniform(0.12, 0.6) * size[1]
+    for _ in range(rng.integers(1, 4)):
+        letter = rng.uniform(0.15, 0.35) * min(size[1], 1.2 * size[0])
+        outline = edge if rng.random() < 0.4 else None
+        y += 1.1 * _write(image, str(rng.choice(WORDS)), (x, y), letter, 0.95 * size[0], rng, ink, outline)
+    for _ in range(rng.integers(0, 3)):
+        x, y = rng.uniform(0.2, 0.8, 2) * size
+        for line in range(rng.integers(2, 7)):
+            words = " ".join(rng.choice(WORDS, 3))
+            _write(image, words, (x, y + 0.012 * _PIXELS_PER_METRE * line / 4), 9, 0.5 * size[0], None, ink, None)
+    if rng.random() < 0.25:
+        x, y = rng.uniform(0.05, 0.7, 2) * size
+        draw.rectangle((x, y, x + 60, y + 36), fill=(250, 250, 250))
+        for left in np.flatnonzero(rng.random(26) < 0.5):
+            draw.rectangle((x + 4 + 2 * left, y + 4, x + 5 + 2 * left, y + 32), fill=(10, 10, 10))
     return image
+
+
+def _any_colour(rng: np.random.Generator) -> tuple[int, ...]:
+    rgb = matplotlib.colors.hsv_to_rgb([rng.random(), rng.uniform(0, 1) ** 0.5, rng.uniform(0.15, 1)])
+    return tuple(round(255 * v) for v in rgb)
+
+
+def _field(draw: ImageDraw.ImageDraw, size: tuple[int, int], rng: np.random.Generator, colour: tuple[int, ...]) -> None:
+    """A band, an ellipse, a wedge, or stripes."""
+    x, y = rng.uniform(0, 1, 2) * size
+    w, h = rng.uniform(0.15, 0.8, 2) * size
+    shape = rng.integers(4)
+    if shape == 0:
+        draw.rectangle((0, y, size[0], y + 0.5 * h), fill=colour)
+    elif shape == 1:
+        draw.ellipse((x - w / 2, y - h / 2, x + w / 2, y + h / 2), fill=colour)
+    elif shape == 2:
+        draw.polygon([(x, y), (x + w, y + 0.2 * h), (x + 0.3 * w, y + h)], fill=colour)
+    else:
+        step = max(size[0] / rng.integers(6, 16), 2.0)
+        for left in np.arange(0, size[0], step):
+            draw.rectangle((left, y, left + 0.4 * step, y + 0.4 * h), fill=colour)
+
+
+def _heap(draw: ImageDraw.ImageDraw, size: tuple[int, int], rng: np.random.Generator) -> None:
+    """A heap of what is in it, cherries or peas: rounds of one hue, each with a light and a dark side."""
+    hue, saturation, value = rng.uniform(-0.03, 0.4) % 1, rng.uniform(0.4, 1), rng.uniform(0.5, 1)
+    radius, stretch = rng.uniform(0.04, 0.2) * min(size), rng.uniform(1, 2.2)
+    middle, spread = rng.uniform(0.3, 0.7, 2) * size, rng.uniform(0.1, 0.35, 2) * size
+    for _ in range(int(rng.integers(6, 60) * min(0.1 * min(size) / radius, 1)) + 1):
+        x, y = middle + spread * rng.normal(size=2)
+        for shade, share, offset in ((0.6, 1.0, 0.0), (1.0, 0.85, 0.1), (1.3, 0.3, 0.35)):
+            rgb = matplotlib.colors.hsv_to_rgb([hue, saturation / max(shade, 1) ** 2, min(value * shade, 1)])
+            r, at = share * radius, (x - offset * radius, y - offset * radius)
+            colour = tuple(round(255 * v) for v in rgb)
+            draw.ellipse((at[0] - stretch * r, at[1] - r, at[0] + stretch * r, at[1] + r), fill=colour)
+
+
+def _write(
+    image: Image.Image,
+    text: str,
+    at: tuple[float, float],
+    letter: float,
+    most: float,
+    rng: np.random.Generator | None,
+    ink: tuple[int, ...],
+    outline: tuple[int, ...] | None,
+) -> float:
+    """Write in letters of so many pixels, no wider than so many, about a point; how high they are."""
+    letter = max(min(letter, 1.5 * most / len(text)), 6)
+    font = ImageFont.truetype(str(FONTS[rng.integers(len(FONTS)) if rng else 0]), int(letter))
+    stroke = 0 if outline is None else max(round(0.08 * letter), 1)
+    ImageDraw.Draw(image).text(at, text, font=font, fill=ink, anchor="mm", stroke_width=stroke, stroke_fill=outline)
+    return letter
 
 
 def _textured(
@@ -130,25 +190,41 @@ def _turned(profile: np.ndarray, image: Image.Image, gloss: float, sections: int
 
 
 def _round_label(
-    profile: np.ndarray, printed: tuple[int, int], rng: np.random.Generator, plain: tuple[int, int, int]
+    profile: np.ndarray,
+    printed: tuple[int, int],
+    rng: np.random.Generator,
+    plain: tuple[int, ...],
+    painted: Sequence[tuple[int, int, tuple[int, ...]]] = (),
 ) -> Image.Image:
-    """The texture of a turned solid: a label between two points of the profile, plain elsewhere."""
+    """The texture of a turned solid: a label between two points of the profile, plain elsewhere, or painted."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     around = 2 * np.pi * profile[:, 0].max()
     colours = _colours(rng)
-    label = _label(around, length[printed[1]] - length[printed[0]], rng, colours)
-    height = max(round(length[-1] * _PIXELS_PER_METRE), label.height)
-    image = Image.new("RGB", (label.width, height), plain)
-    image.paste(label, (0, round(height * (1 - length[printed[1]] / length[-1]))))
+    sides = [_label(around / 2, length[printed[1]] - length[printed[0]], rng, colours)] * 2
+    if rng.random() < 0.5:
+        sides[1] = _label(around / 2, length[printed[1]] - length[printed[0]], rng, colours)
+    width, height = 2 * sides[0].width, max(round(length[-1] * _PIXELS_PER_METRE), sides[0].height)
+    image = Image.new("RGB", (width, height), plain)
+    for place, side in enumerate(sides):
+        image.paste(side, (place * side.width, round(height * (1 - length[printed[1]] / length[-1]))))
+    draw = ImageDraw.Draw(image)
+    for first, last, colour in painted:
+        top, bottom = (round(height * (1 - length[end] / length[-1])) for end in (last, first))
+        draw.rectangle((0, top, width, bottom), fill=colour)
     return image
 
 
 def _can(rng: np.random.Generator) -> trimesh.Trimesh:
     radius, height = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.14)
-    rim = 0.004
-    profile = np.array([[0, 0], [radius, 0], [radius, rim], [radius, height - rim], [radius, height], [0, height]])
-    grey = int(rng.uniform(150, 210))
-    return _turned(profile, _round_label(profile, (2, 3), rng, (grey, grey, grey)), rng.uniform(0.3, 0.6))
+    rim, sunk = 0.003, 0.9 * radius
+    profile = np.array([
+        [0, 0.003], [sunk, 0.003], [sunk, 0], [radius, 0], [radius, rim], [radius, height - rim], [radius, height],
+        [sunk, height], [sunk, height - 0.003], [0.6 * radius, height - 0.003], [0.6 * radius, height - 0.002],
+        [0, height - 0.002],
+    ])  # fmt: skip
+    greys = [(int(value),) * 3 for value in rng.uniform(120, 220, 4)]
+    lid = [(0, 2, greys[1]), (7, 8, greys[2]), (8, 9, greys[3]), (9, 10, greys[2])]
+    return _turned(profile, _round_label(profile, (4, 5), rng, greys[0], lid), rng.uniform(0.25, 0.5))
 
 
 def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
@@ -156,11 +232,9 @@ def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
     shoulder, neck = rng.uniform(0.55, 0.75) * height, rng.uniform(0.35, 0.6) * radius
     profile = np.array([
         [0, 0], [0.9 * radius, 0], [radius, 0.1 * height], [radius, shoulder],
-        [neck, 0.85 * height], [neck, height], [0, height],
+        [neck, 0.82 * height], [1.2 * neck, 0.82 * height], [1.1 * neck, height], [0, height],
     ])  # fmt: skip
-    plain = tuple(
-        int(v) for v in 255 * matplotlib.colors.hsv_to_rgb([rng.random(), rng.uniform(0, 1), rng.uniform(0.3, 1)])
-    )
-    mesh = _turned(profile, _round_label(profile, (2, 3), rng, plain), rng.uniform(0.25, 0.6))  # type: ignore[arg-type]
+    texture = _round_label(profile, (2, 3), rng, _any_colour(rng), [(5, 7, _any_colour(rng))])
+    mesh = _turned(profile, texture, rng.uniform(0.25, 0.6))
     mesh.apply_scale([1, rng.uniform(0.6, 1), 1])
     return mesh

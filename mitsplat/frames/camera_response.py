@@ -163,7 +163,7 @@ class Development:
     Attributes:
         data: Its bytes on the device, flat and row-major, red, green, blue.
         shape: Height and width [px].
-        sharpening: How many times is added what the encoded picture has beyond its Gaussian blur of 1 px (unsharp mask).
+        sharpening: How many times what the encoded picture has beyond a Gaussian blur of 1 px is added (unsharp mask).
         jpeg: Quality of the JPEG file that it has been, if any.
     """
 

@@ -25,7 +25,7 @@ from mitsplat.capture.targets import Board
 from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
-from mitsplat.isolation import ChosenObject, Pick, View, choose_object
+from mitsplat.isolation import ChosenObject, Pick, View, choose_object, hidden_share
 from mitsplat.progress import Progress
 
 MIN_PHOTOS = 3
@@ -34,6 +34,9 @@ MIN_REGISTERED = 0.75
 
 FEW_POINTS = 3 * MIN_POINTS
 """A camera that observes fewer points is worth a warning."""
+
+_MOST_HIDDEN = 0.03
+"""Share of the object that other things may hide in a photo; masks take in what hides more."""
 
 _INPUTS = "inputs.json"
 _RECORDED = ("source", "reprojection_error", "doubtful")
@@ -392,11 +395,24 @@ def _masked(
     else:
         chosen = _chosen(capture, settings)
         points, above = chosen.points, chosen.above
+        capture = _without_hidden(capture, chosen)
     masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
     if len(masked.photos) < MIN_PHOTOS:
         return masked
     # What a photo was rejected for may be what the others set right.
     return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=above)
+
+
+def _without_hidden(capture: Capture, chosen: ChosenObject) -> Capture:
+    """The capture without photos in which another thing stands before the object: masks would take it in."""
+    photos, rejected = [], dict(capture.rejected)
+    for photo in capture.photos:
+        share = hidden_share(photo.camera, chosen.above, chosen.others)
+        if share > _MOST_HIDDEN:
+            rejected[photo.name] = f"another thing stands before the object and hides {share:.0%} of it"
+        else:
+            photos.append(photo)
+    return replace(capture, photos=tuple(photos), rejected=rejected)
 
 
 def _chosen(capture: Capture, settings: CaptureSettings) -> ChosenObject:

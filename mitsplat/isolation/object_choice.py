@@ -74,12 +74,12 @@ class ChosenObject:
     Attributes:
         points: On it, and where the lowest stand on the support, shape (N, 3).
         above: Those on it alone, shape (M, 3).
-        things: Number of things that stand there.
+        others: Those on each other thing that stands there, shape (K, 3).
     """
 
     points: Float64Array
     above: Float64Array
-    things: int
+    others: tuple[Float64Array, ...]
 
 
 def choose_object(
@@ -132,13 +132,14 @@ def choose_object(
         for pick in picks_not:
             scores[_picked(pick, points, thing)] = -1
         chosen = np.array([int(scores.argmax())])
-    others = {_picked(pick, points, thing) for pick in picks_not}
-    if others >= set(chosen.tolist()):
+    refused = {_picked(pick, points, thing) for pick in picks_not}
+    if refused >= set(chosen.tolist()):
         raise InputError(f"what was picked is also said not to be the object ({picks_not[0].name}): they touch")
-    own = np.isin(thing, [number for number in chosen.tolist() if number not in others])
+    own = np.isin(thing, [number for number in chosen.tolist() if number not in refused])
     feet = _feet(points[own], height[own], support)
-    large = int((np.bincount(thing[stands]) >= _FEWEST).sum())
-    return ChosenObject(np.concatenate([points[own], feet]), points[own], large)
+    large = np.flatnonzero(np.bincount(thing[stands]) >= _FEWEST)
+    others = tuple(points[thing == number] for number in large if not own[thing == number].any())
+    return ChosenObject(np.concatenate([points[own], feet]), points[own], others)
 
 
 def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:

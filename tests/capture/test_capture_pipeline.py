@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -21,14 +22,15 @@ from mitsplat.camera import Camera
 from mitsplat.capture import known_poses as poses
 from mitsplat.capture import pipeline as take
 from mitsplat.capture import structure_from_motion as sfm
-from mitsplat.capture.capture import Capture
+from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import agreed_masks, geometric_masks, object_points
 from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
 from mitsplat.capture.photos import prepare_photos
-from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
+from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, _without_hidden, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.isolation import ChosenObject
 from tests import rendered
 from tests.cli.test_cli import run
 
@@ -266,6 +268,22 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")
     with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 480x360 px \(got 300x300\)"):
         capture_photos(given, tmp_path / "out", settings)
+
+
+def test_photos_in_which_another_thing_stands_before_the_object_are_left_out() -> None:
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(400, 3))
+    ball *= 0.04 / np.linalg.norm(ball, axis=1, keepdims=True)
+    photos = tuple(
+        Photo(f"{turn:03}.jpg", Path("none.jpg"), Camera.look_at(eye, (0, 0, 0), width=320, height=240, fov_x=40))
+        for turn in range(0, 360, 45)
+        for eye in [(0.4 * np.cos(np.radians(turn)), 0.4 * np.sin(np.radians(turn)), 0.1)]
+    )
+    capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3)), rejected={"blurred.jpg": "it is blurred"})
+    found = _without_hidden(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
+    assert [photo.name for photo in found.photos] == [f"{turn:03}.jpg" for turn in range(45, 360, 45)]
+    assert found.rejected.keys() == {"blurred.jpg", "000.jpg"}
+    assert re.fullmatch(r"another thing stands before the object and hides \d+% of it", found.rejected["000.jpg"])
 
 
 def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> None:

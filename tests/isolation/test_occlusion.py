@@ -1,0 +1,44 @@
+"""What stands before the object in a photo, against areas of discs that overlap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsplat.arrays import Float64Array
+from mitsplat.camera import Camera
+from mitsplat.isolation.occlusion import hidden_share
+
+
+def ball(middle: tuple[float, float, float], radius: float = 0.04, count: int = 800) -> Float64Array:
+    """Points on a ball [m], shape (N, 3)."""
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    return points * radius / np.linalg.norm(points, axis=1, keepdims=True) + middle
+
+
+CAMERA = Camera.look_at((0, -5, 0), (0, 0, 0), width=640, height=480, fov_x=3)
+"""From so far that balls are discs."""
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.02, 0.04, 0.06, 0.1])
+def test_a_ball_hides_as_much_of_another_as_their_discs_share(aside: float) -> None:
+    own, before, behind = ball((0, 0, 0)), ball((aside, -0.2, 0)), ball((aside, 0.2, 0))
+    # Two discs of radius r whose middles are d apart share 2 r^2 acos(d / 2r) - d sqrt(r^2 - d^2 / 4).
+    half = min(aside / 0.08, 1.0)
+    shared = (2 * np.arccos(half) - 2 * half * np.sqrt(1 - half**2)) / np.pi
+    assert hidden_share(CAMERA, own, [before]) == pytest.approx(shared, abs=0.05)
+    assert hidden_share(CAMERA, own, [behind]) == 0
+    assert hidden_share(CAMERA, own, [before, behind, before]) == pytest.approx(shared, abs=0.05)
+
+
+def test_a_ring_around_the_object_hides_only_what_stands_before_it() -> None:
+    turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    ring = np.column_stack([0.07 * np.cos(turns), 0.07 * np.sin(turns), np.full(400, -0.035)])
+    camera = Camera.look_at((0, -0.4, 0.25), (0, 0, 0), width=640, height=480, fov_x=40)
+    assert hidden_share(camera, ball((0, 0, 0)), [ring]) < 0.1
+
+
+def test_too_few_points_hide_nothing() -> None:
+    assert hidden_share(CAMERA, ball((0, 0, 0)), []) == 0
+    assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0, -0.2, 0))[:3]]) < 0.001
+    assert hidden_share(CAMERA, ball((0, -6, 0)), [ball((0, -0.2, 0))]) == 0

@@ -39,6 +39,10 @@ def train(
     steps: Annotated[int, typer.Option(help="Batches to learn from, however many images there are.")] = 1500,
     batch: Annotated[int, typer.Option(help="Images of a step.")] = 16,
     size: Annotated[int, typer.Option(help="Longer side that images are scaled to [px], a multiple of 32.")] = 640,
+    mirror: Annotated[
+        bool,
+        typer.Option(help="Mirror half of the images: not for what is printed, or for left and right parts."),
+    ] = True,
     seed: Seed = 0,
     device: TorchDevice = "auto",
     workers: Annotated[
@@ -62,6 +66,7 @@ def train(
         batch=batch,
         size=size,
         share=share,
+        mirror=mirror,
         seed=seed,
         device=device,
         workers=workers,

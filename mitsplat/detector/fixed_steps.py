@@ -88,7 +88,7 @@ class Outcome:
 
 
 def train_job(
-    job: Job, *, network: str, weights: Path | None, size: int, seed: int, device: str, workers: int
+    job: Job, *, network: str, weights: Path | None, size: int, mirror: bool, seed: int, device: str, workers: int
 ) -> Outcome:
     """Train, from the run's checkpoint if it has one.
 
@@ -97,6 +97,7 @@ def train_job(
         network: Name of the network's YAML file.
         weights: What to start from, or None for random weights.
         size: Longer side of images [px].
+        mirror: Whether half of them are mirrored left to right.
         seed: Decides everything that is random.
         device: As Ultralytics names it.
         workers: Processes that read images; none on the CPU.
@@ -110,6 +111,7 @@ def train_job(
         "batch": batch,
         "nbs": batch,  # one update of the weights for each batch
         "imgsz": size,
+        "fliplr": 0.5 if mirror else 0.0,
         "seed": seed,
         "deterministic": True,
         "device": device,

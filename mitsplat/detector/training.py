@@ -60,6 +60,8 @@ class TrainSettings:
         batch: Images of a step.
         size: Longer side that images are scaled to [px], a multiple of 32.
         share: Of real images among those of each step, where there are some.
+        mirror: Whether half of the images are mirrored left to right: wrong of what is printed, and of left and right
+            parts that are told apart.
         seed: Decides everything that is random.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, as PyTorch counts GPUs.
         workers: Processes that read images, beside this one; if None, up to 8, and none on the CPU.
@@ -71,6 +73,7 @@ class TrainSettings:
     batch: int = 16
     size: int = 640
     share: float = 0.1
+    mirror: bool = True
     seed: int = 0
     device: str = "auto"
     workers: int | None = None
@@ -293,6 +296,7 @@ def _train(
         network=settings.model,
         weights=settings.weights,
         size=settings.size,
+        mirror=settings.mirror,
         seed=settings.seed,
         device=device,
         workers=0 if device == "cpu" else workers,

@@ -377,6 +377,30 @@ def test_every_step_takes_the_images_of_the_plan(data: Path, tmp_path: Path, mon
 
 @needs_ultralytics
 @pytest.mark.slow
+@pytest.mark.parametrize("mirror", [True, False])
+def test_images_are_mirrored_only_if_wanted(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mirror: bool
+) -> None:
+    from ultralytics.data.augment import RandomFlip
+
+    mirrored: list[bool] = []
+    apply = RandomFlip.apply_image
+
+    def look(self: Any, labels: dict[str, Any], params: dict[str, Any]) -> Any:
+        before = labels["img"].copy()
+        after = apply(self, labels, params)
+        if self.direction == "horizontal":
+            mirrored.append(bool((after["img"] != before).any()))
+        return after
+
+    monkeypatch.setattr(RandomFlip, "apply_image", look)
+    train_detector([data / "cell"], tmp_path / "run", _other(mirror=mirror))
+    assert len(mirrored) == 16
+    assert 3 <= sum(mirrored) <= 13 if mirror else not any(mirrored)
+
+
+@needs_ultralytics
+@pytest.mark.slow
 def test_figures_are_those_of_ultralytics(data: Path, trained: Run, tmp_path: Path) -> None:
     """Its own validation, told to do what else differs: images letterboxed to squares, masks compared in all pixels.
 

@@ -287,7 +287,7 @@ def _march(
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
         """States of the rays at a place in the pixels, and estimates of their errors."""
-        state = {"several": labelled and several, "late": late}
+        state: dict[str, Any] = {"several": labelled and several, "late": late}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
         found = walk(rays, order, partial(_fresh, **state), partial(_blend, **state), right if gives_up else None)
@@ -354,7 +354,7 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
     if quality.order == "ray":
         dr.eval(lists.nearest)
     late = _late(quality)
-    state = {"several": lists.instance is None, "late": late}
+    state: dict[str, Any] = {"several": lists.instance is None, "late": late}
     where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
     rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
     found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))

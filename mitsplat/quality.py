@@ -56,6 +56,9 @@ class Quality:
         transmittance_min: A ray ends when less than this share of the light behind would still be seen.
         extends: Whether what a ray has not seen because it ended counts as the mean of what it has seen, and not as
             nothing, by which it mostly is nearer to a ray that goes on.
+        amends: Whether, where the tolerance is infinite, a Gaussian that comes later in its tile's order than along the
+            ray takes its share of the colour from what it hides, as far as a few sums tell what that is. Opacities,
+            depths and instances stay those of the tile's order.
         sh_degree: Highest spherical-harmonic band that is evaluated.
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered); ``edges`` for one, and 2 x 2
             where instances border on each other, see :mod:`mitsplat.plugins.edges`.
@@ -69,6 +72,7 @@ class Quality:
     alpha_min: float = 1.0 / 255.0
     transmittance_min: float = 1e-3
     extends: bool = False
+    amends: bool = False
     sh_degree: int = 3
     samples: Samples = 1
     lens_rings: int = 2
@@ -103,7 +107,7 @@ class Quality:
 
 
 PRESETS: dict[PresetName, Quality] = {
-    "fast": Quality(alpha_min=3e-3, transmittance_min=2e-2, extends=True, sh_degree=2),
+    "fast": Quality(alpha_min=3e-3, transmittance_min=2e-2, extends=True, amends=True, sh_degree=2),
     "balanced": Quality(tolerance=1e-2, alpha_min=1e-3, transmittance_min=1e-3, extends=True),
     "exact": Quality(tolerance=0.0, alpha_min=1e-5, transmittance_min=1e-6),
 }

@@ -72,6 +72,8 @@ def _check(view: View, quality: Quality) -> None:
         raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
     if quality.extends:
         raise ValueError("gradients need rays that do not extend beyond their end (quality.extends)")
+    if quality.amends:
+        raise ValueError("gradients need colours in the order of tiles as it is (quality.amends)")
     if KERNELS[quality.kernel].alpha_max < 1:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
 

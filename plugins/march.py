@@ -19,6 +19,10 @@ forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of the
 sums counts what lies behind the late peak, if they reach evenly from the deepest peak to as far in front of their mean.
 Those are seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
 
+`fast` adds that difference to the colour instead (`amends`): what comes late takes from what it hides. Its weight and
+theirs change by the same amount, so that one colour stays one colour. Sums there forget more of what lies in front,
+S / (S + 8 w).
+
 Most tiles need no more than their own order, and one walk in that, several rays to a lane, tells which: where the
 estimate exceeds the tolerance, it ends. Such tiles are walked in a window, and those of them in which an estimate still
 exceeds the tolerance in the order of each ray.
@@ -30,7 +34,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial, reduce
 from operator import or_
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -108,50 +112,88 @@ def largest_and_mean(error: Any) -> tuple[Any, Any]:
 
 T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
 """State of a ray: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and from there
-on the tally of its instances where there are several. Where the error of the order is estimated, that comes last."""
+on the tally of its instances where there are several. What is known of late peaks comes last, see :data:`_EXTRA`."""
 
-ESTIMATE = 7
+Late = Literal["taken", "estimated", "amended"]
+"""What becomes of peaks that come late in the order of a tile: nothing, an estimate of the error, or its correction."""
+
+_EXTRA: dict[Late, int] = {"taken": 0, "estimated": 7, "amended": 6}
+"""Numbers that a ray's state holds for that."""
+
 ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
-"""State of the estimate: error, deepest peak, sums of the last weights and of these times depth, red, green, blue."""
+"""State of late peaks: estimate of the error; deepest peak, and sums of the last weights and of these times depth, red,
+green, blue."""
+
+_FORGETS = 8
+"""Weights of a new deepest peak that sums give way to where late ones are amended. From 2 on, more is better for solid
+walls, and less for a solid object: the PSNR of captures changes by 0.6 dB at the most up to 16."""
 
 
-def _fresh(several: bool, estimated: bool) -> Pixel:
+def _fresh(several: bool, late: Late) -> Pixel:
     """A ray that has met nothing yet."""
     nothing = [mi.Float(0.0) for _ in range(TALLY - 1)]
-    tally, error = new_tally() if several else [], [mi.Float(0.0) for _ in range(ESTIMATE if estimated else 0)]
-    return [mi.Float(1.0), *nothing, *tally, *error]
+    tally, extra = new_tally() if several else [], [mi.Float(0.0) for _ in range(_EXTRA[late])]
+    return [mi.Float(1.0), *nothing, *tally, *extra]
 
 
-def _blend(pixel: Pixel, weight: Any, record: Any, z: Any, several: bool, estimated: bool) -> Pixel:
+def _blend(pixel: Pixel, weight: Any, record: Any, z: Any, several: bool, late: Late) -> Pixel:
     """The pixel after one more Gaussian."""
     transmittance = pixel[T] - weight
     colour = [record[6], record[7], record[8]]
+    sums = [dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)]
+    extra: list[Any] = []
+    if late == "estimated":
+        extra = _add_to_error(pixel, weight, colour, z)
+    elif late == "amended":
+        change, extra = _amended(pixel, weight, colour, z)
+        sums = [a + b for a, b in zip(sums, change, strict=True)]
     return [
         transmittance,
-        *(dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)),
+        *sums,
         dr.fma(weight, z, pixel[SUM_Z]),
         dr.select((pixel[T] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z]),
-        *(add_to_tally(pixel[TALLY : -ESTIMATE if estimated else None], weight, record[15]) if several else []),
-        *(_add_to_error(pixel, weight, colour, z) if estimated else []),
+        *(add_to_tally(pixel[TALLY : len(pixel) - len(extra)], weight, record[15]) if several else []),
+        *extra,
     ]
+
+
+def _share_behind(pixel: Pixel, z: Any) -> Any:
+    """Share of the sums that lies behind a peak, see the module; where that is late."""
+    total, moment, *_ = pixel[SUMS]
+    gap, reach = (pixel[DEEPEST] - z) * total, 2 * dr.fma(pixel[DEEPEST], total, -moment)
+    return dr.select(gap < reach, gap / reach, 1.0)
 
 
 def _add_to_error(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> list[Any]:
     """The estimate after one more Gaussian, see the module."""
-    total, moment, *colours = pixel[SUMS]
+    total, _, *colours = pixel[SUMS]
     deepest, opacity = pixel[DEEPEST], weight / pixel[T]
     met = weight > 0
     late = met & (z < deepest)
     change = mi.Float(0.0)
     for c, sum_c in zip(colour, colours, strict=True):
         change = dr.maximum(change, dr.abs(dr.fma(total, c, -sum_c)))
-    gap, reach = (deepest - z) * total, 2 * dr.fma(deepest, total, -moment)
-    behind = dr.select(gap < reach, gap / reach, 1.0)
     keep = dr.select(met & ~late, total / dr.fma(2, weight, total), 1.0)
     return [
-        dr.select(late, dr.fma(opacity * behind, change, pixel[ERROR]), pixel[ERROR]),
+        dr.select(late, dr.fma(opacity * _share_behind(pixel, z), change, pixel[ERROR]), pixel[ERROR]),
         dr.select(met, dr.maximum(z, deepest), deepest),
         *(dr.fma(keep, old, weight * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
+    ]
+
+
+def _amended(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
+    """What one more Gaussian changes of the colour if it is late, and the state of late peaks after it."""
+    total, _, *colours = pixel[SUMS]
+    deepest = pixel[DEEPEST]
+    met = weight > 0
+    late = met & (z < deepest)
+    taken = dr.select(late, weight / pixel[T] * _share_behind(pixel, z), 0.0)
+    change = [taken * dr.fma(total, c, -sum_c) for c, sum_c in zip(colour, colours, strict=True)]
+    keep = dr.select(met & ~late, total / dr.fma(_FORGETS, weight, total), 1.0 - taken)
+    own = dr.fma(taken, total, weight)
+    return change, [
+        dr.select(met, dr.maximum(z, deepest), deepest),
+        *(dr.fma(keep, old, own * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
     ]
 
 
@@ -237,6 +279,7 @@ def _march(
     several = lists.instance is None
     tolerance = dr.opaque(mi.Float, quality.tolerance) if estimated else None
     gives_up = estimated and order == "tile"
+    late: Late = "estimated" if estimated else _late(quality)
 
     def right(pixels: list[Pixel]) -> Any:
         """Whether lanes have no ray whose error exceeds the tolerance."""
@@ -244,11 +287,11 @@ def _march(
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
         """States of the rays at a place in the pixels, and estimates of their errors."""
-        state = {"several": labelled and several, "estimated": estimated}
+        state: dict[str, Any] = {"several": labelled and several, "late": late}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
         found = walk(rays, order, partial(_fresh, **state), partial(_blend, **state), right if gives_up else None)
-        return ([pixel[:-ESTIMATE] for pixel in found], [pixel[ERROR] for pixel in found]) if estimated else (found, [])
+        return _without_extra(found, late), [pixel[ERROR] for pixel in found] if estimated else []
 
     found, errors = pixels(0.5, 0.5, labelled=True)
     image, unsure = _collect(found, lanes, lists.instance, quality)
@@ -277,6 +320,16 @@ def _march(
     return image, _tiles_of(_too_wrong(errors, tolerance), lanes) if estimated else None
 
 
+def _late(quality: Quality) -> Late:
+    """What becomes of late peaks where no error is estimated: in the order of rays there are none."""
+    return "amended" if quality.amends and quality.order == "tile" else "taken"
+
+
+def _without_extra(pixels: list[Pixel], late: Late) -> list[Pixel]:
+    """States of rays without what is known of late peaks."""
+    return [pixel[: len(pixel) - _EXTRA[late]] for pixel in pixels]
+
+
 def _too_wrong(errors: list[Any], tolerance: Any) -> Any:
     """Whether the estimate for any of a lane's rays exceeds the tolerance."""
     return largest(errors) > tolerance
@@ -300,11 +353,12 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
     far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
     if quality.order == "ray":
         dr.eval(lists.nearest)
-    state = {"several": lists.instance is None, "estimated": False}
+    late = _late(quality)
+    state: dict[str, Any] = {"several": lists.instance is None, "late": late}
     where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
     rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
     found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
-    image, _ = _collect(found, lanes, lists.instance, quality)
+    image, _ = _collect(_without_extra(found, late), lanes, lists.instance, quality)
     dr.eval(image)
     return image
 

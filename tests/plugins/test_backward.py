@@ -123,6 +123,17 @@ def test_image_is_that_of_the_plain_march(distortion: tuple[float, ...]) -> None
     assert np.array(rgb[0]).max() > 0.1
 
 
+@pytest.mark.parametrize("switch", ["extends", "amends"])
+def test_no_gradients_of_colours_that_are_put_right_afterwards(switch: str) -> None:
+    ensure_variant()
+    from mitsplat.plugins.splat_proxy import view_of
+
+    splats = make_splats(1, 3)
+    cloud = backward.pack_cloud(*[mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS], 16)
+    with pytest.raises(ValueError, match=switch):
+        backward.render_differentiable(cloud, view_of(make_sensor(CAMERA)), replace(QUALITY, **{switch: True}))
+
+
 def test_depth_of_an_opaque_gaussian_is_that_of_its_centre() -> None:
     """Moving the camera's only Gaussian away by dz moves depth by dz, whatever its alpha."""
     ensure_variant()

@@ -164,11 +164,44 @@ def test_late_by_one_place_is_estimated_exactly() -> None:
     from mitsplat.plugins.march import ERROR, _blend, _fresh
 
     colours, opacities = ((0.9, 0.2, 0.1), (0.3, 0.6, 0.4)), (0.6, 0.5)
-    pixel = _fresh(False, True)
+    pixel = _fresh(False, "estimated")
     for colour, opacity, z in zip(colours, opacities, (2.0, 1.0), strict=True):
         record = {6: colour[0], 7: colour[1], 8: colour[2]}
-        pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, True)
+        pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, "estimated")
     assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
+
+
+def test_late_by_one_place_is_amended_exactly() -> None:
+    """The colour is that of the right order, and a third one, late behind both, is blended as it comes."""
+    ensure_variant()
+    from mitsplat.plugins.march import BLUE, RED, _blend, _fresh
+
+    met = [((0.9, 0.2, 0.1), 0.6, 2.0), ((0.3, 0.6, 0.4), 0.5, 1.0), ((0.1, 0.8, 0.5), 0.7, 3.0)]
+    pixel = _fresh(False, "amended")
+    for colour, opacity, z in met:
+        record = {6: colour[0], 7: colour[1], 8: colour[2]}
+        pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, "amended")
+    expected, transmittance = np.zeros(3), 1.0
+    for colour, opacity, _ in sorted(met, key=lambda peak: peak[2]):
+        expected += transmittance * opacity * np.array(colour)
+        transmittance *= 1 - opacity
+    assert np.array(pixel[RED : BLUE + 1]).ravel() == pytest.approx(expected, abs=1e-6)
+    assert np.array(pixel[0]).item() == pytest.approx(transmittance)
+
+
+def test_amended_pictures_are_nearer_to_the_order_of_rays_and_show_the_same_things() -> None:
+    plain = replace(PRESETS["fast"], amends=False)
+    layers, amended = (render_splats(CROWD, WIDE, quality=quality) for quality in (plain, PRESETS["fast"]))
+    exact = display(render_splats(CROWD, WIDE, quality=replace(plain, tolerance=0.0)))
+    before, after = (float(np.sqrt(np.mean((display(each) - exact) ** 2))) for each in (layers, amended))
+    assert after < 0.8 * before
+    for name in ("alpha", "depth", "instance"):
+        np.testing.assert_array_equal(getattr(amended, name), getattr(layers, name))
+
+
+def test_amended_pictures_of_one_colour_keep_it() -> None:
+    even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality="fast")
+    assert np.ptp(even.rgb / even.alpha[..., None]) < 1e-5
 
 
 def test_the_error_that_is_left_is_told_with_the_picture() -> None:

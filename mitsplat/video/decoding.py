@@ -83,17 +83,19 @@ def open_video(file: Path) -> Iterator[VideoReader]:
     """Open a video at its first frame; frames are turned as the camera's sensor of gravity says.
 
     Raises:
-        InputError: If it is none that can be read.
+        InputError: If it is none that can be read, or OpenCV gives up on it while it is used.
     """
     opened = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
     try:
         if not opened.isOpened():
             raise InputError(
-                f"{file}: must be a video that FFmpeg reads, such as .mp4, .mov or .avi (got a file of "
-                f"{file.stat().st_size} bytes that it does not, or that is cut short)"
+                f"{file}: must be a whole video that FFmpeg reads, such as .mp4, .mov or .avi (got a file of "
+                f"{file.stat().st_size} bytes that it cannot open)"
             )
         opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         rate, stated = opened.get(cv2.CAP_PROP_FPS), opened.get(cv2.CAP_PROP_FRAME_COUNT)
         yield VideoReader(file, opened, rate if 0 < rate < 1000 else _RATE, max(0, int(stated)))
+    except cv2.error as error:  # such as frames of several sizes, or of more memory than there is
+        raise InputError(f"{file}: must hold frames that can be decoded (got {error.err or error})") from error
     finally:
         opened.release()

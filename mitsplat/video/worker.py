@@ -9,6 +9,7 @@ say of the frames that lie in FOLDER.
 from __future__ import annotations
 
 import json
+import resource
 import sys
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,9 @@ from mitsplat.video.choice import STEP, Choice, FrameMeasure, choose
 from mitsplat.video.decoding import open_video
 from mitsplat.video.motion import MotionClock
 from mitsplat.video.sharpness import sharpness
+
+_MEMORY = 12 << 30
+"""Address space [bytes]; decoders of large frames reserve some for each thread."""
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
@@ -109,4 +113,5 @@ def _say(**message: Any) -> None:
 
 
 if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, resource.RLIM_INFINITY))
     main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

@@ -28,6 +28,7 @@ from mitsplat.cli import app
 from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.scene import load_scene
 from mitsplat.surfels import place_surfels
+from tests import rendered
 from tests.conftest import box_asset
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ SMALLER = {
     "settle": ["-n", "1", "--size", "32x18"],
     "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60", "--sh-degree", "0"],
+    "capture": ["--frames", "24"],
     "asset": ["--gaussians", "300", "--iterations", "20", "--edge", "64", "--faces", "300"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],
@@ -217,7 +219,8 @@ def test_the_guides_scene_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
-    """Their cameras are there, as if a first run had ended after structure from motion, which takes a minute.
+    """Their cameras are there, as if a first run had ended after structure from motion, which takes a minute; those of
+    the video are found.
 
     Status 4 is that of a tiny fit, which misses the thresholds of an asset.
     """
@@ -226,8 +229,12 @@ def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Pat
         shutil.copytree(given, desk / "photos" / name)
     for place in ("captures/mug", "assets/mug/capture", "assets/cell/capture"):
         shutil.copytree(out, desk / place)
+    (desk / "videos").mkdir()
+    rendered.render_video(desk / "videos/mug.mp4")
     for words in SHOWN:
         if words[1] in PHOTOGRAPHS or "assets/mug" in words:
             obey(words, desk, good={"asset": (0, 4), "mesh": (0, 4), "check": (0, 1)}.get(words[1], (0,)))
     made = ("captures/mug/capture.png", "assets/mug/report.html", "assets/mug_by_stages/report.html")
+    film = desk / "captures/mug_film"
+    assert len(list((film / "images").iterdir())) >= 0.75 * len(list((film / "frames").glob("*.jpg"))) > 15
     assert [name for name in made if not (desk / name).stat().st_size] == []

@@ -257,9 +257,9 @@ def jumpy(file: Path) -> Path:
     [
         (
             text,
-            r"must be a video that FFmpeg reads, such as .mp4, .mov or .avi \(got a file of 8 bytes that it does not",
+            r"must be a whole video that FFmpeg reads, such as .mp4, .mov or .avi \(got a file of 8 bytes that",
         ),
-        (headless, r"must be a video that FFmpeg reads, .* or that is cut short\)"),
+        (headless, r"must be a whole video that FFmpeg reads, .* that it cannot open\)"),
         (
             torn,
             r"must hold the 60 frames that it is said to \(got \d\d, \d\.\d of 2\.0 s\): it is cut short or damaged",

@@ -64,7 +64,7 @@ def walk(count: int) -> list[Camera]:
     return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
 
 
-def render_video(file: Path, count: int = 150, *, samples: int = 4) -> dict[int, Camera]:
+def render_video(file: Path, count: int = 96, *, samples: int = 4) -> dict[int, Camera]:
     """Render a video of 30 frames a second, of which every tenth is blurred; returns its cameras by frame."""
     with TemporaryDirectory() as folder:
         found = photograph(box_scene(5), walk(count), Path(folder), samples=samples)

@@ -57,7 +57,8 @@ def choose(measures: list[FrameMeasure], most: int) -> Choice:
 
     Each stretch without jumps is divided into equal steps of at most :data:`STEP`, or of longer ones where there would
     be more than ``most``. Sharpness is compared within a step alone: its frames show nearly the same, so that blur
-    decides and not texture. Jumps are steps too: with more than ``most`` of them, there is more than a frame of each.
+    decides and not texture. Every stretch gives a frame at least: more than ``most`` come only of a video that jumps as
+    often.
     """
     usable = [measure for measure in measures if measure.moved.followed]
     numbers = sorted({measure.moved.segment for measure in usable})

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
 import mitsuba as mi
 import numpy as np
 
@@ -52,3 +54,23 @@ def _sides(rng: np.random.Generator) -> list[dict[str, Any]]:
         colour = paint(speckle(rng, 10, (0.8, 0.4, 0.3)))
         sides.append({"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": colour})
     return sides
+
+
+def walk(count: int) -> list[Camera]:
+    """Cameras of a hand that goes once around the box, up and down a little."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    heights, radii = 0.19 + 0.03 * np.sin(3 * angles), 0.23 + 0.015 * np.cos(3 * angles)
+    places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
+    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
+
+
+def render_video(file: Path, count: int = 96, *, samples: int = 4) -> dict[int, Camera]:
+    """Render a video of 30 frames a second, of which every tenth is blurred; returns its cameras by frame."""
+    with TemporaryDirectory() as folder:
+        found = photograph(box_scene(5), walk(count), Path(folder), samples=samples)
+        writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 30.0, SIZE)
+        for number, name in enumerate(found):
+            picture = cv2.imread(str(Path(folder) / name))
+            writer.write(cv2.blur(picture, (9, 9)) if number % 10 == 5 else picture)
+        writer.release()
+    return dict(enumerate(found.values()))

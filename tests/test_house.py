@@ -21,7 +21,7 @@ FLOORS = (
     ("fit", "frames"),
     ("labels", "physics", "render"),
     ("capture", "engine", "plugins", "scene"),
-    ("isolation",),
+    ("isolation", "video"),
     ("spec",),
     ("ground",),
 )

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import gaussforge
 import numpy as np
 import trimesh
@@ -43,6 +44,7 @@ from mitsplat.errors import InputError
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
+from mitsplat.video import choose_frames
 
 MEMORY = 12 << 30
 """Address space of a child [bytes]; libraries that it loads reserve some of it without using it."""
@@ -174,6 +176,11 @@ def make_samples(folder: Path) -> None:
     (folder / "model/images.txt").write_text("1 1 0 0 0 0 0 1 1 a.png\n5 6 1\n2 1 0 0 0 0.1 0 1 1 b.png\n5 6 1\n")
     (folder / "model/points3D.txt").write_text("1 0 0 1 9 9 9 0.1 1 0 2 0\n")
     _labelled(folder, rng)
+    noise = cv2.resize(rng.integers(0, 255, (24, 80, 3), dtype=np.uint8), None, fx=4, fy=4)
+    writer = cv2.VideoWriter(str(folder / "walk.avi"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (128, 96))
+    for left in range(0, 120, 4):
+        writer.write(noise[:, left : left + 128])
+    writer.release()
 
 
 def _labelled(folder: Path, rng: np.random.Generator) -> None:
@@ -245,6 +252,7 @@ READERS: Mapping[str, Reader] = {
     "YOLO data.yaml": Reader("yolo/data.yaml", lambda folder: _read_labelled(folder / "yolo")),
     "YOLO labels": Reader("yolo/labels/a.txt", lambda folder: _read_labelled(folder / "yolo")),
     "YOLO image": Reader("yolo/images/a.png", lambda folder: _read_labelled(folder / "yolo")),
+    "video": Reader("walk.avi", lambda f: choose_frames(f / "walk.avi", f / "frames", most=9, least=3), slow=True),
     "COCO labels": Reader("coco/labels.json", lambda folder: _read_labelled(folder / "coco")),
 }
 

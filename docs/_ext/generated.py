@@ -38,7 +38,7 @@ WINGS = (
         "report",
         "detector",
     ),
-    *("capture", "fit", "reconstruct", "bake", "checks"),
+    *("video", "capture", "fit", "reconstruct", "bake", "checks"),
 )
 
 

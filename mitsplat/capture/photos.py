@@ -11,20 +11,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture.capture import Photo, stored_name
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, write_file
 from mitsplat.progress import Progress
+from mitsplat.video.sharpness import sharpness
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _UNREAD = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")
 _LOSSY = ("JPEG", "MPO", "WEBP")
-
-_JUDGED_EDGE = 800
-"""Longer edge at which sharpness is measured [px], so that size and noise matter little."""
 
 _BLURRED = 0.12
 """Share of the set's median sharpness. Gaussian blur of 3 px in 1600 px comes below it; views of one object, which
@@ -67,7 +64,7 @@ def find_photos(folder: Path) -> list[Path]:
         InputError: If the folder does not exist.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of photographs")
+        raise InputError(f"{folder}: no such folder of photographs, or video")
     below = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES + _UNREAD and path.is_file())
     return sorted(path for path in below if not any(part.startswith(".") for part in path.relative_to(folder).parts))
 
@@ -148,7 +145,7 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
     grey = np.asarray(rgb.convert("L"))
     clipped = (float(np.mean(grey <= 4)), float(np.mean(grey >= 251)))
-    return _Judged(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), _sharpness(grey), clipped)
+    return _Judged(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), sharpness(grey), clipped)
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
@@ -156,14 +153,6 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
         return Image.fromarray((np.asarray(image).astype(np.int64) // 256).clip(0, 255).astype(np.uint8)).convert("RGB")
     return image.convert("RGB")
-
-
-def _sharpness(grey: npt.NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian (Pech-Pacheco et al. 2000) at a fixed size."""
-    scale = _JUDGED_EDGE / max(grey.shape)
-    if scale < 1:
-        grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
 def _fault(photo: _Judged, median_sharpness: float) -> str | None:

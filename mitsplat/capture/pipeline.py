@@ -1,4 +1,4 @@
-"""From a folder of photographs to a :class:`~mitsplat.capture.capture.Capture`, the stage of ``mitsplat capture``."""
+"""From photographs, or a video, to a :class:`~mitsplat.capture.capture.Capture`, the stage of ``mitsplat capture``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.overview import capture_sheet
-from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
+from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.targets import Board
 from mitsplat.content_hash import file_hash
@@ -27,6 +27,7 @@ from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
 from mitsplat.isolation import ChosenObject, Pick, View, choose_object, hidden_share
 from mitsplat.progress import Progress
+from mitsplat.video import ChosenFrames, choose_frames
 
 MIN_PHOTOS = 3
 MIN_REGISTERED = 0.75
@@ -50,6 +51,7 @@ class CaptureSettings:
     Attributes:
         kind: An object is cut out by masks; an environment is not.
         max_size: Longest edge at which photos are used [px].
+        frames: Most frames that are taken of a video.
         board: ChArUco board to look for.
         tag: Edge of AprilTags as printed [m]; unknown if None.
         scale_from: Two places and their distance [m], as in :func:`mitsplat.capture.metric_frame.spot`.
@@ -65,6 +67,7 @@ class CaptureSettings:
 
     kind: Literal["object", "environment"] = "object"
     max_size: int = 1600
+    frames: int = 150
     board: Board = DEFAULT_BOARD
     tag: float | None = None
     scale_from: tuple[str, str, float] | None = None
@@ -113,6 +116,7 @@ class CaptureResult:
         source: Where scale and gravity come from, a clause.
         reprojection_error: Mean over all observations [px].
         doubtful: Share of the matches that a camera explains, where it is low and no board confirms the camera.
+        video: What the photographs are frames of, if they are.
     """
 
     capture: Capture
@@ -120,6 +124,7 @@ class CaptureResult:
     source: str
     reprojection_error: float
     doubtful: Mapping[str, float]
+    video: ChosenFrames | None = None
 
     @property
     def registered(self) -> float:
@@ -141,7 +146,7 @@ class CaptureResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the user should know of photos that are in the capture, one sentence each."""
-        warnings = []
+        warnings = [] if self.video is None else [*self.video.warnings]
         if self.doubtful:
             shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
             warnings.append(
@@ -169,8 +174,8 @@ def capture_photos(
     """Find cameras, scale, gravity and masks of photographs; what an interrupted or finished run left is used.
 
     Args:
-        photos: Folder of photographs of one object or place.
-        out: Folder of the capture; ``sfm/`` in it keeps what a repeated run can use.
+        photos: Folder of photographs of one object or place, or a video of it.
+        out: Folder of the capture; ``sfm/`` in it keeps what a repeated run can use, ``frames/`` those of a video.
         settings: What else decides the result.
         progress: Told steps done, of how many, and what is being done.
 
@@ -180,6 +185,14 @@ def capture_photos(
         MissingResourceError: If COLMAP or the masks' model fails to run.
     """
     _keep_apart(out, photos, settings.masks)
+    if photos.is_file() and photos.suffix.lower() not in SUFFIXES:
+        video = choose_frames(photos, out / "frames", most=settings.frames, least=MIN_PHOTOS, progress=progress)
+        return replace(_capture(video.folder, out, settings, progress), video=video)
+    return _capture(photos, out, settings, progress)
+
+
+def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progress | None) -> CaptureResult:
+    """The capture of a folder of photographs."""
     files = find_photos(photos)
     if len(files) < MIN_PHOTOS:
         raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
@@ -247,7 +260,7 @@ def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
     if out.resolve().is_relative_to(photos.resolve()):
         raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
     for given in (photos, masks):
-        for made in ("images", "masks", "sfm"):
+        for made in ("frames", "images", "masks", "sfm"):
             if given is not None and given.resolve().is_relative_to((out / made).resolve()):
                 raise InputError(f"{given}: must not lie in {out / made}, which is written anew")
 
@@ -255,10 +268,11 @@ def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
     """What decides a capture, in JSON."""
     given = [path for path in (settings.poses, settings.masks, settings.mask_model) if path is not None]
+    kept = {name: value for name, value in asdict(settings).items() if name != "frames"}  # the photos are those frames
     others = [path for place in given for path in (sorted(place.rglob("*")) if place.is_dir() else [place])]
     return {
         "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},
-        "settings": json.loads(json.dumps(asdict(settings), default=str)),
+        "settings": json.loads(json.dumps(kept, default=str)),
         "files": {str(path): file_hash(path) for path in others if path.is_file()},
     }
 

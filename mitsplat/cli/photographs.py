@@ -30,7 +30,10 @@ if TYPE_CHECKING:
     from mitsplat.reconstruct.pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with masks for an object.")]
-Photos = Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place.")]
+Photos = Annotated[
+    Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place, or a video of it.")
+]
+Frames = Annotated[int, typer.Option(help="Most frames that are taken of a video.")]
 Poses = Annotated[
     Path | None, typer.Option(help="Folder of a COLMAP model, or NeRF's transforms.json, to take cameras from.")
 ]
@@ -173,6 +176,7 @@ def capture(
     kind: Annotated[
         Literal["object", "environment"], typer.Option(help="Whether the subject is cut out by masks.")
     ] = "object",
+    frames: Frames = 150,
     max_size: Annotated[int, typer.Option(help="Longest edge at which photos are used [px].")] = 1600,
     squares: Annotated[str, typer.Option(metavar="CxR", help="Squares of the ChArUco board to look for.")] = "7x5",
     square: Annotated[float, typer.Option(help="Edge of its squares as measured on the print [m].")] = 0.035,
@@ -198,6 +202,7 @@ def capture(
     settings = CaptureSettings(
         kind=kind,
         max_size=max_size,
+        frames=frames,
         board=_board(squares, square),
         tag=tag,
         scale_from=scale_from,
@@ -212,7 +217,9 @@ def capture(
     )
     with progress_bar("steps/s") as progress:
         result = capture_photos(photos, out, settings, progress=progress)
-    found = result.capture
+    found, video = result.capture, result.video
+    if video is not None:
+        typer.echo(f"video: {len(video.names)} of {video.read} frames ({video.seconds:.1f} s) in {video.folder}")
     for name, reason in sorted(found.rejected.items()):
         typer.echo(f"rejected: {name}: {reason}")
     for warning in result.warnings:
@@ -309,6 +316,7 @@ def asset(
     name: Name = None,
     class_name: ClassName = None,
     kind: Kind = "object",
+    frames: Frames = 150,
     size: Size = None,
     scale_from: ScaleFrom = None,
     poses: Poses = None,
@@ -360,6 +368,7 @@ def asset(
             job,
             capture=CaptureSettings(
                 kind=kind,
+                frames=frames,
                 scale_from=scale_from,
                 poses=poses,
                 masks=masks,

@@ -26,7 +26,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import agreed_masks, geometric_masks, object_points
 from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
-from mitsplat.capture.photos import prepare_photos
+from mitsplat.capture.photos import Prepared, prepare_photos
 from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, _without_hidden, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
@@ -607,3 +607,40 @@ def test_board_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
     assert run("board", "-o", tmp_path / "b.png") == 2
     assert "--out must end in .pdf" in capsys.readouterr().err
+
+
+def test_a_video_is_captured_by_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to structure from motion, which sees photographs of one camera."""
+    texture = np.kron(np.random.default_rng(0).integers(0, 255, (20, 100), dtype=np.uint8), np.ones((12, 12), np.uint8))
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
+    for left in range(0, 240, 4):
+        writer.write(cv2.cvtColor(texture[:, left : left + 320], cv2.COLOR_GRAY2BGR))
+    writer.release()
+    given: list[Prepared] = []
+
+    def find_cameras(photos: list[Prepared], *_: object) -> SparseModel:
+        given.extend(photos)
+        raise InputError("no cameras")
+
+    monkeypatch.setattr(take, "find_cameras", find_cameras)
+    with pytest.raises(InputError, match="no cameras"):
+        capture_photos(tmp_path / "a.avi", tmp_path / "out", CaptureSettings(frames=9))
+    assert 8 <= len(given) <= 9
+    assert len({photo.lens for photo in given}) == 1
+    assert [photo.name for photo in given] == sorted(path.name for path in (tmp_path / "out/frames").glob("*.jpg"))
+    for photo in given:
+        assert photo.file.read_bytes() == (tmp_path / "out/frames" / photo.name).read_bytes()
+    inside = tmp_path / "out/frames/a.avi"
+    shutil.copyfile(tmp_path / "a.avi", inside)
+    with pytest.raises(InputError, match=r"a\.avi: must not lie in .*frames, which is written anew"):
+        capture_photos(inside, tmp_path / "out")
+
+
+def test_how_many_frames_a_video_may_give_does_not_touch_a_capture_of_photographs(
+    captured: tuple[Path, Path, CaptureResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given, out, result = captured
+    monkeypatch.setattr(take, "find_cameras", None)
+    again = capture_photos(given, out, CaptureSettings(board=rendered.BOARD, frames=40))
+    assert again.video is None
+    assert [photo.name for photo in again.capture.photos] == [photo.name for photo in result.capture.photos]

@@ -28,6 +28,7 @@ from mitsplat.cli import app
 from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.scene import load_scene
 from mitsplat.surfels import place_surfels
+from tests import rendered
 from tests.conftest import box_asset
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ SMALLER = {
     "settle": ["-n", "1", "--size", "32x18"],
     "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60", "--sh-degree", "0"],
+    "capture": ["--frames", "24"],
     "asset": ["--gaussians", "300", "--iterations", "20", "--edge", "64", "--faces", "300"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],
@@ -142,6 +144,10 @@ SHOWN = [words for words in {form(words): words for words in reversed(DOCUMENTED
 SHOWN.sort(key=DOCUMENTED.index)  # what needs something that another one has made comes after it
 
 
+FILMED = [words for words in SHOWN if words[1] in PHOTOGRAPHS and any(word.endswith(".mp4") for word in words)]
+"""Those that begin with a video."""
+
+
 def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
     """Type a command, made quick; it must end well and say nothing that is for developers."""
     typed = shlex.join(smaller(words)).replace("'>'", ">")
@@ -227,7 +233,19 @@ def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Pat
     for place in ("captures/mug", "assets/mug/capture", "assets/cell/capture"):
         shutil.copytree(out, desk / place)
     for words in SHOWN:
-        if words[1] in PHOTOGRAPHS or "assets/mug" in words:
+        if words not in FILMED and (words[1] in PHOTOGRAPHS or "assets/mug" in words):
             obey(words, desk, good={"asset": (0, 4), "mesh": (0, 4), "check": (0, 1)}.get(words[1], (0,)))
     made = ("captures/mug/capture.png", "assets/mug/report.html", "assets/mug_by_stages/report.html")
     assert [name for name in made if not (desk / name).stat().st_size] == []
+
+
+@pytest.mark.slow
+def test_videos_become_captures_as_documented(tmp_path: Path) -> None:
+    (tmp_path / "videos").mkdir()
+    rendered.render_video(tmp_path / "videos/mug.mp4")
+    for words in FILMED:
+        obey(words, tmp_path)
+        made = tmp_path / words[words.index("-o") + 1]
+        assert (made / "capture.png").stat().st_size
+        assert len(list((made / "images").iterdir())) >= 0.75 * len(list((made / "frames").glob("*.jpg"))) > 15
+    assert FILMED

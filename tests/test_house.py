@@ -21,7 +21,7 @@ FLOORS = (
     ("fit", "frames"),
     ("labels", "physics", "render"),
     ("capture", "engine", "plugins", "scene"),
-    ("isolation", "video"),
+    ("boards", "isolation", "video"),
     ("spec",),
     ("ground",),
 )

@@ -27,11 +27,11 @@ from benchmarks.assets import photographing
 from benchmarks.assets.judged import tell_wanted
 from benchmarks.assets.photographing import Sensors, by_name, paint, photograph, speckle
 from benchmarks.record import figure, recording
+from mitsplat.boards.targets import Board
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.capture.pipeline import CaptureSettings
-from mitsplat.capture.targets import Board
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.mesh_distance import Surface

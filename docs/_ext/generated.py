@@ -38,7 +38,7 @@ WINGS = (
         "report",
         "detector",
     ),
-    *("video", "capture", "fit", "reconstruct", "bake", "checks"),
+    *("video", "boards", "capture", "fit", "reconstruct", "bake", "checks"),
 )
 
 

@@ -14,9 +14,9 @@ from scipy.optimize import least_squares
 from skimage.transform import SimilarityTransform
 
 from mitsplat.arrays import Float64Array
+from mitsplat.boards.targets import Board, find_tags
 from mitsplat.camera import Camera
 from mitsplat.capture.structure_from_motion import SparseModel
-from mitsplat.capture.targets import Board, find_tags
 from mitsplat.errors import InputError
 
 DEFAULT_BOARD = Board()

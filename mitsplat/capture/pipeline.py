@@ -12,7 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from mitsplat.capture.board_mask import bare_squares
+from mitsplat.boards.board_mask import bare_squares
+from mitsplat.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.known_poses import read_poses
@@ -21,7 +22,6 @@ from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metri
 from mitsplat.capture.overview import capture_sheet
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
-from mitsplat.capture.targets import Board
 from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text

@@ -26,7 +26,7 @@ from mitsplat.cli.options import (
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
-    from mitsplat.capture.targets import Board
+    from mitsplat.boards.targets import Board
     from mitsplat.reconstruct.pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with masks for an object.")]
@@ -391,7 +391,7 @@ def asset(
 
 
 def _board(squares: str, square: float) -> Board:
-    from mitsplat.capture.targets import Board
+    from mitsplat.boards.targets import Board
 
     columns, _, rows = squares.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal()):

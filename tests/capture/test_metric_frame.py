@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from mitsplat.boards.targets import Board, find_tags
 from mitsplat.camera import Camera
 from mitsplat.capture import metric_frame as anchor
 from mitsplat.capture.metric_frame import (
@@ -23,7 +24,6 @@ from mitsplat.capture.metric_frame import (
     vertical_from_cameras,
 )
 from mitsplat.capture.structure_from_motion import SparseModel
-from mitsplat.capture.targets import Board, find_tags
 from mitsplat.errors import InputError
 
 BOARD = Board(6, 4, 0.03)

@@ -214,7 +214,7 @@ except RuntimeError as error:
 
 FAULT = """
 from mitsplat.cli import main
-from mitsplat.capture import targets as board
+from mitsplat.boards import targets as board
 
 def write_pdf(*args):
     raise ZeroDivisionError("on purpose\\nat length")

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mitsplat.boards.board_mask import bare_squares
 from mitsplat.camera import Camera
-from mitsplat.capture.board_mask import bare_squares
 from tests.capture.test_metric_frame import BOARD, draw, ring
 
 ALL = BOARD.columns * BOARD.rows

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.boards.targets import Board
 from mitsplat.camera import Camera
-from mitsplat.capture.targets import Board
 
 _DOTS = 16
 """Samples along a square's edge."""

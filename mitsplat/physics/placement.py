@@ -20,6 +20,8 @@ _PLACES = 200  # positions tried for an object before all are drawn anew
 _PLACES_IN_LAYER = 20  # of a pile
 _DRAWS = 20
 _SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
+_ROOM = (2e-3, 5e-3)  # between what is packed [m]
+_ASKEW = 3.0  # how far it is turned from quarter turns [degrees]
 _HOVER = 2e-4  # how closely objects are put on what is below them [m]
 
 
@@ -107,6 +109,8 @@ class _Draw:
         if arrangement == "stack":
             assets = dict.fromkeys(self._items[i].asset for i in free)
             return all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
+        if arrangement == "packed":
+            return self._pack(free)
         place: dict[str, Callable[[int], bool]] = {
             "drop": self._drop,
             "pile": self._pour,
@@ -179,6 +183,27 @@ class _Draw:
             if box[1][2] > self._high[2]:
                 return False
             self._take(i, pose, box)
+        return True
+
+    def _pack(self, members: Sequence[int]) -> bool:
+        """All members side by side in rows along x, from the region's low corner on."""
+        corner, depth = self._low.copy(), 0.0
+        for i in self._rng.permutation(np.asarray(members, dtype=np.intp)).tolist():
+            pose = np.eye(4)
+            angle = 90 * self._rng.integers(4) + self._rng.uniform(-_ASKEW, _ASKEW)
+            pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+            bounds = _bounds(self._items[i].outline, pose)
+            size, room = bounds[1] - bounds[0], self._rng.uniform(*_ROOM)
+            if corner[0] + size[0] > self._high[0]:
+                corner[:2], depth = (self._low[0], corner[1] + depth + room), 0.0
+            if (corner + size > self._high).any():
+                return False
+            pose[:3, 3] = [*(corner - bounds[0])[:2], self._high[2] - bounds[1][2]]
+            if not (self._lower(i, pose) and self._free(i, pose, _bounds(self._items[i].outline, pose), above=True)):
+                return False
+            self._take(i, pose, _bounds(self._items[i].outline, pose))
+            corner[0] += size[0] + room
+            depth = max(depth, float(size[1]))
         return True
 
     def _stand(self, i: int, turn: Float64Array) -> bool:

@@ -31,7 +31,7 @@ GainRange = Annotated[tuple[_Gain, _Gain], AfterValidator(ordered)]
 _Roughness = Annotated[float, Field(ge=0.02, le=1)]
 RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(ordered)]
 
-Arrangement = Literal["drop", "pile", "scatter", "stack", "upright"]
+Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "packed"]
 
 
 class ObjectPose(StrictModel):
@@ -188,10 +188,13 @@ class Settle(StrictModel):
 
     ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes, poured in at
     1 m/s. ``scatter``: apart, so that none touches another. ``stack``: all of one asset above one another on their
-    largest face. ``upright``: put down as the asset stands, turned about the vertical.
+    largest face. ``upright``: put down as the asset stands, turned about the vertical. ``packed``: the same side by
+    side, in rows from a corner of the region, by quarter turns that are a little off.
     """
 
-    arrangement: Arrangement = Field("drop", description="Random drop, pile, sparse scatter, stacks or upright.")
+    arrangement: Arrangement = Field(
+        "drop", description="Random drop, pile, sparse scatter, stacks, upright, or packed side by side."
+    )
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(
         5, ge=1, description="Draws of poses before what does not come to rest is left out of a layout."

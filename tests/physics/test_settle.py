@@ -583,7 +583,7 @@ def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
     assert layout.certificate.surface_motion < 1e-4
 
 
-@pytest.mark.parametrize("arrangement", ["stack", "upright"])
+@pytest.mark.parametrize("arrangement", ["stack", "upright", "packed"])
 def test_things_are_put_down_below_the_lid_of_an_enclosure(scene_data, write_scene, arrangement):
     """They start at the region's top, where the lid is, but stand on the ground from the first moment on."""
     scene_data["objects"] = [{"asset": "assets/nut", "count": 2}]
@@ -601,6 +601,29 @@ def test_what_is_upright_stands_as_the_asset_does(scene_data, write_scene):
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-4)
     np.testing.assert_allclose(poses[:, 2, 3], 0.025, atol=3e-4)
     assert np.ptp(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])) > 0.5
+
+
+def test_what_is_packed_stands_side_by_side_in_rows(scene_data, write_scene):
+    """Bolts of 10 x 10 mm, turned by quarters up to 3 degrees off, have at most 11 mm by 11 mm and gaps of 2 to 5 mm.
+
+    So at most five stand in a row of 60 mm, the rows are as many as they must be, and none is far from the next.
+    """
+    scene_data["objects"] = [{"asset": "assets/bolt", "count": 9}]
+    scene_data["region"] = {"min": [-0.03, -0.03, 0.0], "max": [0.03, 0.03, 0.08]}
+    scene, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
+    poses = np.array([instance.world_from_object for instance in layout.instances])
+    np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-4)
+    turns = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    assert np.abs((turns + 45) % 90 - 45).max() < 3.1
+    assert np.ptp(np.round(turns / 90)) > 0
+    rows = np.round((poses[:, 1, 3] - poses[:, 1, 3].min()) / 0.014)
+    assert sorted(np.unique_counts(rows).counts.tolist()) in ([1, 4, 4], [4, 5], [2, 3, 4])
+    gaps = [pair.distance for pair in placed_clearances(scene, layout)]
+    nearest = np.sort(np.linalg.norm(poses[:, None, :2, 3] - poses[None, :, :2, 3], axis=-1), axis=1)[:, 1]
+    assert min(gaps) > 5e-4 and nearest.max() < 0.0165
+    scene_data["objects"][0]["count"] = 40
+    with pytest.raises(InputError, match=r"region must be large enough .* settle.arrangement packed"):
+        drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
 
 
 def test_poses_may_be_given(scene_data, write_scene):

@@ -126,7 +126,7 @@ green, blue."""
 
 _FORGETS = 8
 """Weights of a new deepest peak that sums give way to where late ones are amended. From 2 on, more is better for solid
-walls, and less for a solid object: the PSNR of captures changes by 0.6 dB at the most up to 16."""
+walls, and less for a solid object: between 2 and 16 the PSNR of captures changes by up to 1.4 dB."""
 
 
 def _fresh(several: bool, late: Late) -> Pixel:

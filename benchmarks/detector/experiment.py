@@ -43,9 +43,12 @@ def scenes_of(arm: Mapping[str, Any]) -> list[str]:
 
 
 def write_scene(work: Path, name: str) -> Path:
-    """The scene of a name: ``groceries.yaml`` with its changes, by dotted key; null takes away."""
+    """The scene of a name: ``groceries.yaml`` with its changes, by dotted key; null takes away at the end."""
     scene, plan = YAML(typ="safe").load((HERE / "groceries.yaml").read_text()), read_arms()
-    for key, value in [row for change in name.split("+") for row in plan["changes"][change].items()]:
+    rows = [row for change in name.split("+") for row in plan["changes"][change].items()]
+    # What is later in a list goes first, so that places in it stay those of groceries.yaml.
+    gone = sorted((row for row in rows if row[1] is None), reverse=True)
+    for key, value in [row for row in rows if row[1] is not None] + gone:
         *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
         place = scene
         for step in way:

@@ -40,7 +40,7 @@ def hidden_share(camera: Camera, own: Float64Array, others: Sequence[Float64Arra
     edge = _EDGE + 4 * _GAP
     outline = np.zeros((edge, edge), dtype=np.uint8)
     cv2.fillConvexPoly(outline, np.rint(cv2.convexHull(placed(pixels).astype(np.float32))).astype(np.int32), 1)
-    hidden, middle = np.zeros_like(outline), float(np.median(depths))
+    hidden, middle = np.zeros(outline.shape, dtype=bool), float(np.median(depths))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _GAP + 1, 2 * _GAP + 1))
     for points in others:
         pixels, depths = camera.project(points)
@@ -48,5 +48,6 @@ def hidden_share(camera: Camera, own: Float64Array, others: Sequence[Float64Arra
         x, y = near[((near >= 0) & (near < edge)).all(axis=1)].astype(np.intp).T
         dots = np.zeros_like(outline)
         dots[y, x] = 1
-        hidden |= cv2.morphologyEx(dots, cv2.MORPH_CLOSE, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return float((hidden & outline).sum() / outline.sum())
+        closed = cv2.morphologyEx(dots, cv2.MORPH_CLOSE, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        hidden |= np.asarray(closed > 0)
+    return float(hidden[outline > 0].mean())

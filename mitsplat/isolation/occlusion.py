@@ -35,7 +35,7 @@ def hidden_share(camera: Camera, own: Float64Array, others: Sequence[Float64Arra
         return 0.0
 
     def placed(pixels: Float64Array) -> Float64Array:
-        return (pixels - low) * (_EDGE / size) + 2 * _GAP
+        return np.asarray((pixels - low) * (_EDGE / size) + 2 * _GAP)
 
     edge = _EDGE + 4 * _GAP
     outline = np.zeros((edge, edge), dtype=np.uint8)

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 
 _EDGE = 128
 """Longer edge of the object in the picture that shares are counted in [px]."""
-_GAP = 12
-"""Points of a thing that are at most twice as far apart there have the thing between them [px]."""
+_GAPS = (12, 40)
+"""Bounds of how far points of a thing reach there, which is twice the usual way to the third nearest of them [px]."""
 
 
 def hidden_share(camera: Camera, own: Float64Array, others: Sequence[Float64Array]) -> float:
@@ -35,17 +36,21 @@ def hidden_share(camera: Camera, own: Float64Array, others: Sequence[Float64Arra
         return 0.0
 
     def placed(pixels: Float64Array) -> Float64Array:
-        return np.asarray((pixels - low) * (_EDGE / size) + 2 * _GAP)
+        return np.asarray((pixels - low) * (_EDGE / size) + _EDGE / 2)
 
-    edge = _EDGE + 4 * _GAP
+    edge = 2 * _EDGE
     outline = np.zeros((edge, edge), dtype=np.uint8)
     cv2.fillConvexPoly(outline, np.rint(cv2.convexHull(placed(pixels).astype(np.float32))).astype(np.int32), 1)
     hidden, middle = np.zeros(outline.shape, dtype=bool), float(np.median(depths))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _GAP + 1, 2 * _GAP + 1))
     for points in others:
         pixels, depths = camera.project(points)
         near = placed(pixels[(depths > 0) & (depths < middle)])
-        x, y = near[((near >= 0) & (near < edge)).all(axis=1)].astype(np.intp).T
+        near = near[((near >= 0) & (near < edge)).all(axis=1)]
+        if len(near) < 4:
+            continue
+        gap = round(float(np.clip(2 * np.median(KDTree(near).query(near, k=4)[0][:, -1]), *_GAPS)))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * gap + 1, 2 * gap + 1))
+        x, y = near.astype(np.intp).T
         dots = np.zeros_like(outline)
         dots[y, x] = 1
         closed = cv2.morphologyEx(dots, cv2.MORPH_CLOSE, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0)

@@ -199,9 +199,12 @@ class _Draw:
             if (corner + size > self._high).any():
                 return False
             pose[:3, 3] = [*(corner - bounds[0])[:2], self._high[2] - bounds[1][2]]
-            if not (self._lower(i, pose) and self._free(i, pose, _bounds(self._items[i].outline, pose), above=True)):
+            if not self._lower(i, pose):
                 return False
-            self._take(i, pose, _bounds(self._items[i].outline, pose))
+            box = bounds + pose[:3, 3]
+            if not self._free(i, pose, box, above=True):
+                return False
+            self._take(i, pose, box)
             corner[0] += size[0] + room
             depth = max(depth, float(size[1]))
         return True

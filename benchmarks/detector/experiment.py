@@ -91,6 +91,24 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
     return folder
 
 
+def drawn(rendered: list[Path], count: int, folder: Path) -> Path:
+    """A YOLO folder that lists so many images of rendered ones: the first of an order which is the same for any number.
+
+    Raises:
+        SystemExit: If there are not so many.
+    """
+    images = sorted(path.resolve() for one in rendered for path in (one / "images" / "train").iterdir())
+    if len(images) < count:
+        raise SystemExit(f"there are {len(images)} images, not {count}")
+    order = np.random.default_rng(0).permutation(len(images))[:count]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "train.txt").write_text("".join(f"{images[i]}\n" for i in sorted(order)))
+    names = YAML(typ="safe").load((rendered[0] / "data.yaml").read_text())["names"]
+    with (folder / "data.yaml").open("w") as file:
+        YAML(typ="safe").dump({"train": "train.txt", "names": names}, file)
+    return folder
+
+
 def main() -> None:
     """Train and judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -111,6 +129,8 @@ def measure(options: argparse.Namespace) -> None:
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
+    if "images" in arm:
+        rendered = [drawn(rendered, arm["images"], work / "drawn" / f"{options.arm}-{options.seed}")]
     learns_photographs = arm.get("real", False)
     settings = TrainSettings(
         **(plan["train"] | arm.get("train", {})),

@@ -38,6 +38,7 @@ for _command in (
     datasets.export,
     detectors.train,
     detectors.evaluate,
+    detectors.compare,
     assets.bake,
     photographs.fit,
     photographs.capture,

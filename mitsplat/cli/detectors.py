@@ -5,12 +5,16 @@ Commands import what they need inside of their functions, so that the start of e
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from mitsplat.cli.options import JsonLog, Seed, command_log
+
+if TYPE_CHECKING:
+    from mitsplat.detector.likeness import Trait
 
 TorchDevice = Annotated[
     str,
@@ -115,6 +119,57 @@ def evaluate(
         told = [f"{score['ap50_95']:.3f} ({words})" for words, score in scores.items() if score]
         typer.echo(f"  {name}: {count} labelled" + (f", AP50-95 {', '.join(told)}" if told else ""))
     typer.echo(f"report: {found.page}")
+
+
+def compare(
+    datasets: Annotated[
+        list[Path],
+        typer.Argument(metavar="DATASETS... PHOTOS", help="Rendered datasets, and labelled photographs last."),
+    ],
+    split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Which rendered images.")] = "train",
+    size: Annotated[
+        int, typer.Option(help="Longer side that images are scaled to before they are measured [px].")
+    ] = 640,
+    images: Annotated[int, typer.Option(help="How many of each to measure at most, evenly drawn.")] = 400,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="JSON file to write what was measured to.")
+    ] = None,
+    json_log: JsonLog = False,
+) -> None:
+    """Say where labelled photographs lie outside of rendered images, and what to change.
+
+    Objects' brightness, saturation, size and number, images' brightness and noise, of all and of each class.
+    """
+    from mitsplat.detector.likeness import compare_with_photographs
+    from mitsplat.errors import InputError
+    from mitsplat.files import write_text
+
+    if len(datasets) < 2:
+        raise InputError("name rendered datasets, and labelled photographs last (got one folder)")
+    with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
+        found = compare_with_photographs(
+            datasets[:-1], datasets[-1], split=split, size=size, most=images, progress=progress
+        )
+    typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")
+    for trait in found.traits:
+        _tell(trait.name, trait)
+    for name, traits in found.classes.items():
+        for trait in traits:
+            if trait.advice:
+                _tell(f"{name}: {trait.name}", trait)
+    if out is not None:
+        write_text(out, json.dumps(found.to_json(), indent=1) + "\n")
+        typer.echo(f"measured: {out}")
+
+
+def _tell(name: str, trait: Trait) -> None:
+    sides = "; ".join(
+        f"{words} {values[0]:.0f} {values[1]:.0f} {values[2]:.0f}"
+        for words, values in (("rendered", trait.rendered), ("photographs", trait.real))
+    )
+    typer.echo(f"{name}{f' [{trait.unit}]' if trait.unit else ''}: {sides}")
+    if trait.advice:
+        typer.echo(f"  {trait.below:.0%} of photographs' have less, {trait.above:.0%} more: {trait.advice}")
 
 
 def _scores(score: dict[str, Any]) -> str:

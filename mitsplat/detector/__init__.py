@@ -8,6 +8,7 @@ Training and predicting need the extra ``train``; judging detections that are ke
 from __future__ import annotations
 
 from mitsplat.detector.evaluation import Evaluation, evaluate_detector
+from mitsplat.detector.likeness import Likeness, compare_with_photographs
 from mitsplat.detector.scores import AveragePrecision, DetectionMatches, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set
 from mitsplat.detector.training import Run, TrainSettings, open_run, train_detector
@@ -17,9 +18,11 @@ __all__ = [
     "DetectionMatches",
     "Evaluation",
     "LabelledSet",
+    "Likeness",
     "Run",
     "TrainSettings",
     "average_precision",
+    "compare_with_photographs",
     "evaluate_detector",
     "open_run",
     "read_set",

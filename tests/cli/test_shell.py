@@ -53,6 +53,7 @@ SMALLER = {
     "split": ["--folds", "2"],
     "train": ["--steps", "2", "--batch", "2", "--size", "64", "--device", "cpu"],
     "evaluate": ["--size", "64", "--device", "cpu"],
+    "compare": ["--size", "64"],
 }
 """Options that are added to documented commands, in place of their own, so that they are quick."""
 
@@ -168,7 +169,7 @@ def test_every_command_is_shown() -> None:
 @pytest.mark.slow
 def test_every_command_runs_by_itself_as_documented(desk: Path) -> None:
     for words in SHOWN:
-        if words[1] in ("view", *DETECTORS):  # one serves until it is ended: tests/view
+        if words[1] in ("view", "compare", *DETECTORS):  # one serves until it is ended: tests/view; others come below
             continue
         if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
             # 1 is that of findings, which a box of sixty Gaussians and small machines may give.
@@ -181,16 +182,30 @@ def test_every_command_runs_by_itself_as_documented(desk: Path) -> None:
     assert len(list((desk / "out/cell/images").rglob("*.jpg"))) == 2
 
 
+def lay_photographs(desk: Path) -> None:
+    """Labelled photographs, which are images of the dataset that the commands above have made."""
+    if not (desk / "photographs").is_dir():
+        for name in ("images", "labels"):
+            shutil.copytree(desk / "out/cell" / name, desk / "photographs" / name)
+        shutil.copyfile(desk / "out/cell/data.yaml", desk / "photographs/data.yaml")
+
+
+@pytest.mark.slow
+def test_photographs_are_compared_as_documented(desk: Path) -> None:
+    lay_photographs(desk)
+    for words in SHOWN:
+        if words[1] == "compare":
+            obey(words, desk)
+
+
 @pytest.mark.slow
 def test_detectors_learn_as_documented(desk: Path) -> None:
-    """After the commands above, which have made the dataset; its images are those of photographs."""
+    """After the commands above, which have made the dataset."""
     if not all(map(find_spec, ("torch", "torchvision", "ultralytics"))):
         pytest.skip("Ultralytics and PyTorch are not installed")
     if subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, check=False).returncode:
         pytest.skip("torchvision was built for another PyTorch")
-    for name in ("images", "labels"):
-        shutil.copytree(desk / "out/cell" / name, desk / "photographs" / name)
-    shutil.copyfile(desk / "out/cell/data.yaml", desk / "photographs/data.yaml")
+    lay_photographs(desk)
     for words in SHOWN:
         if words[1] in DETECTORS:
             obey(words, desk)

@@ -1,0 +1,262 @@
+"""How far labelled photographs lie outside of rendered images: brightness, saturation and size of objects, noise.
+
+A detector fails where photographs show what it was never shown. Means of whole pictures hide that: objects are small,
+and a camera that meters the picture makes them dark where what lies around is bright. So objects are measured within
+their labels, image by image at the size that a detector is given, and photographs are told by the share of them that
+lies beyond the middle nine tenths of the rendered ones: a tenth would where both are drawn from the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.stats import binom
+
+from mitsplat.arrays import BoolArray, ByteImage
+from mitsplat.detector.sets import Instance, LabelledSet, Sample, Split, in_classes, read_set
+from mitsplat.errors import InputError
+from mitsplat.labels.polygons import fill_polygon
+from mitsplat.progress import Progress
+
+FEWEST, FEWEST_RENDERED = 5, 20
+"""Objects of a class, on photographs and rendered, from which it is judged."""
+CHANCE = 0.01
+"""Of so many outside of the rendered range by chance; what is less likely is advised on."""
+_TAIL = 0.05
+_SMALLEST = 64
+"""Area within a label from which its colour is measured [px]."""
+_FLAT_QUANTILE = 0.4
+"""Share of an image whose smoothed gradient is least: there the Laplacian is noise."""
+_DARK = 40
+"""Bytes below which a sensor clips its noise."""
+
+_TRAITS: dict[str, tuple[str, str, str]] = {
+    "brightness of objects": (
+        "of 255",
+        "lower randomise.exposure, or light less",
+        "raise randomise.exposure, light objects more, or darken what lies around them",
+    ),
+    "saturation of objects": ("%", "lower randomise.saturation", "raise randomise.saturation, or give less gloss"),
+    "size of objects": ("px", "take cameras farther away", "take cameras nearer"),
+    "objects of an image": ("", "lower objects[].count", "raise objects[].count, or show more of them at once"),
+    "objects cut by the border": ("% of an image's", "look at all of them, from farther", "let views cut more off"),
+    "brightness of images": ("of 255", "darken the backdrop", "brighten the backdrop"),
+    "noise of images": ("of 255", "lower randomise.iso, or expose more", "raise randomise.iso"),
+}
+"""Unit, and what to change if photographs have less, or more."""
+
+
+@dataclass(frozen=True)
+class Trait:
+    """One trait of rendered images and of photographs.
+
+    Attributes:
+        name: What is measured.
+        unit: In which unit.
+        rendered: Quantiles 0.05, 0.5 and 0.95 of rendered images, or of objects in them.
+        real: Those of photographs.
+        below: Share of photographs, or of objects in them, that have less than 95 % of the rendered ones.
+        above: That have more than 95 % of them.
+        advice: What to change, if more lie outside on a side than would by chance; empty otherwise.
+    """
+
+    name: str
+    unit: str
+    rendered: tuple[float, float, float]
+    real: tuple[float, float, float]
+    below: float
+    above: float
+    advice: str
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How rendered images and photographs differ.
+
+    Attributes:
+        images: How many rendered images were measured.
+        photographs: How many photographs.
+        traits: Of all of them.
+        classes: Brightness and saturation of each class that both show often enough.
+    """
+
+    images: int
+    photographs: int
+    traits: tuple[Trait, ...]
+    classes: dict[str, tuple[Trait, ...]]
+
+    def to_json(self) -> dict[str, Any]:
+        """For a file."""
+        return asdict(self)
+
+
+def compare_with_photographs(
+    rendered: Sequence[str | Path],
+    photographs: str | Path,
+    *,
+    split: Split = "train",
+    real_split: Split = "all",
+    size: int = 640,
+    most: int = 400,
+    progress: Progress | None = None,
+) -> Likeness:
+    """Measure rendered images beside labelled photographs.
+
+    Colours are those of pixels within masks, and within the middle half of boxes where there is no mask.
+
+    Args:
+        rendered: Datasets, or YOLO or COCO folders, with the same classes.
+        photographs: Likewise; classes may come in another order.
+        split: Which rendered images.
+        real_split: Which photographs.
+        size: Longer side that images are scaled to before they are measured [px].
+        most: Images of each side, evenly drawn from what there is.
+        progress: Told of each image.
+
+    Raises:
+        InputError: If there is nothing to compare, or something cannot be read.
+    """
+    if size < 32 or most < 1:
+        raise InputError(f"size must be 32 px or more, and most at least 1 (got {size} and {most})")
+    real = read_set(photographs, real_split)
+    sets = [in_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
+    if not sets:
+        raise InputError("there are no rendered images to compare")
+    ours = _evenly([sample for one in sets for sample in one.samples], most)
+    theirs = _evenly(list(real.samples), most)
+    measured = []
+    for number, sample in enumerate(ours + theirs):
+        if progress is not None:
+            progress(number, len(ours) + len(theirs), "measuring images")
+        measured.append(_measure(sample, real, size))
+    sides = [_Side(measured[: len(ours)]), _Side(measured[len(ours) :])]
+    classes = {}
+    for index, name in enumerate(real.class_names):
+        of_class = [side.of_class(index) for side in sides]
+        counts = [len(values["brightness of objects"]) for values in of_class]
+        if counts[0] >= FEWEST_RENDERED and counts[1] >= FEWEST:
+            classes[name] = tuple(_trait(key, of_class[0][key], of_class[1][key]) for key in of_class[0])
+    return Likeness(
+        len(ours),
+        len(theirs),
+        tuple(
+            _trait(key, sides[0].values[key], sides[1].values[key])
+            for key in _TRAITS
+            if all(side.values[key] for side in sides)
+        ),
+        classes,
+    )
+
+
+def _evenly(samples: list[Sample], most: int) -> list[Sample]:
+    places = np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).round().astype(int))
+    return [samples[place] for place in places]
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Of an image: traits of it, and (class, brightness, saturation) of its objects, and the sizes of these."""
+
+    image: dict[str, float]
+    colours: list[tuple[int, float, float]]
+    sizes: list[float]
+
+
+class _Side:
+    """What was measured on rendered images, or on photographs."""
+
+    def __init__(self, measured: list[_Measured]) -> None:
+        self.colours = [colour for one in measured for colour in one.colours]
+        self.values: dict[str, list[float]] = {
+            "brightness of objects": [colour[1] for colour in self.colours],
+            "saturation of objects": [colour[2] for colour in self.colours],
+            "size of objects": [size for one in measured for size in one.sizes],
+        }
+        for key in _TRAITS:
+            if key not in self.values:
+                self.values[key] = [one.image[key] for one in measured if key in one.image]
+
+    def of_class(self, index: int) -> dict[str, list[float]]:
+        """Brightness and saturation of one class."""
+        rows = [colour for colour in self.colours if colour[0] == index]
+        return {
+            "brightness of objects": [row[1] for row in rows],
+            "saturation of objects": [row[2] for row in rows],
+        }
+
+
+def _measure(sample: Sample, found: LabelledSet, size: int) -> _Measured:
+    """Measure an image at a longer side of ``size`` pixels."""
+    stored = cv2.imread(str(sample.path), cv2.IMREAD_COLOR)
+    if stored is None:
+        raise InputError(f"{sample.path}: cannot be read as an image")
+    scale = size / max(sample.width, sample.height)
+    width, height = (max(round(scale * side), 1) for side in (sample.width, sample.height))
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    picture: ByteImage = cv2.resize(stored, (width, height), interpolation=way).astype(np.uint8)
+    bright = picture.max(axis=2)
+    colours, sizes, cut = [], [], 0
+    objects = [instance for instance in sample.instances if not instance.crowd]
+    for instance in objects:
+        x0, y0, x1, y1 = instance.box
+        sizes.append(scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0))))
+        cut += bool(min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1)
+        inside = _inside(instance, sample, width, height)
+        if inside.sum() >= _SMALLEST:
+            pixels = picture[inside].astype(float)
+            most = pixels.max(axis=1)
+            saturation = (most - pixels.min(axis=1)) / np.maximum(most, 1)
+            colours.append((instance.class_index, float(np.median(most)), 100 * float(np.median(saturation))))
+    image = {"brightness of images": float(picture.mean()), "objects of an image": float(len(objects))}
+    if objects:
+        image["objects cut by the border"] = 100 * cut / len(objects)
+    noise = _noise(picture[..., 1], bright)
+    if noise is not None:
+        image["noise of images"] = noise
+    return _Measured(image, colours, sizes)
+
+
+def _inside(instance: Instance, sample: Sample, width: int, height: int) -> BoolArray:
+    """Pixels (height, width) of an object in the scaled image."""
+    factor = np.array([width / sample.width, height / sample.height])
+    if instance.has_mask:
+        return fill_polygon(instance.outlined() * factor, width, height)
+    inside = np.zeros((height, width), dtype=bool)
+    (x0, y0), (x1, y1) = (np.array(corner) * factor for corner in (instance.box[:2], instance.box[2:]))
+    rows, columns = (
+        slice(max(round(low + (high - low) / 4), 0), max(round(high - (high - low) / 4), 0))
+        for low, high in ((y0, y1), (x0, x1))
+    )
+    inside[rows, columns] = True
+    return inside
+
+
+def _noise(green: ByteImage, bright: ByteImage) -> float | None:
+    """Median of the Laplacian's size where an image is flat, in bytes; None where hardly anything is to be seen."""
+    values = green.astype(np.float32)
+    smooth = cv2.GaussianBlur(values, (0, 0), 2)
+    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    lit = (bright > _DARK) & (bright < 250)
+    if lit.sum() < _SMALLEST:
+        return None
+    flat = lit & (slope <= np.quantile(slope[lit], _FLAT_QUANTILE))
+    return float(np.median(np.abs(cv2.Laplacian(values, cv2.CV_32F))[flat]))
+
+
+def _trait(name: str, rendered: Sequence[float], real: Sequence[float]) -> Trait:
+    unit, less, more = _TRAITS[name]
+    ours, theirs = (np.quantile(values, [_TAIL, 0.5, 1 - _TAIL]) for values in (rendered, real))
+    outside = np.asarray(real) < ours[0], np.asarray(real) > ours[2]
+    advice = [
+        words
+        for beyond, words in zip(outside, (less, more), strict=True)
+        if binom.sf(beyond.sum() - 1, len(beyond), _TAIL) < CHANCE
+    ]
+    quantiles = [(float(values[0]), float(values[1]), float(values[2])) for values in (ours, theirs)]
+    below, above = (float(beyond.mean()) for beyond in outside)
+    return Trait(name, unit, quantiles[0], quantiles[1], below, above, "; ".join(advice))

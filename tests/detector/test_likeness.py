@@ -1,0 +1,144 @@
+"""Rendered images beside photographs: what is measured of both, and what is advised."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mitsplat.cli import app
+from mitsplat.detector.likeness import Likeness, Trait, compare_with_photographs
+from mitsplat.errors import InputError
+from tests.detector.painted import HEIGHT, HUES, WIDTH, write_coco, write_yolo
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_yolo(tmp_path_factory.mktemp("rendered") / "set", {"train": 40})
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    return write_coco(tmp_path / "photographs", 20, first=1000)
+
+
+def trait(found: Likeness, name: str) -> Trait:
+    (one,) = [one for one in found.traits if one.name == name]
+    return one
+
+
+def change(photographs: Path, do: object) -> None:
+    for path in (photographs / "photos").iterdir():
+        cv2.imwrite(str(path), np.clip(do(cv2.imread(str(path)).astype(float)), 0, 255).astype(np.uint8))  # type: ignore[operator]
+
+
+def test_what_is_painted_alike_needs_no_advice(rendered: Path, photographs: Path) -> None:
+    found = compare_with_photographs([rendered], photographs, size=WIDTH)
+    assert (found.images, found.photographs) == (40, 20)
+    assert [one.name for one in found.traits if one.advice] == []
+    assert not any(one.advice for traits in found.classes.values() for one in traits)
+
+
+def test_what_is_measured_is_what_was_painted(rendered: Path, photographs: Path) -> None:
+    found = compare_with_photographs([rendered], photographs, size=WIDTH)
+    for name, hue in HUES.items():
+        bright, saturation = found.classes[name]
+        assert bright.rendered == bright.real == (max(hue),) * 3
+        assert saturation.real == pytest.approx((100 * (1 - min(hue) / max(hue)),) * 3)
+    size = trait(found, "size of objects")
+    assert 10 < size.rendered[0] < size.rendered[2] < 33
+    assert trait(found, "objects of an image").real[::2] == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "do", "says"),
+    [
+        ("brightness of objects", lambda image: image * 0.4, "lower randomise.exposure"),
+        (
+            "saturation of objects",
+            lambda image: image.mean(axis=2, keepdims=True) + 0 * image,
+            "lower randomise.saturation",
+        ),
+        ("noise of images", lambda image: cv2.GaussianBlur(image, (0, 0), 3), "lower randomise.iso"),
+        ("brightness of images", lambda image: image + 60, "brighten the backdrop"),
+    ],
+)
+def test_what_differs_is_named_with_what_changes_it(
+    rendered: Path, photographs: Path, name: str, do: object, says: str
+) -> None:
+    change(photographs, do)
+    found = trait(compare_with_photographs([rendered], photographs, size=WIDTH), name)
+    assert says in found.advice
+    assert max(found.below, found.above) > 0.9
+
+
+def test_a_class_alone_can_differ(rendered: Path, photographs: Path) -> None:
+    """Discs are red and boxes blue: without half of the blue the boxes are dark."""
+    change(photographs, lambda image: image * (0.5, 1, 1))
+    found = compare_with_photographs([rendered], photographs, size=WIDTH)
+    assert "lower" in found.classes["box"][0].advice
+    assert not found.classes["disc"][0].advice
+
+
+def test_size_is_that_of_the_scaled_image(rendered: Path, photographs: Path) -> None:
+    once, twice = (
+        trait(compare_with_photographs([rendered], photographs, size=size), "size of objects")
+        for size in (WIDTH, 2 * WIDTH)
+    )
+    assert np.allclose(twice.real, 2 * np.array(once.real))
+
+
+def test_the_form_of_labels_does_not_matter(rendered: Path, tmp_path: Path) -> None:
+    found = [
+        compare_with_photographs([rendered], write_coco(tmp_path / form, 12, form=form), size=WIDTH)
+        for form in ("polygons", "lengths", "compressed", "boxes")
+    ]
+    for other in found[1:]:
+        assert other.classes == found[0].classes
+
+
+def test_photographs_of_another_size_are_compared(rendered: Path, photographs: Path, tmp_path: Path) -> None:
+    change(photographs, lambda image: image)
+    larger = write_coco(tmp_path / "larger", 20, first=1000)
+    labels = json.loads((larger / "labels.json").read_text())
+    for image in labels["images"]:
+        path = larger / "photos" / image["file_name"]
+        image |= {"width": 3 * WIDTH, "height": 3 * HEIGHT}
+        cv2.imwrite(str(path), np.kron(cv2.imread(str(path)), np.ones((3, 3, 1), dtype=np.uint8)))
+    for one in labels["annotations"]:
+        one["bbox"] = [3 * value for value in one["bbox"]]
+        one["segmentation"] = [[3 * value for value in ring] for ring in one["segmentation"]]
+    (larger / "labels.json").write_text(json.dumps(labels))
+    once, other = (compare_with_photographs([rendered], one, size=WIDTH) for one in (photographs, larger))
+    for name in ("size of objects", "brightness of objects", "noise of images"):
+        assert np.allclose(trait(other, name).real, trait(once, name).real, rtol=0.02), name
+
+
+def test_images_are_drawn_evenly(rendered: Path, photographs: Path) -> None:
+    found = compare_with_photographs([rendered], photographs, size=WIDTH, most=7)
+    assert (found.images, found.photographs) == (7, 7)
+
+
+def test_other_classes_are_refused(rendered: Path, tmp_path: Path) -> None:
+    other = write_yolo(tmp_path / "other", {"train": 2}, classes=("disc", "box", "cone"))
+    with pytest.raises(InputError, match="it lacks cone"):
+        compare_with_photographs([rendered], other)
+    with pytest.raises(InputError, match="at least 1"):
+        compare_with_photographs([rendered], rendered, most=0)
+
+
+def test_the_command_says_it_and_writes_it(rendered: Path, photographs: Path, tmp_path: Path) -> None:
+    change(photographs, lambda image: image * 0.4)
+    out = tmp_path / "likeness.json"
+    done = CliRunner().invoke(app, ["compare", str(rendered), str(photographs), "--size", str(WIDTH), "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "40 rendered images, 20 photographs" in done.output
+    assert "brightness of objects [of 255]: rendered 220 220 220; photographs 88 88 88" in done.output
+    assert "100% of photographs' have less, 0% more: lower randomise.exposure" in done.output
+    kept = json.loads(out.read_text())
+    assert kept["traits"][0]["real"] == [88, 88, 88]
+    assert CliRunner().invoke(app, ["compare", str(rendered)]).exit_code != 0

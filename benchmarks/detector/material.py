@@ -28,6 +28,9 @@ PACKAGE = BakeSettings(
 )
 """Packages are many and diffuse: a third of the time of a scan, 2 dB less."""
 
+UP: dict[str, Literal["y", "z"]] = {"bbq_sauce": "z"}
+"""Axes of scans that stand along another than y: this one lies on its label."""
+
 DENSITY = 600.0
 """Of packed food with air around it [kg/m^3]."""
 
@@ -74,8 +77,9 @@ def make(options: argparse.Namespace) -> None:
     if not photos.exists():
         shutil.copytree(options.hope / "photos", photos)
         shutil.copy(options.hope / "labels.json", photos / "labels.json")
+    scans = BakeSettings(gaussians=options.gaussians)
     for path in sorted((options.hope / "meshes").glob("*.glb")):
-        bake(path, options.work / "groceries" / path.stem, path.stem, BakeSettings(gaussians=options.gaussians), "y")
+        bake(path, options.work / "groceries" / path.stem, path.stem, scans, UP.get(path.stem, "y"))
     for seed in range(options.packages):
         bake(make_package(seed), options.work / "packages" / f"package_{seed:02d}", "package", PACKAGE, "z")
 

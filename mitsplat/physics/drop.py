@@ -181,8 +181,9 @@ class Drop:
             start = self.draw_poses(assets, rng, given, number, regions)
         except InputError as error:
             # An object that is too large for its region leaves the others room.
+            spec = self.scene.spec
             alone = [
-                draw_poses([item], obstacles, self.scene.spec.all_regions, rng) is None
+                draw_poses([item], obstacles, spec.all_regions, rng, spec.settle.yaw) is None
                 for item in self._items(assets, given, regions)
             ]
             if not any(alone):
@@ -389,7 +390,7 @@ class Drop:
         items = self._items(assets, given, regions)
         region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
         obstacles = self._grounds[ground].obstacles
-        poses = draw_poses(items, obstacles, self.scene.spec.all_regions, rng)
+        poses = draw_poses(items, obstacles, self.scene.spec.all_regions, rng, self.scene.spec.settle.yaw)
         if poses is not None:
             return poses
         if self.scene.spec.regions:

@@ -49,6 +49,7 @@ def draw_poses(
     obstacles: Sequence[PlacedSurface],
     regions: Sequence[tuple[Region, Arrangement]],
     rng: np.random.Generator,
+    yaw: tuple[float, float] | None = None,
 ) -> Float64Array | None:
     """Poses (N, 4, 4) of all items; None if they find no room. None that is drawn touches another or an obstacle.
 
@@ -57,9 +58,10 @@ def draw_poses(
         obstacles: What does not move.
         regions: Where, and how, see :class:`mitsplat.spec.spec.Settle`; one region after the other.
         rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
+        yaw: Range of turns about the vertical [degrees] of what is put down upright or packed; any if None.
     """
     for _ in range(_DRAWS):
-        poses = _Draw(items, obstacles, rng).all_poses(regions)
+        poses = _Draw(items, obstacles, rng, yaw).all_poses(regions)
         if poses is not None:
             return poses
     return None
@@ -80,8 +82,14 @@ def resting_turn(outline: Float64Array) -> Float64Array:
 class _Draw:
     """One attempt to place all items."""
 
-    def __init__(self, items: Sequence[Item], obstacles: Sequence[PlacedSurface], rng: np.random.Generator) -> None:
-        self._items, self._obstacles, self._rng = items, obstacles, rng
+    def __init__(
+        self,
+        items: Sequence[Item],
+        obstacles: Sequence[PlacedSurface],
+        rng: np.random.Generator,
+        yaw: tuple[float, float] | None,
+    ) -> None:
+        self._items, self._obstacles, self._rng, self._yaw = items, obstacles, rng, yaw
         self._low = self._high = self._foot = np.zeros(3)
         self._sky = np.inf
         self._poses = np.tile(np.eye(4), (len(items), 1, 1))
@@ -115,7 +123,7 @@ class _Draw:
             "drop": self._drop,
             "pile": self._pour,
             "scatter": self._scatter,
-            "upright": lambda i: self._stand(i, np.eye(3)),
+            "upright": lambda i: self._stand(i, np.eye(3), self._yaw),
         }
         return all(place[arrangement](i) for i in free)
 
@@ -190,7 +198,10 @@ class _Draw:
         corner, depth = self._low.copy(), 0.0
         for i in self._rng.permutation(np.asarray(members, dtype=np.intp)).tolist():
             pose = np.eye(4)
-            angle = 90 * self._rng.integers(4) + self._rng.uniform(-_ASKEW, _ASKEW)
+            if self._yaw is not None:
+                angle = self._rng.uniform(*self._yaw)
+            else:
+                angle = 90 * int(self._rng.integers(4)) + self._rng.uniform(-_ASKEW, _ASKEW)
             pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix()
             bounds = _bounds(self._items[i].outline, pose)
             size, room = bounds[1] - bounds[0], self._rng.uniform(*_ROOM)
@@ -209,12 +220,13 @@ class _Draw:
             depth = max(depth, float(size[1]))
         return True
 
-    def _stand(self, i: int, turn: Float64Array) -> bool:
+    def _stand(self, i: int, turn: Float64Array, yaw: tuple[float, float] | None = None) -> bool:
         """Put an item, turned about the vertical, down on what is below."""
         outline = self._items[i].outline
+        low_yaw, high_yaw = (0.0, 2 * np.pi) if yaw is None else np.radians(yaw)
         for _ in range(_PLACES):
             pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_euler("z", self._rng.uniform(0, 2 * np.pi)).as_matrix() @ turn
+            pose[:3, :3] = Rotation.from_euler("z", self._rng.uniform(low_yaw, high_yaw)).as_matrix() @ turn
             bounds = _bounds(outline, pose)
             low, high = self._low - bounds[0], self._high - bounds[1]
             if (low > high).any():

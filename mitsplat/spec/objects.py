@@ -31,6 +31,9 @@ GainRange = Annotated[tuple[_Gain, _Gain], AfterValidator(ordered)]
 _Roughness = Annotated[float, Field(ge=0.02, le=1)]
 RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(ordered)]
 
+_Yaw = Annotated[float, Field(ge=-360, le=360)]
+YawRange = Annotated[tuple[_Yaw, _Yaw], AfterValidator(ordered)]
+
 Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "packed"]
 
 
@@ -194,6 +197,12 @@ class Settle(StrictModel):
 
     arrangement: Arrangement = Field(
         "drop", description="Random drop, pile, sparse scatter, stacks, upright, or packed side by side."
+    )
+    yaw: YawRange | None = Field(
+        None,
+        exclude_if=lambda yaw: yaw is None,
+        description="Range of turns about the vertical [degrees] of what is put down upright or packed, 0 as the asset "
+        "stands: where fronts look. Any turn if absent, and quarter turns of what is packed.",
     )
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(

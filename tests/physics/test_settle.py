@@ -626,6 +626,22 @@ def test_what_is_packed_stands_side_by_side_in_rows(scene_data, write_scene):
         drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
 
 
+@pytest.mark.parametrize("arrangement", ["upright", "packed"])
+def test_fronts_look_where_yaw_says(scene_data, write_scene, arrangement):
+    scene_data["objects"] = [{"asset": "assets/bolt", "count": 8}]
+    settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [80, 110]}
+    _, layout = drop_layout(scene_data, write_scene, settle=settle)
+    poses = np.array([instance.world_from_object for instance in layout.instances])
+    turns = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    assert turns.min() > 79.9 and turns.max() < 110.1 and np.ptp(turns) > 5
+
+
+def test_yaw_is_for_what_is_put_down(scene_data, write_scene):
+    scene_data["settle"] = {"arrangement": "pile", "yaw": [0, 90]}
+    with pytest.raises(InputError, match=r"settle.yaw: needs settle.arrangement upright or packed \(got pile\)"):
+        load_scene(write_scene(scene_data))
+
+
 def test_poses_may_be_given(scene_data, write_scene):
     """A nut put down turned by 30 degrees stays there; one above it comes down by its clearance; others keep off."""
     given = [

@@ -22,7 +22,7 @@ from mitsplat.plugins.gaussian import RECORD
 from mitsplat.plugins.pairs import NUMBER_BITS, Pairs, pair_records, prefix_ranges
 from mitsplat.plugins.project import CloudSet, Placement, Projector, placement_table
 from mitsplat.plugins.rays import View
-from mitsplat.plugins.sorting import sort_in_threads, stable_order
+from mitsplat.plugins.sorting import numpy_sorts_slowly, sort_in_threads, stable_order
 from mitsplat.plugins.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
 from mitsplat.quality import Quality
 
@@ -258,9 +258,9 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
 def _sorted(key: Any, bits: int) -> Any:
     """Keys (UInt64, evaluated) of pairs by their leading ``bits``, above their numbers, by which they ascend already.
 
-    On a CPU, where NumPy sorts several of them with each instruction, in their own memory.
+    On most CPUs NumPy sorts several of them with each instruction, in their own memory.
     """
-    if dr.backend_v(key) == dr.JitBackend.LLVM:
+    if dr.backend_v(key) == dr.JitBackend.LLVM and not numpy_sorts_slowly():
         sort_in_threads(key.numpy(), min(8, max(1, dr.thread_count() // 2)))
         return key
     in_order = dr.gather(mi.UInt64, key, stable_order(key >> NUMBER_BITS, bits))

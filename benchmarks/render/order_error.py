@@ -94,8 +94,8 @@ class Picture:
         lanes = Lanes(lists, self.view, rows=1)
         far = [mi.Float(dr.inf)]
         rays = Rays.through(lists, self.view, quality, lanes.slopes(0.5, 0.5), far, lanes.start, lanes.stop)
-        state = {"several": False, "estimated": True}
-        (pixel,) = walk(rays, "window", partial(_fresh, **state), partial(_blend, **state))
+        fresh, blend = (partial(step, several=False, late="estimated") for step in (_fresh, _blend))
+        (pixel,) = walk(rays, "window", fresh, blend)
         *rgb, error = (lanes.image(mi.Float, [pixel[k]]).numpy() for k in (1, 2, 3, ERROR))
         return np.stack(rgb, axis=-1), error
 

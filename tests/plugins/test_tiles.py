@@ -1,6 +1,7 @@
 """Lists of Gaussians per tile: what is in them, and in which order."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -9,7 +10,7 @@ import pytest
 
 from mitsplat.camera import Camera
 from mitsplat.quality import PRESETS
-from mitsplat.render.layers import ensure_variant, make_sensor
+from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
 from tests.render.test_render import make_splats
 
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=50, fov_x=50)
@@ -52,3 +53,35 @@ def test_sorts_agree_with_numpy() -> None:
         np.testing.assert_array_equal(found, np.sort(keys))
     order = np.array(stable_order(mi.UInt64(keys), 31))
     np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
+
+
+@pytest.mark.parametrize(
+    ("said", "slow"),
+    [
+        ("vendor_id\t: AuthenticAMD\ncpu family\t: 25\nflags\t: sse avx2 avx512f avx512dq\n", True),
+        ("vendor_id\t: AuthenticAMD\ncpu family\t: 25\nflags\t: sse avx2 sha_ni\n", False),  # Zen 3
+        ("vendor_id\t: AuthenticAMD\ncpu family\t: 26\nflags\t: sse avx2 avx512f avx512dq\n", False),  # Zen 5
+        ("vendor_id\t: GenuineIntel\ncpu family\t: 6\nflags\t: sse avx2 avx512f avx512dq\n", False),
+        (None, False),  # not Linux
+    ],
+)
+def test_processors_on_which_numpy_sorts_slowly_are_known(
+    said: str | None, slow: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mitsplat.plugins import sorting
+
+    if said is not None:
+        (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{said}\nprocessor\t: 1\n{said}")
+    monkeypatch.setattr(sorting, "CPUINFO", tmp_path / "cpuinfo")
+    assert sorting.numpy_sorts_slowly.__wrapped__() is slow
+
+
+def test_lists_are_the_same_however_they_are_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mitsplat.plugins import tiles
+
+    splats, found = make_splats(3000, 5), []
+    for slow in (False, True):
+        monkeypatch.setattr(tiles, "numpy_sorts_slowly", lambda slow=slow: slow)
+        found.append(render_splats(splats, CAMERA.resized(64, 48), quality=PRESETS["fast"]))
+    for name in ("rgb", "alpha", "depth", "instance"):
+        np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
 from mitsplat.camera import Camera, look_at_pose
 from mitsplat.colour import encode_srgb
@@ -239,6 +240,16 @@ def test_balanced_pops_less_than_fast() -> None:
         return float(max(np.abs(after - before).max() for before, after in pairwise(wrong)))
 
     assert popping("balanced") < 0.5 * popping("fast")
+
+
+def test_the_estimate_ranks_pixels_as_the_benchmark_records_it() -> None:
+    from benchmarks.render.order_error import Picture
+
+    ensure_variant()
+    picture, quality = Picture(CROWD, WIDE), replace(PRESETS["balanced"], extends=False)
+    rgb, estimate = picture.estimate(quality)
+    error = np.abs(rgb - picture.show(replace(quality, tolerance=0.0))).max(axis=-1)
+    assert spearmanr(estimate[error > 1e-6], error[error > 1e-6]).statistic > 0.6
 
 
 def turned(degrees: float) -> Camera:

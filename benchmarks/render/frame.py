@@ -27,9 +27,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def ten_objects(path: Path) -> dict[str, Any]:
-    """What makes a scene one of ten objects, of the first assets, under its first light and its environment."""
+    """What makes a scene one of ten objects of its first entry, under its first light and its environment."""
     scene = YAML(typ="safe").load(path)
-    objects = [{**entry, "count": 1} for entry in scene["objects"]][:10]
+    objects = [{**scene["objects"][0], "count": 10}]
     lights = [scene["lights"][0], *(light for light in scene["lights"][1:] if light["kind"] == "environment")]
     return {"objects": objects, "lights": lights}
 

@@ -122,9 +122,9 @@ def evaluate(
 
 
 def compare(
-    datasets: Annotated[
-        list[Path],
-        typer.Argument(metavar="DATASETS... PHOTOS", help="Rendered datasets, and labelled photographs last."),
+    datasets: Annotated[list[Path], typer.Argument(metavar="DATASETS...", help="Rendered datasets.")],
+    photographs: Annotated[
+        Path, typer.Argument(metavar="PHOTOS", help="Labelled photographs: a YOLO folder, a COCO folder or a dataset.")
     ],
     split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Which rendered images.")] = "train",
     size: Annotated[
@@ -141,15 +141,10 @@ def compare(
     Objects' brightness, saturation, size and number, images' brightness and noise, of all and of each class.
     """
     from mitsplat.detector.likeness import compare_with_photographs
-    from mitsplat.errors import InputError
     from mitsplat.files import write_text
 
-    if len(datasets) < 2:
-        raise InputError("name rendered datasets, and labelled photographs last (got one folder)")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
-        found = compare_with_photographs(
-            datasets[:-1], datasets[-1], split=split, size=size, most=images, progress=progress
-        )
+        found = compare_with_photographs(datasets, photographs, split=split, size=size, most=images, progress=progress)
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")
     for trait in found.traits:
         _tell(trait.name, trait)

@@ -252,11 +252,12 @@ def _trait(name: str, rendered: Sequence[float], real: Sequence[float]) -> Trait
     unit, less, more = _TRAITS[name]
     ours, theirs = (np.quantile(values, [_TAIL, 0.5, 1 - _TAIL]) for values in (rendered, real))
     outside = np.asarray(real) < ours[0], np.asarray(real) > ours[2]
-    advice = [
-        words
-        for beyond, words in zip(outside, (less, more), strict=True)
-        if binom.sf(beyond.sum() - 1, len(beyond), _TAIL) < CHANCE
-    ]
+    too_low, too_high = (bool(binom.sf(beyond.sum() - 1, len(beyond), _TAIL) < CHANCE) for beyond in outside)
+    advice = {
+        (True, False): less,
+        (False, True): more,
+        (True, True): "photographs differ more among themselves: widen both ends of the range",
+    }
     quantiles = [(float(values[0]), float(values[1]), float(values[2])) for values in (ours, theirs)]
     below, above = (float(beyond.mean()) for beyond in outside)
-    return Trait(name, unit, quantiles[0], quantiles[1], below, above, "; ".join(advice))
+    return Trait(name, unit, quantiles[0], quantiles[1], below, above, advice.get((too_low, too_high), ""))

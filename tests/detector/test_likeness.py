@@ -76,6 +76,15 @@ def test_what_differs_is_named_with_what_changes_it(
     assert max(found.below, found.above) > 0.9
 
 
+def test_photographs_that_differ_both_ways_ask_for_a_wider_range(rendered: Path, photographs: Path) -> None:
+    for number, path in enumerate(sorted((photographs / "photos").iterdir())):
+        image = cv2.imread(str(path)).astype(float) * (0.5 if number % 2 else 1.1)
+        cv2.imwrite(str(path), np.clip(image, 0, 255).astype(np.uint8))
+    found = trait(compare_with_photographs([rendered], photographs, size=WIDTH), "brightness of objects")
+    assert "widen both ends" in found.advice
+    assert found.below > 0.3 and found.above > 0.3
+
+
 def test_a_class_alone_can_differ(rendered: Path, photographs: Path) -> None:
     """Discs are red and boxes blue: without half of the blue the boxes are dark."""
     change(photographs, lambda image: image * (0.5, 1, 1))

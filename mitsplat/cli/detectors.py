@@ -6,6 +6,7 @@ Commands import what they need inside of their functions, so that the start of e
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -153,7 +154,7 @@ def compare(
             if trait.advice:
                 _tell(f"{name}: {trait.name}", trait)
     if out is not None:
-        write_text(out, json.dumps(found.to_json(), indent=1) + "\n")
+        write_text(out, json.dumps(asdict(found), indent=1) + "\n")
         typer.echo(f"measured: {out}")
 
 

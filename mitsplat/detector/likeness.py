@@ -8,17 +8,18 @@ lies beyond the middle nine tenths of the rendered ones: a tenth would where bot
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from scipy.stats import binom
 
 from mitsplat.arrays import BoolArray, ByteImage
-from mitsplat.detector.sets import Instance, LabelledSet, Sample, Split, in_classes, read_set
+from mitsplat.detector.sets import Instance, Sample, Split, in_classes, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress
@@ -35,8 +36,9 @@ _FLAT_QUANTILE = 0.4
 _DARK = 40
 """Bytes below which a sensor clips its noise."""
 
+BRIGHTNESS = "brightness of objects"
 _TRAITS: dict[str, tuple[str, str, str]] = {
-    "brightness of objects": (
+    BRIGHTNESS: (
         "of 255",
         "lower randomise.exposure, or light less",
         "raise randomise.exposure, light objects more, or darken what lies around them",
@@ -49,6 +51,9 @@ _TRAITS: dict[str, tuple[str, str, str]] = {
     "noise of images": ("of 255", "lower randomise.iso, or expose more", "raise randomise.iso"),
 }
 """Unit, and what to change if photographs have less, or more."""
+
+_Values: TypeAlias = dict[tuple[str, int | None], list[float]]
+"""Values of a trait: of all objects or images, and of those of a class by its index."""
 
 
 @dataclass(frozen=True)
@@ -90,17 +95,12 @@ class Likeness:
     traits: tuple[Trait, ...]
     classes: dict[str, tuple[Trait, ...]]
 
-    def to_json(self) -> dict[str, Any]:
-        """For a file."""
-        return asdict(self)
-
 
 def compare_with_photographs(
     rendered: Sequence[str | Path],
     photographs: str | Path,
     *,
     split: Split = "train",
-    real_split: Split = "all",
     size: int = 640,
     most: int = 400,
     progress: Progress | None = None,
@@ -111,9 +111,8 @@ def compare_with_photographs(
 
     Args:
         rendered: Datasets, or YOLO or COCO folders, with the same classes.
-        photographs: Likewise; classes may come in another order.
+        photographs: Likewise, of which all count; classes may come in another order.
         split: Which rendered images.
-        real_split: Which photographs.
         size: Longer side that images are scaled to before they are measured [px].
         most: Images of each side, evenly drawn from what there is.
         progress: Told of each image.
@@ -123,34 +122,29 @@ def compare_with_photographs(
     """
     if size < 32 or most < 1:
         raise InputError(f"size must be 32 px or more, and most at least 1 (got {size} and {most})")
-    real = read_set(photographs, real_split)
+    real = read_set(photographs, "all")
     sets = [in_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:
         raise InputError("there are no rendered images to compare")
     ours = _evenly([sample for one in sets for sample in one.samples], most)
     theirs = _evenly(list(real.samples), most)
-    measured = []
+    sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
     for number, sample in enumerate(ours + theirs):
         if progress is not None:
             progress(number, len(ours) + len(theirs), "measuring images")
-        measured.append(_measure(sample, real, size))
-    sides = [_Side(measured[: len(ours)]), _Side(measured[len(ours) :])]
-    classes = {}
-    for index, name in enumerate(real.class_names):
-        of_class = [side.of_class(index) for side in sides]
-        counts = [len(values["brightness of objects"]) for values in of_class]
-        if counts[0] >= FEWEST_RENDERED and counts[1] >= FEWEST:
-            classes[name] = tuple(_trait(key, of_class[0][key], of_class[1][key]) for key in of_class[0])
-    return Likeness(
-        len(ours),
-        len(theirs),
-        tuple(
-            _trait(key, sides[0].values[key], sides[1].values[key])
-            for key in _TRAITS
-            if all(side.values[key] for side in sides)
-        ),
-        classes,
-    )
+        _measure(sample, size, sides[number >= len(ours)])
+
+    def traits_of(index: int | None) -> tuple[Trait, ...]:
+        shown = [key for key in _TRAITS if all(side.get((key, index)) for side in sides)]
+        return tuple(_trait(key, sides[0][key, index], sides[1][key, index]) for key in shown)
+
+    least = FEWEST_RENDERED, FEWEST
+    classes = {
+        name: traits_of(index)
+        for index, name in enumerate(real.class_names)
+        if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
+    }
+    return Likeness(len(ours), len(theirs), traits_of(None), classes)
 
 
 def _evenly(samples: list[Sample], most: int) -> list[Sample]:
@@ -158,40 +152,8 @@ def _evenly(samples: list[Sample], most: int) -> list[Sample]:
     return [samples[place] for place in places]
 
 
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """Of an image: traits of it, and (class, brightness, saturation) of its objects, and the sizes of these."""
-
-    image: dict[str, float]
-    colours: list[tuple[int, float, float]]
-    sizes: list[float]
-
-
-class _Side:
-    """What was measured on rendered images, or on photographs."""
-
-    def __init__(self, measured: list[_Measured]) -> None:
-        self.colours = [colour for one in measured for colour in one.colours]
-        self.values: dict[str, list[float]] = {
-            "brightness of objects": [colour[1] for colour in self.colours],
-            "saturation of objects": [colour[2] for colour in self.colours],
-            "size of objects": [size for one in measured for size in one.sizes],
-        }
-        for key in _TRAITS:
-            if key not in self.values:
-                self.values[key] = [one.image[key] for one in measured if key in one.image]
-
-    def of_class(self, index: int) -> dict[str, list[float]]:
-        """Brightness and saturation of one class."""
-        rows = [colour for colour in self.colours if colour[0] == index]
-        return {
-            "brightness of objects": [row[1] for row in rows],
-            "saturation of objects": [row[2] for row in rows],
-        }
-
-
-def _measure(sample: Sample, found: LabelledSet, size: int) -> _Measured:
-    """Measure an image at a longer side of ``size`` pixels."""
+def _measure(sample: Sample, size: int, values: _Values) -> None:
+    """Add what an image shows at a longer side of ``size`` pixels."""
     stored = cv2.imread(str(sample.path), cv2.IMREAD_COLOR)
     if stored is None:
         raise InputError(f"{sample.path}: cannot be read as an image")
@@ -199,26 +161,26 @@ def _measure(sample: Sample, found: LabelledSet, size: int) -> _Measured:
     width, height = (max(round(scale * side), 1) for side in (sample.width, sample.height))
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     picture: ByteImage = cv2.resize(stored, (width, height), interpolation=way).astype(np.uint8)
-    bright = picture.max(axis=2)
-    colours, sizes, cut = [], [], 0
-    objects = [instance for instance in sample.instances if not instance.crowd]
+    objects, cut = [instance for instance in sample.instances if not instance.crowd], 0
     for instance in objects:
         x0, y0, x1, y1 = instance.box
-        sizes.append(scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0))))
+        values["size of objects", None].append(scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0))))
         cut += bool(min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1)
         inside = _inside(instance, sample, width, height)
         if inside.sum() >= _SMALLEST:
             pixels = picture[inside].astype(float)
             most = pixels.max(axis=1)
             saturation = (most - pixels.min(axis=1)) / np.maximum(most, 1)
-            colours.append((instance.class_index, float(np.median(most)), 100 * float(np.median(saturation))))
-    image = {"brightness of images": float(picture.mean()), "objects of an image": float(len(objects))}
+            for index in (None, instance.class_index):
+                values[BRIGHTNESS, index].append(float(np.median(most)))
+                values["saturation of objects", index].append(100 * float(np.median(saturation)))
+    values["objects of an image", None].append(float(len(objects)))
     if objects:
-        image["objects cut by the border"] = 100 * cut / len(objects)
-    noise = _noise(picture[..., 1], bright)
+        values["objects cut by the border", None].append(100 * cut / len(objects))
+    values["brightness of images", None].append(float(picture.mean()))
+    noise = _noise(picture[..., 1], picture.max(axis=2))
     if noise is not None:
-        image["noise of images"] = noise
-    return _Measured(image, colours, sizes)
+        values["noise of images", None].append(noise)
 
 
 def _inside(instance: Instance, sample: Sample, width: int, height: int) -> BoolArray:

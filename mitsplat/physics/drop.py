@@ -181,11 +181,7 @@ class Drop:
             start = self.draw_poses(assets, rng, given, number, regions)
         except InputError as error:
             # An object that is too large for its region leaves the others room.
-            spec = self.scene.spec
-            alone = [
-                draw_poses([item], obstacles, spec.all_regions, rng, spec.settle.yaw) is None
-                for item in self._items(assets, given, regions)
-            ]
+            alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
             if not any(alone):
                 raise
             return _Refusal("no room for it", np.flatnonzero(alone).tolist(), str(error))
@@ -389,8 +385,7 @@ class Drop:
         """
         items = self._items(assets, given, regions)
         region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
-        obstacles = self._grounds[ground].obstacles
-        poses = draw_poses(items, obstacles, self.scene.spec.all_regions, rng, self.scene.spec.settle.yaw)
+        poses = self._place(items, ground, rng)
         if poses is not None:
             return poses
         if self.scene.spec.regions:
@@ -403,8 +398,12 @@ class Drop:
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
             f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
-            f"{self._in_way(obstacles)}, settle.arrangement {arrangement})"
+            f"{self._in_way(self._grounds[ground].obstacles)}, settle.arrangement {arrangement})"
         )
+
+    def _place(self, items: Sequence[Item], ground: int, rng: np.random.Generator) -> Float64Array | None:
+        spec = self.scene.spec
+        return draw_poses(items, self._grounds[ground].obstacles, spec.all_regions, rng, spec.settle.yaw)
 
     def _items(
         self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None

@@ -227,7 +227,7 @@ class SceneSpec(StrictModel):
         return self
 
     def _check_regions(self) -> None:
-        """Refuse walls that end above their region, and regions that are not told apart or not there."""
+        """Refuse walls above their region, regions that are not told apart or not there, and a yaw for none of them."""
         stated: list[tuple[tuple[str | int, ...], Region, Enclosure | None]] = [((), self.region, self.enclosure)]
         stated += [(("regions", i), region, region.enclosure) for i, region in enumerate(self.regions)]
         for keys, region, walls in stated:

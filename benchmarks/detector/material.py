@@ -3,8 +3,8 @@
     python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 90] [--device cuda]
 
 HOPE holds ``meshes/*.glb`` (textured scans [m], y up), ``photos/*.jpg`` named ``scene_NNNN_LLLL``, and ``labels.json``
-(COCO). WORK gets ``groceries/`` and ``packages/``, folders of assets, and ``photos/``, a COCO folder. What is there
-already is kept, so that it goes on where it was stopped.
+(COCO). WORK gets ``groceries/``, ``packages/`` and ``brands/`` (the scans as other brands print them), folders of
+assets, and ``photos/``, a COCO folder. What is there already is kept, so that it goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal
 
 import trimesh
 
-from benchmarks.detector.packages import make_package
+from benchmarks.detector.packages import make_package, relabel, shape_of
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import read_parts
@@ -30,6 +30,9 @@ PACKAGE = BakeSettings(
 
 UP: dict[str, Literal["y", "z"]] = {"bbq_sauce": "z"}
 """Axes of scans that stand along another than y: this one lies on its label."""
+
+BRANDS = {"box": 2, "bottle": 5, "can": 8}
+"""How many other brands of each scan there are, by its shape: most goods in cans and bottles come in these."""
 
 DENSITY = 600.0
 """Of packed food with air around it [kg/m^3]."""
@@ -78,8 +81,13 @@ def make(options: argparse.Namespace) -> None:
         shutil.copytree(options.hope / "photos", photos)
         shutil.copy(options.hope / "labels.json", photos / "labels.json")
     scans = BakeSettings(gaussians=options.gaussians)
-    for path in sorted((options.hope / "meshes").glob("*.glb")):
-        bake(path, options.work / "groceries" / path.stem, path.stem, scans, UP.get(path.stem, "y"))
+    for number, path in enumerate(sorted((options.hope / "meshes").glob("*.glb"))):
+        up = UP.get(path.stem, "y")
+        bake(path, options.work / "groceries" / path.stem, path.stem, scans, up)
+        scan = trimesh.load(path, force="mesh")
+        for brand in range(BRANDS[shape_of(scan)]):
+            out = options.work / "brands" / f"{path.stem}_{brand}"
+            bake(relabel(scan, 1000 * number + brand, "xyz".index(up)), out, "package", PACKAGE, up)
     for seed in range(options.packages):
         bake(make_package(seed), options.work / "packages" / f"package_{seed:02d}", "package", PACKAGE, "z")
 

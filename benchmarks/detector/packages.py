@@ -1,7 +1,8 @@
 """Packages that no class is: boxes, cans and bottles with printed labels, as textured meshes to be baked.
 
 A detector that has never seen another box with words on it takes every box with words for one that it knows. These are
-drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib.
+drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib. Nor
+is a shape a class where brands share bottles and cans: scans are printed anew, each as another brand's.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -34,6 +35,79 @@ def make_package(seed: int) -> trimesh.Trimesh:
     rng = np.random.default_rng(seed)
     kind: Callable[[np.random.Generator], trimesh.Trimesh] = (_box, _can, _bottle)[seed % 3]
     return kind(rng)
+
+
+def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
+    """What a package is, by how much of its bounding box it fills, and how slender it is."""
+    extents = np.sort(scan.extents)
+    if scan.convex_hull.volume > 0.8 * extents.prod():
+        return "box"
+    return "bottle" if extents[2] > 1.8 * extents[1] else "can"
+
+
+def relabel(scan: trimesh.Trimesh, seed: int, up: int) -> trimesh.Trimesh:
+    """A scan with another brand's print on it: all sides of a box, all around a bottle below its cap, or a can.
+
+    Args:
+        scan: With a texture, of which ends of cans stay.
+        seed: Decides all that is printed.
+        up: Axis along which print stands upright.
+    """
+    rng = np.random.default_rng(seed)
+    shape = shape_of(scan)
+    corners = scan.triangles - scan.bounds.mean(axis=0)
+    across, along = (up + 1) % 3, (up + 2) % 3  # from which the upright axis is the third of a right-handed frame
+    size, colours = scan.extents, _colours(rng)
+    scanned = scan.visual.material.baseColorTexture.convert("RGB")
+    uv, sheets = scan.visual.uv[scan.faces], [scanned]
+    side = np.zeros(len(corners), dtype=int)  # the sheet that is on a triangle
+
+    def put(sheet: Image.Image, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> None:
+        """Print on some of the triangles, at coordinates within [0, 1]."""
+        side[faces] = len(sheets)
+        uv[faces] = np.clip(np.stack([u[faces], v[faces]], axis=-1), 0, 1)
+        sheets.append(sheet)
+
+    height = corners[..., up] / size[up] + 0.5
+    if shape == "box":
+        nearest = np.abs(scan.face_normals).argmax(axis=1)
+        sign = np.sign(np.take_along_axis(scan.face_normals, nearest[:, None], axis=1)[:, 0])
+        for axis, u_axis, v_axis in ((across, along, up), (along, across, up), (up, across, along)):
+            for facing in (-1, 1):
+                # Seen from outside, u grows to the right.
+                turned = facing if axis != along else -facing
+                u = turned * corners[..., u_axis] / size[u_axis] + 0.5
+                v = corners[..., v_axis] / size[v_axis] + 0.5
+                sheet = _label(size[u_axis], size[v_axis], rng, colours)
+                put(sheet, (nearest == axis) & (sign == facing), u, v)
+    else:
+        around = np.pi * (size[across] + size[along]) / 2
+        u = np.arctan2(corners[..., along], corners[..., across]) / (2 * np.pi) + 0.5
+        u = np.where((u < 0.25) & (np.ptp(u, axis=1, keepdims=True) > 0.5), u + 1, u)
+        front = _label(around / 2, size[up], rng, colours)
+        sheet = Image.new("RGB", (round(2.1 * front.width), front.height))
+        for place in range(3):  # front and back, and the beginning again where triangles reach over the seam
+            sheet.paste(front, (place * front.width, 0))
+        if shape == "bottle":
+            cap = (0, 0, sheet.width, round(rng.uniform(0.1, 0.25) * sheet.height))
+            ImageDraw.Draw(sheet).rectangle(cap, fill=_any_colour(rng))
+        printed = np.full(len(corners), True)
+        if shape == "can":
+            printed = np.abs(scan.face_normals[:, up]) < 0.7
+            printed &= np.abs(height.mean(axis=1) - 0.5) < 0.5 - 0.004 / size[up]
+        put(sheet, printed, u / 1.05, height)
+
+    atlas = Image.new("RGB", (max(sheet.width for sheet in sheets), sum(sheet.height for sheet in sheets)))
+    top = 0
+    for number, sheet in enumerate(sheets):
+        atlas.paste(sheet, (0, top))
+        here = side == number
+        uv[here, :, 0] *= sheet.width / atlas.width
+        uv[here, :, 1] = 1 - (top + sheet.height * (1 - uv[here, :, 1])) / atlas.height
+        top += sheet.height
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    vertices = scan.triangles.reshape(-1, 3)
+    return _textured(vertices, faces, uv.reshape(-1, 2), atlas, rng.uniform(0.35, 0.8))
 
 
 def _colours(rng: np.random.Generator) -> Colours:

@@ -449,7 +449,7 @@ class Drop:
         fallen = [
             item
             for item, tilt, pose in zip(resting, tilts, given, strict=True)
-            if laid[item] in ("stack", "upright", "packed") and pose is None and tilt > _FALLEN
+            if laid[item] in ("stack", "upright", "tower", "packed") and pose is None and tilt > _FALLEN
         ]
         return (f"{fallen[0].name} fell over", set(fallen)) if fallen else None
 

@@ -22,6 +22,7 @@ _DRAWS = 20
 _SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
 _ROOM = (2e-3, 5e-3)  # between what is packed [m]
 _ASKEW = 3.0  # how far it is turned from quarter turns [degrees]
+_OFF_MIDDLE = 4e-3  # how far each of a tower is from the middle of what is below it, along x and y [m]
 _HOVER = 2e-4  # how closely objects are put on what is below them [m]
 
 
@@ -58,7 +59,8 @@ def draw_poses(
         obstacles: What does not move.
         regions: Where, and how, see :class:`mitsplat.spec.spec.Settle`; one region after the other.
         rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
-        yaw: Range of turns about the vertical [degrees] of what is put down upright or packed; any if None.
+        yaw: Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed; any if
+            None.
     """
     for _ in range(_DRAWS):
         poses = _Draw(items, obstacles, rng, yaw).all_poses(regions)
@@ -104,7 +106,8 @@ class _Draw:
                 self._take(i, item.pose, _bounds(item.outline, item.pose))
         # Large ones first, for which room is scarce.
         free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
-        for number, (region, arrangement) in enumerate(regions):
+        # Towers before what stands around them.
+        for number, (region, arrangement) in sorted(enumerate(regions), key=lambda one: one[1][1] != "tower"):
             self._low, self._high = np.array(region.min), np.array(region.max)
             self._sky = float(self._high[2]) if len(regions) > 1 else np.inf  # there may be another region above
             self._foot = self._low.copy()  # of what is still free of a pile's column
@@ -117,6 +120,8 @@ class _Draw:
         if arrangement == "stack":
             assets = dict.fromkeys(self._items[i].asset for i in free)
             return all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
+        if arrangement == "tower":
+            return self._build(free)
         if arrangement == "packed":
             return self._pack(free)
         place: dict[str, Callable[[int], bool]] = {
@@ -193,6 +198,23 @@ class _Draw:
             self._take(i, pose, box)
         return True
 
+    def _build(self, members: Sequence[int]) -> bool:
+        """All members upright on one another, the widest below, each turned for itself and a little off the middle."""
+        members = sorted(members, key=lambda i: -float(np.ptp(self._items[i].outline[:, :2], axis=0).prod()))
+        if members and not self._stand(members[0], np.eye(3), self._yaw):
+            return False
+        for i in members[1:]:
+            below, pose = self._taken[-1], np.eye(4)
+            pose[:3, :3] = self._turn(self._yaw)
+            bounds = _bounds(self._items[i].outline, pose)
+            pose[:2, 3] = (below - bounds).mean(axis=0)[:2] + self._rng.uniform(-_OFF_MIDDLE, _OFF_MIDDLE, 2)
+            pose[2, 3] = below[1][2] + _HOVER - bounds[0][2]
+            box = bounds + pose[:3, 3]
+            if box[1][2] > self._high[2]:
+                return False
+            self._take(i, pose, box)
+        return True
+
     def _pack(self, members: Sequence[int]) -> bool:
         """All members side by side in rows along x, from the region's low corner on."""
         corner, depth = self._low.copy(), 0.0
@@ -223,10 +245,9 @@ class _Draw:
     def _stand(self, i: int, turn: Float64Array, yaw: tuple[float, float] | None = None) -> bool:
         """Put an item, turned about the vertical, down on what is below."""
         outline = self._items[i].outline
-        low_yaw, high_yaw = (0.0, 2 * np.pi) if yaw is None else np.radians(yaw)
         for _ in range(_PLACES):
             pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_euler("z", self._rng.uniform(low_yaw, high_yaw)).as_matrix() @ turn
+            pose[:3, :3] = self._turn(yaw) @ turn
             bounds = _bounds(outline, pose)
             low, high = self._low - bounds[0], self._high - bounds[1]
             if (low > high).any():
@@ -237,6 +258,11 @@ class _Draw:
                 self._take(i, pose, _bounds(outline, pose))
                 return True
         return False
+
+    def _turn(self, yaw: tuple[float, float] | None) -> Float64Array:
+        """A rotation (3, 3) about the vertical by an angle from a range [degrees], or any."""
+        low, high = (0.0, 2 * np.pi) if yaw is None else np.radians(yaw)
+        return Rotation.from_euler("z", self._rng.uniform(low, high)).as_matrix()
 
     def _lower(self, i: int, pose: Float64Array) -> bool:
         """Lower a pose, in place, until it all but touches an obstacle; false if there is none below.

@@ -34,7 +34,7 @@ RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(ordered
 _Yaw = Annotated[float, Field(ge=-360, le=360)]
 YawRange = Annotated[tuple[_Yaw, _Yaw], AfterValidator(ordered)]
 
-Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "packed"]
+Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "tower", "packed"]
 
 
 class ObjectPose(StrictModel):
@@ -191,18 +191,19 @@ class Settle(StrictModel):
 
     ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes, poured in at
     1 m/s. ``scatter``: apart, so that none touches another. ``stack``: all of one asset above one another on their
-    largest face. ``upright``: put down as the asset stands, turned about the vertical. ``packed``: the same side by
-    side, in rows from a corner of the region, by quarter turns that are a little off.
+    largest face. ``upright``: put down as the asset stands, turned about the vertical. ``tower``: the same, all that
+    start in the region on one another, the widest below. ``packed``: the same side by side, in rows from a corner of
+    the region, by quarter turns that are a little off.
     """
 
     arrangement: Arrangement = Field(
-        "drop", description="Random drop, pile, sparse scatter, stacks, upright, or packed side by side."
+        "drop", description="Random drop, pile, sparse scatter, stacks, upright, a tower, or packed side by side."
     )
     yaw: YawRange | None = Field(
         None,
         exclude_if=lambda yaw: yaw is None,
-        description="Range of turns about the vertical [degrees] of what is put down upright or packed, 0 as the asset "
-        "stands: where fronts look. Any turn if absent, and quarter turns of what is packed.",
+        description="Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed, 0 "
+        "as the asset stands: where fronts look. Any turn if absent, quarter turns of what is packed.",
     )
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(

@@ -234,8 +234,8 @@ class SceneSpec(StrictModel):
             if walls is not None and walls.floor >= region.max[2]:
                 text = f"must be below the region's top at {region.max[2]:g} m (got {walls.floor:g})"
                 raise FieldError((*keys, "enclosure", "floor"), text)
-        if self.settle.yaw is not None and not {"upright", "packed"} & {way for _, way in self.all_regions}:
-            text = f"needs settle.arrangement upright or packed (got {self.settle.arrangement})"
+        if self.settle.yaw is not None and not {"upright", "tower", "packed"} & {way for _, way in self.all_regions}:
+            text = f"needs settle.arrangement upright, tower or packed (got {self.settle.arrangement})"
             raise FieldError(("settle", "yaw"), text)
         names = self.region_names
         for number, name in enumerate(names[1:]):

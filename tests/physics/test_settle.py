@@ -583,7 +583,7 @@ def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
     assert layout.certificate.surface_motion < 1e-4
 
 
-@pytest.mark.parametrize("arrangement", ["stack", "upright", "packed"])
+@pytest.mark.parametrize("arrangement", ["stack", "upright", "tower", "packed"])
 def test_things_are_put_down_below_the_lid_of_an_enclosure(scene_data, write_scene, arrangement):
     """They start at the region's top, where the lid is, but stand on the ground from the first moment on."""
     scene_data["objects"] = [{"asset": "assets/nut", "count": 2}]
@@ -626,9 +626,26 @@ def test_what_is_packed_stands_side_by_side_in_rows(scene_data, write_scene):
         drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
 
 
-@pytest.mark.parametrize("arrangement", ["upright", "packed"])
+def test_what_is_a_tower_stands_on_one_another_the_widest_below(scene_data, write_scene):
+    """A bolt of 50 mm stands on three nuts of 10 mm, whatever order they are listed in; each is turned for itself."""
+    scene_data["objects"] = [{"asset": "assets/bolt", "count": 1}, {"asset": "assets/nut", "count": 3}]
+    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "tower", "stepper": "mujoco"})
+    poses = {one.asset: [] for one in layout.instances}
+    for one in layout.instances:
+        poses[one.asset].append(one.world_from_object)
+    bolt, nuts = poses[0][0], np.array(poses[1])
+    np.testing.assert_allclose(np.sort(nuts[:, 2, 3]), [0.005, 0.015, 0.025], atol=3e-4)
+    np.testing.assert_allclose(bolt[2, 3], 0.055, atol=3e-4)
+    np.testing.assert_allclose(np.linalg.norm(nuts[:, :2, 3] - bolt[:2, 3], axis=1), 0, atol=0.017)
+    assert np.ptp(np.arctan2(nuts[:, 1, 0], nuts[:, 0, 0])) > 0.1
+    scene_data["objects"][1]["count"] = 15
+    with pytest.raises(InputError, match=r"region must be large enough .* settle.arrangement tower"):
+        drop_layout(scene_data, write_scene, settle={"arrangement": "tower", "stepper": "mujoco"})
+
+
+@pytest.mark.parametrize("arrangement", ["upright", "tower", "packed"])
 def test_fronts_look_where_yaw_says(scene_data, write_scene, arrangement):
-    scene_data["objects"] = [{"asset": "assets/bolt", "count": 8}]
+    scene_data["objects"] = [{"asset": "assets/nut", "count": 8}]
     settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [80, 110]}
     _, layout = drop_layout(scene_data, write_scene, settle=settle)
     poses = np.array([instance.world_from_object for instance in layout.instances])
@@ -638,7 +655,7 @@ def test_fronts_look_where_yaw_says(scene_data, write_scene, arrangement):
 
 def test_yaw_is_for_what_is_put_down(scene_data, write_scene):
     scene_data["settle"] = {"arrangement": "pile", "yaw": [0, 90]}
-    with pytest.raises(InputError, match=r"settle.yaw: needs settle.arrangement upright or packed \(got pile\)"):
+    with pytest.raises(InputError, match=r"settle.yaw: needs settle.arrangement upright, tower or packed \(got pile\)"):
         load_scene(write_scene(scene_data))
 
 

@@ -262,7 +262,8 @@ class _Draw:
     def _turn(self, yaw: tuple[float, float] | None) -> Float64Array:
         """A rotation (3, 3) about the vertical by an angle from a range [degrees], or any."""
         low, high = (0.0, 2 * np.pi) if yaw is None else np.radians(yaw)
-        return Rotation.from_euler("z", self._rng.uniform(low, high)).as_matrix()
+        turn: Float64Array = Rotation.from_euler("z", self._rng.uniform(low, high)).as_matrix()
+        return turn
 
     def _lower(self, i: int, pose: Float64Array) -> bool:
         """Lower a pose, in place, until it all but touches an obstacle; false if there is none below.

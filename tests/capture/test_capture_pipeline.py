@@ -32,7 +32,7 @@ from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.isolation import ChosenObject
 from tests import rendered
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 
 
 def test_a_rendered_capture_comes_back(

@@ -11,7 +11,7 @@ from mitsplat.asset import Asset
 from mitsplat.checks.preflight import SIZES, check_asset, check_scene
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 from tests.conftest import box_asset
 
 

@@ -200,7 +200,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
 
     folder = made_once(tmp_path_factory, "rendered", rendered.render_capture)
     names = sorted(path.name for path in folder.iterdir())
-    return folder, dict(zip(names, rendered.cameras(len(names)), strict=True))
+    return folder, dict(zip(names, rendered.capture_cameras(), strict=True))
 
 
 @pytest.fixture(scope="session")

@@ -30,9 +30,14 @@ def cameras(count: int) -> list[Camera]:
     return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
 
 
-def render_capture(folder: Path, count: int = 24, *, samples: int = 8) -> dict[str, Camera]:
+def capture_cameras() -> list[Camera]:
+    """Cameras of a capture, 15 degrees apart, as far around as shows all sides: each pair of its photos is matched."""
+    return cameras(24)[:16]
+
+
+def render_capture(folder: Path, *, samples: int = 8) -> dict[str, Camera]:
     """Render photos into a folder; returns their cameras by name, in the board's frame [m]."""
-    return photograph(box_scene(5), cameras(count), folder, samples=samples)
+    return photograph(box_scene(5), capture_cameras(), folder, samples=samples)
 
 
 def box_scene(seed: int) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def test_a_rendered_capture_comes_back(
     assert (capture.units, capture.up, capture.table) == ("metre", "z", True)
     assert set(capture.rejected) == {"torn.png"}
     assert capture.rejected["torn.png"].startswith("it cannot be read")
-    assert result.given == 25
+    assert result.given == 17
     assert result.shortcoming is None
     assert result.reprojection_error < 1
     assert {photo.name for photo in capture.photos} == set(truth)
@@ -258,7 +258,7 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
     capture = capture_photos(given, tmp_path / "out", settings).capture
     assert capture.rejected["photo03.png"] == "its mask covers only 0.0% of it"
-    assert len(capture.photos) == 23
+    assert len(capture.photos) == 15
     alpha = capture.photos[0].picture()[1]
     assert alpha is not None
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
@@ -363,7 +363,7 @@ def test_photos_of_two_things_end_with_status_4(
     out, err = capsys.readouterr()
     assert "rejected: photo08.png: it only fits a smaller group of photos, as of another object or side\n" in out
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
-    assert "only 8 of 25 photos (32%) could be used, 75% are wanted" in err
+    assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
     assert len(Capture.load(tmp_path / "out").photos) == 8
 
 

@@ -45,7 +45,7 @@ SMALLER = {
     "settle": ["-n", "1", "--size", "32x18"],
     "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60", "--sh-degree", "0"],
-    "capture": ["--frames", "24"],
+    "capture": ["--frames", "21"],
     "asset": ["--gaussians", "300", "--iterations", "20", "--edge", "64", "--faces", "300"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],

@@ -6,9 +6,11 @@ import json
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import zlib
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -515,6 +517,22 @@ capture_photos(given, out, CaptureSettings(board=rendered.BOARD, kind="environme
     capture_photos(given, out, settings)
     for name in ("capture.json", "points.npz", "capture.png", "inputs.json"):
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_what_was_matched_is_of_use_in_another_place(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path
+) -> None:
+    """A finished capture is moved, and made anew as a place: its photos are the same, and so are their matches."""
+    given, finished, result = captured
+    out = Path(shutil.copytree(finished, tmp_path / "moved"))
+    with closing(sqlite3.connect(out / "sfm/database.db")) as database:
+        database.execute("PRAGMA application_id = 7")
+    again = capture_photos(given, out, CaptureSettings(board=rendered.BOARD, kind="environment"))
+    with closing(sqlite3.connect(out / "sfm/database.db")) as database:
+        assert database.execute("PRAGMA application_id").fetchone() == (7,)
+    assert again.reprojection_error == result.reprojection_error
+    for one, other in zip(again.capture.photos, result.capture.photos, strict=True):
+        np.testing.assert_array_equal(one.camera.world_from_camera[:, :3], other.camera.world_from_camera[:, :3])
 
 
 def test_colmap_ends_with_the_process_that_started_it(tmp_path: Path) -> None:

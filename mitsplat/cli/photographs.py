@@ -67,6 +67,7 @@ Budget = Annotated[
     str | None, typer.Option(metavar="TIME", help="Shorten the fit to this time, such as 90s, 10min or 1h.")
 ]
 Edge = Annotated[int, typer.Option(help="Longest edge of the photos in the fit, around an object [px].")]
+Voxels = Annotated[int, typer.Option(help="Cells of the mesh's grid along the longest extent.")]
 Refine = Annotated[
     bool, typer.Option("--refine", help="Refine the mesh by the masks, where photos set aside say that it helps.")
 ]
@@ -256,7 +257,7 @@ def mesh(
     class_name: ClassName = None,
     kind: Kind = "object",
     faces: Faces = 10000,
-    voxels: Annotated[int, typer.Option(help="Cells of the grid along the longest extent.")] = 192,
+    voxels: Voxels = 192,
     dissent: Annotated[int, typer.Option(help="Masks that may leave a point out and be overruled, 0 to 3.")] = 2,
     size: Size = None,
     take: Annotated[
@@ -326,6 +327,7 @@ def asset(
     budget: Budget = None,
     edge: Edge = 800,
     faces: Faces = 10000,
+    voxels: Voxels = 192,
     refine: Refine = False,
     device: DeviceName = "cpu",
     seed: Seed = 0,
@@ -350,7 +352,9 @@ def asset(
         class_name=class_name,
         kind=kind,
         settings=ReconstructSettings(
-            surface=SurfaceSettings(faces=faces), size=size, refine=MeshRefineSettings(seed=seed) if refine else None
+            surface=SurfaceSettings(voxels=voxels, faces=faces),
+            size=size,
+            refine=MeshRefineSettings(seed=seed) if refine else None,
         ),
     )
     take_device(device)

@@ -181,12 +181,12 @@ def test_asset_passes_every_option_on(
     status = run(
         "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", kind, "--size", 0.1,
         "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--gaussians", 70,
-        "--iterations", 80, "--budget", "1.5min", "--edge", 90, "--faces", 500, "--seed", 4,
+        "--iterations", 80, "--budget", "1.5min", "--edge", 90, "--faces", 500, "--voxels", 64, "--seed", 4,
     )  # fmt: skip
     assert status == 0
     photos, out, job = calls.args
     assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
-    assert (job.kind, job.settings.size, job.settings.surface.faces) == (kind, 0.1, 500)
+    assert (job.kind, job.settings.size, job.settings.surface) == (kind, 0.1, SurfaceSettings(voxels=64, faces=500))
     assert calls.kwargs["capture"] == CaptureSettings(
         kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
     )

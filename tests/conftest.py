@@ -51,6 +51,12 @@ def pytest_configure(config: pytest.Config) -> None:
             raise pytest.UsageError(str(error)) from error
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first, so that no process begins one when there is nothing left for the others."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     mark = item.get_closest_marker("cpu")
     if mark is not None and item.config.getoption("--device") != "cpu":
@@ -200,7 +206,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
 
     folder = made_once(tmp_path_factory, "rendered", rendered.render_capture)
     names = sorted(path.name for path in folder.iterdir())
-    return folder, dict(zip(names, rendered.cameras(len(names)), strict=True))
+    return folder, dict(zip(names, rendered.capture_cameras(), strict=True))
 
 
 @pytest.fixture(scope="session")

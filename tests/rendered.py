@@ -20,6 +20,9 @@ BOX = np.array([0.07, 0.05, 0.07])
 """Edges of the box [m]; it stands in the middle of the board, z = 0 the board."""
 
 SIZE = (480, 360)
+"""Of photos [px]."""
+FILM_SIZE = (400, 300)
+"""Of a video [px]."""
 
 
 def cameras(count: int) -> list[Camera]:
@@ -30,9 +33,14 @@ def cameras(count: int) -> list[Camera]:
     return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
 
 
-def render_capture(folder: Path, count: int = 24, *, samples: int = 8) -> dict[str, Camera]:
+def capture_cameras() -> list[Camera]:
+    """Cameras of a capture, 15 degrees apart, as far around as shows all sides: each pair of its photos is matched."""
+    return cameras(24)[:16]
+
+
+def render_capture(folder: Path, *, samples: int = 8) -> dict[str, Camera]:
     """Render photos into a folder; returns their cameras by name, in the board's frame [m]."""
-    return photograph(box_scene(5), cameras(count), folder, samples=samples)
+    return photograph(box_scene(5), capture_cameras(), folder, samples=samples)
 
 
 def box_scene(seed: int) -> dict[str, Any]:
@@ -61,14 +69,14 @@ def walk(count: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     heights, radii = 0.19 + 0.03 * np.sin(3 * angles), 0.23 + 0.015 * np.cos(3 * angles)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
-    return [Camera.look_at(place, (0, 0, 0.02), width=SIZE[0], height=SIZE[1], fov_x=48) for place in places]
+    return [Camera.look_at(place, (0, 0, 0.02), width=FILM_SIZE[0], height=FILM_SIZE[1], fov_x=48) for place in places]
 
 
 def render_video(file: Path, count: int = 96, *, samples: int = 4) -> dict[int, Camera]:
     """Render a video of 30 frames a second, of which every tenth is blurred; returns its cameras by frame."""
     with TemporaryDirectory() as folder:
         found = photograph(box_scene(5), walk(count), Path(folder), samples=samples)
-        writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 30.0, SIZE)
+        writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 30.0, FILM_SIZE)
         for number, name in enumerate(found):
             picture = cv2.imread(str(Path(folder) / name))
             writer.write(cv2.blur(picture, (9, 9)) if number % 10 == 5 else picture)

@@ -15,7 +15,7 @@ from mitsplat.frames import mitsuba_xml as xml_scene
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 from tests.conftest import box_asset
 
 

@@ -62,15 +62,15 @@ def run(job: dict[str, Any], folder: Path) -> None:
 
     Args:
         job: ``task``: "read" a COLMAP model from ``model``; or "reconstruct" from ``groups`` (names of the photos in
-            ``images`` by shared intrinsics), with ``features``, ``first_octave``, ``matching`` ("exhaustive" or
-            "sequential") and ``enough``, the number of photos below which the global mapper is tried as well; or
-            "triangulate", the same with known ``cameras`` (see :func:`known_model`).
+            ``images``, a path from ``folder``, by shared intrinsics), with ``features``, ``first_octave``, ``matching``
+            ("exhaustive" or "sequential") and ``enough``, the number of photos below which the global mapper is tried
+            as well; or "triangulate", the same with known ``cameras`` (see :func:`known_model`).
         folder: Where the database and the results are.
     """
     if job["task"] == "read":
         store(folder, [pycolmap.Reconstruction(job["model"])])
         return
-    images, database = Path(job["images"]), folder / "database.db"
+    images, database = folder / job["images"], folder / "database.db"
     extract(job, images, database, folder)
     match(job, database, folder)
     if job["task"] == "triangulate":

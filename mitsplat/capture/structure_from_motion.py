@@ -7,6 +7,7 @@ The work is done by COLMAP (Schönberger and Frahm 2016; global mapper: Pan et a
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import subprocess
 import sys
@@ -110,7 +111,7 @@ def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | 
         InputError: If no two photos share enough points to begin with.
         MissingResourceError: If COLMAP ends its process.
     """
-    return _read_arrays(_run({"task": "reconstruct", **_job(photos)}, folder, progress), photos)
+    return _read_arrays(_run({"task": "reconstruct", **_job(photos, folder)}, folder, progress), photos)
 
 
 def find_points(
@@ -134,7 +135,7 @@ def find_points(
         }
         for name, camera in cameras.items()
     }
-    job = _job(photos) | {"groups": [[photo.file.name] for photo in photos], "camera_model": "FULL_OPENCV"}
+    job = _job(photos, folder) | {"groups": [[photo.file.name] for photo in photos], "camera_model": "FULL_OPENCV"}
     model = _read_arrays(_run({"task": "triangulate", "cameras": known, **job}, folder, progress), photos)
     seen = {name: model.seen.get(name, np.zeros(0, dtype=np.int32)) for name in cameras}
     return SparseModel(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
@@ -188,14 +189,17 @@ def opencv_camera(
         raise InputError(f"a camera of lens model {model} cannot be used: {error}") from error
 
 
-def _job(photos: Sequence[Prepared]) -> dict[str, Any]:
-    """What to do for so many photos: finer features for few, neighbours only for many."""
+def _job(photos: Sequence[Prepared], folder: Path) -> dict[str, Any]:
+    """What to do for so many photos: finer features for few, neighbours only for many.
+
+    It names the photos as seen from its own folder, so that what was found of them is still of use when both move.
+    """
     groups: dict[tuple[str, ...], list[str]] = {}
     for photo in photos:
         groups.setdefault(photo.lens, []).append(photo.file.name)
     few, many = len(photos) <= 100, len(photos) > 150
     return {
-        "images": str(photos[0].file.parent.resolve()),
+        "images": os.path.relpath(photos[0].file.parent, folder),
         "groups": list(groups.values()),
         "features": 8192 if few else 4096,
         "first_octave": -1 if few else 0,

@@ -20,6 +20,7 @@ from mitsplat.mesh import mass_properties
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
+from mitsplat.scene.references import environments, object_assets
 from mitsplat.scene.scene import Scene, load_scene, plan_frame
 
 SIZES = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
@@ -161,16 +162,13 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         yield Finding("formats", False, str(error), "change output.formats, or what they need")
     faults = list(run_faults(scene))
     yield from faults or doubts(scene)
-    assets = {
-        id(asset.splats): asset for asset in (*scene.environments, *scene.assets)
-    }.values()  # several may have one name
-    for asset in assets:
-        name = asset.name
-        wrong = [finding for finding in check_asset(asset) if not finding.ok]
+    for sizes in _sized(scene):
+        name = sizes[0].name
+        wrong = dict.fromkeys(finding for asset in sizes for finding in check_asset(asset) if not finding.ok)
         for finding in wrong:
             yield replace(finding, name=f"{name}: {finding.name}")
         if not wrong:
-            yield Finding(name, True, f"{len(asset.splats)} Gaussians, nothing to say")
+            yield Finding(name, True, f"{len(sizes[0].splats)} Gaussians, nothing to say")
     most = [entry.count[1] for entry in spec.objects]
     meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
     volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
@@ -187,10 +185,22 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     if support and not faults:
         yield from _rest(scene)
     yield _sight(scene)
-    lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in assets)
+    drawn = (*scene.environments, *scene.assets)
+    lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
     yield Finding(
         "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
     )
+
+
+def _sized(scene: Scene) -> Iterator[list[Asset]]:
+    """Each asset in all sizes that it has in a scene: one by its folder, as several may have one name."""
+    folders = [folder for _, folder in environments(scene.spec)]
+    folders += [folder for _, folder, entry in object_assets(scene.spec) for _ in entry.scales]
+    found: dict[str, dict[int, Asset]] = {}
+    for folder, asset in zip(folders, (*scene.environments, *scene.assets), strict=True):
+        found.setdefault(folder, {})[id(asset.splats)] = asset
+    for sizes in found.values():
+        yield list(sizes.values())
 
 
 def _rest(scene: Scene) -> Iterator[Finding]:

@@ -6,6 +6,7 @@ Commands import what they need inside of their functions, so that the start of e
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -27,6 +28,7 @@ from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.boards.targets import Board
+    from mitsplat.capture.pipeline import CaptureSettings
     from mitsplat.reconstruct.pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with masks for an object.")]
@@ -65,6 +67,7 @@ Budget = Annotated[
     str | None, typer.Option(metavar="TIME", help="Shorten the fit to this time, such as 90s, 10min or 1h.")
 ]
 Edge = Annotated[int, typer.Option(help="Longest edge of the photos in the fit, around an object [px].")]
+Voxels = Annotated[int, typer.Option(help="Cells of the mesh's grid along the longest extent.")]
 Refine = Annotated[
     bool, typer.Option("--refine", help="Refine the mesh by the masks, where photos set aside say that it helps.")
 ]
@@ -197,23 +200,15 @@ def capture(
 
     Runs again where it stopped. If too many photos are of no use, the exit status is 4.
     """
-    from mitsplat.capture.pipeline import CaptureSettings, capture_photos
+    from mitsplat.capture.pipeline import capture_photos
 
-    settings = CaptureSettings(
-        kind=kind,
+    settings = replace(
+        _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
         max_size=max_size,
-        frames=frames,
         board=_board(squares, square),
         tag=tag,
-        scale_from=scale_from,
-        poses=poses,
         metric=metric,
-        masks=masks,
-        mask_model=mask_model,
         undistorted=undistort,
-        picks=tuple(pick or ()),
-        picks_not=tuple(pick_not or ()),
-        box=box,
     )
     with progress_bar("steps/s") as progress:
         result = capture_photos(photos, out, settings, progress=progress)
@@ -262,7 +257,7 @@ def mesh(
     class_name: ClassName = None,
     kind: Kind = "object",
     faces: Faces = 10000,
-    voxels: Annotated[int, typer.Option(help="Cells of the grid along the longest extent.")] = 192,
+    voxels: Voxels = 192,
     dissent: Annotated[int, typer.Option(help="Masks that may leave a point out and be overruled, 0 to 3.")] = 2,
     size: Size = None,
     take: Annotated[
@@ -332,6 +327,7 @@ def asset(
     budget: Budget = None,
     edge: Edge = 800,
     faces: Faces = 10000,
+    voxels: Voxels = 192,
     refine: Refine = False,
     device: DeviceName = "cpu",
     seed: Seed = 0,
@@ -342,7 +338,6 @@ def asset(
     report.html shows what came of it. Of an environment, level surfaces are found, and a scene file beside its folder
     drops things on the one that photos look at. If a threshold is missed, the exit status is 4.
     """
-    from mitsplat.capture.pipeline import CaptureSettings
     from mitsplat.fit.trainer import FitSettings
     from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
     from mitsplat.reconstruct.reconstruct import ReconstructSettings
@@ -357,7 +352,9 @@ def asset(
         class_name=class_name,
         kind=kind,
         settings=ReconstructSettings(
-            surface=SurfaceSettings(faces=faces), size=size, refine=MeshRefineSettings(seed=seed) if refine else None
+            surface=SurfaceSettings(voxels=voxels, faces=faces),
+            size=size,
+            refine=MeshRefineSettings(seed=seed) if refine else None,
         ),
     )
     take_device(device)
@@ -366,17 +363,7 @@ def asset(
             photos,
             out,
             job,
-            capture=CaptureSettings(
-                kind=kind,
-                frames=frames,
-                scale_from=scale_from,
-                poses=poses,
-                masks=masks,
-                mask_model=mask_model,
-                picks=tuple(pick or ()),
-                picks_not=tuple(pick_not or ()),
-                box=box,
-            ),
+            capture=_capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
             fit=FitSettings(
                 gaussians=gaussians if gaussians is not None else 60_000 if whole else 30_000,
                 iterations=iterations,
@@ -388,6 +375,33 @@ def asset(
             progress=progress,
         )
     _tell_asset(done)
+
+
+def _capture_settings(
+    kind: Kind,
+    frames: Frames,
+    scale_from: ScaleFrom,
+    poses: Poses,
+    masks: Masks,
+    mask_model: MaskModel,
+    pick: Picks,
+    pick_not: PicksNot,
+    box: Box,
+) -> CaptureSettings:
+    """What `capture` and `asset` both are told of photographs."""
+    from mitsplat.capture.pipeline import CaptureSettings
+
+    return CaptureSettings(
+        kind=kind,
+        frames=frames,
+        scale_from=scale_from,
+        poses=poses,
+        masks=masks,
+        mask_model=mask_model,
+        picks=tuple(pick or ()),
+        picks_not=tuple(pick_not or ()),
+        box=box,
+    )
 
 
 def _board(squares: str, square: float) -> Board:

@@ -20,8 +20,10 @@ _GAPS = (12, 40)
 def hidden_share(camera: Camera, own: Float64Array, others: Sequence[Float64Array]) -> float:
     """Share of an object's outline that other things hide from a camera.
 
-    The object's outline is the convex hull of its points in the image. Another thing is where its points lie close
-    that are nearer to the camera than the middle of the object; it may reach around it.
+    The object's outline is the convex hull of its points in the image, also of one that is not convex: masks are looked
+    for in there, and would take in what stands before a notch; and sparse points do not tell a notch from a plain side.
+    Another thing is where its points lie close that are nearer to the camera than the middle of the object; it may
+    reach around it.
 
     Args:
         camera: From where.

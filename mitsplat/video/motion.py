@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import ByteImage, Float32Array
+from mitsplat.video.shrink import shrink
 
 _EDGE = 480
 """Longer edge at which motion is measured [px]."""
@@ -54,9 +55,7 @@ class MotionClock:
 
     def add(self, grey: ByteImage) -> Moved:
         """Take the next picture, grey, shape (H, W)."""
-        scale = _EDGE / max(grey.shape)
-        if scale < 1:
-            grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        grey = shrink(grey, _EDGE)
         if (
             self._anchor is None or len(self._corners) < _FEWEST
         ):  # nothing to follow yet: the first that shows something

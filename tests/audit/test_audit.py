@@ -18,7 +18,7 @@ from pycocotools import mask as coco_mask
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.errors import InputError
 from mitsplat.files import Record
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 
 
 def records_of(root: Path) -> list[Record]:

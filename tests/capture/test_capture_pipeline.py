@@ -6,9 +6,11 @@ import json
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import zlib
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +34,7 @@ from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.isolation import ChosenObject
 from tests import rendered
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 
 
 def test_a_rendered_capture_comes_back(
@@ -44,7 +46,7 @@ def test_a_rendered_capture_comes_back(
     assert (capture.units, capture.up, capture.table) == ("metre", "z", True)
     assert set(capture.rejected) == {"torn.png"}
     assert capture.rejected["torn.png"].startswith("it cannot be read")
-    assert result.given == 25
+    assert result.given == 17
     assert result.shortcoming is None
     assert result.reprojection_error < 1
     assert {photo.name for photo in capture.photos} == set(truth)
@@ -258,7 +260,7 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
     capture = capture_photos(given, tmp_path / "out", settings).capture
     assert capture.rejected["photo03.png"] == "its mask covers only 0.0% of it"
-    assert len(capture.photos) == 23
+    assert len(capture.photos) == 15
     alpha = capture.photos[0].picture()[1]
     assert alpha is not None
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
@@ -363,7 +365,7 @@ def test_photos_of_two_things_end_with_status_4(
     out, err = capsys.readouterr()
     assert "rejected: photo08.png: it only fits a smaller group of photos, as of another object or side\n" in out
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
-    assert "only 8 of 25 photos (32%) could be used, 75% are wanted" in err
+    assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
     assert len(Capture.load(tmp_path / "out").photos) == 8
 
 
@@ -515,6 +517,22 @@ capture_photos(given, out, CaptureSettings(board=rendered.BOARD, kind="environme
     capture_photos(given, out, settings)
     for name in ("capture.json", "points.npz", "capture.png", "inputs.json"):
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_what_was_matched_is_of_use_in_another_place(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path
+) -> None:
+    """A finished capture is moved, and made anew as a place: its photos are the same, and so are their matches."""
+    given, finished, result = captured
+    out = Path(shutil.copytree(finished, tmp_path / "moved"))
+    with closing(sqlite3.connect(out / "sfm/database.db")) as database:
+        database.execute("PRAGMA application_id = 7")
+    again = capture_photos(given, out, CaptureSettings(board=rendered.BOARD, kind="environment"))
+    with closing(sqlite3.connect(out / "sfm/database.db")) as database:
+        assert database.execute("PRAGMA application_id").fetchone() == (7,)
+    assert again.reprojection_error == result.reprojection_error
+    for one, other in zip(again.capture.photos, result.capture.photos, strict=True):
+        np.testing.assert_array_equal(one.camera.world_from_camera[:, :3], other.camera.world_from_camera[:, :3])
 
 
 def test_colmap_ends_with_the_process_that_started_it(tmp_path: Path) -> None:

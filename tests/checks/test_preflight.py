@@ -8,10 +8,10 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.checks.preflight import check_asset, check_scene
+from mitsplat.checks.preflight import SIZES, check_asset, check_scene
 from mitsplat.scene.scene import load_scene
 from mitsplat.splats import Splats
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 from tests.conftest import box_asset
 
 
@@ -108,6 +108,17 @@ def test_assets_of_one_name_do_not_hide_each_other(tmp_path):
     }
     YAML(typ="safe", pure=True).dump(data, tmp_path / "scene.yaml")
     assert "box: opacity" in wrong(check_scene(load_scene(tmp_path / "scene.yaml")))
+
+
+def test_an_asset_is_listed_once_in_all_its_sizes(scene_data, write_scene, monkeypatch):
+    """A fault of one size is told of, and nothing is said to be well with the asset then."""
+    monkeypatch.setitem(SIZES, "object", (0.016, 2.0))
+    scene_data["objects"] = [{"asset": f"assets/{name}", "scale": [0.5, 1]} for name in ("nut", "bolt")]
+    said = [(finding.name, finding.text) for finding in check_scene(load_scene(write_scene(scene_data)))]
+    assert [(name, text) for name, text in said if name.startswith(("nut", "bolt"))] == [
+        ("nut: units", "the longest extent is 0.015 m"),
+        ("bolt", "12 Gaussians, nothing to say"),
+    ]
 
 
 def test_an_object_that_cannot_fit_is_refused(scene_data, write_scene, capsys):

@@ -21,7 +21,7 @@ from mitsplat.mesh_points import points_inside
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
 from mitsplat.scene.scene import load_scene
 from tests.bodies import pose_at
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 from tests.dataset.test_write import render, settle
 
 

@@ -20,7 +20,7 @@ from mitsplat.errors import InputError
 from mitsplat.scene.scene import load_scene
 from mitsplat.spec.spec import FORMATS, HoldOut
 from tests.audit.test_audit import records_of, store
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 from tests.conftest import box_asset, small_scene
 from tests.dataset.test_distractors import scatter_drawn
 from tests.drawn import large_boxes, render_boxes

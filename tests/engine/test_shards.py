@@ -28,7 +28,7 @@ from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import Renderer
 from mitsplat.scene.scene import load_scene, plan_frame
 from mitsplat.spec.spec import FORMATS
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, render, settle, write
 from tests.engine.test_faults import KilledOnce

@@ -15,7 +15,7 @@ import pytest
 from mitsplat.report.report import SAMPLES, write_report
 from mitsplat.svg_charts import HeatMap, Histogram, bars, columns
 from tests.audit.test_audit import records_of, store, swap_a_class
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 
 
 class Page(HTMLParser):

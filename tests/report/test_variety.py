@@ -18,7 +18,7 @@ from mitsplat.report.report import write_report
 from mitsplat.report.variety import FEW_VIEWS, RINGS, SECTORS, Variety, cell_of
 from mitsplat.svg_charts import discs
 from tests.audit.test_audit import records_of, store
-from tests.cli.test_cli import run
+from tests.cli.typed import run
 
 CONTENT = {"classes": ["bolt", "nut"], "assets": ["long bolt", "nut"]}
 

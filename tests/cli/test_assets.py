@@ -1,0 +1,57 @@
+"""``mitsplat bake``."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.asset import Asset
+from mitsplat.bake.bake import BakeSettings
+from tests.cli.typed import run
+from tests.conftest import box_asset
+
+
+def test_bake_takes_every_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What each does is read from the asset; processes of their own bake in full in test_shell.py."""
+    few = partial(BakeSettings, directions=4, samples=2, fit_views=2, fit_steps=2, verify_views=1)
+    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", few)
+    box_asset("gear", (20.0, 30.0, 10.0)).mesh.export(tmp_path / "gear.glb")
+    options = (
+        "--class", "wheel", "--light", "studio", "--gaussians", 60, "--sh-degree", 1, "--units", 0.001, "--up", "y",
+        "--density", 7800, "--friction", 0.2, "--seed", 4, "--kind", "environment", "--name", "cog",
+        "--colour", "steelblue", "--roughness", 0.3, "--metallic", 1, "--specular", 0.05, "--any-size",
+    )  # fmt: skip
+    assert run("bake", tmp_path / "gear.glb", "-o", tmp_path / "gear", *options) == 0
+    asset = Asset.load(tmp_path / "gear")
+    assert (asset.name, asset.class_name, asset.kind) == ("cog", "wheel", "environment")
+    assert (asset.density, asset.friction, asset.splats.sh_degree) == (7800.0, 0.2, 1)
+    assert 30 < len(asset.splats) < 120
+    np.testing.assert_allclose(asset.mesh.extents, (0.02, 0.01, 0.03), atol=1e-6)
+    assert asset.roughness == pytest.approx(0.3)
+    red, _, blue = asset.splats.sh[:, 0].mean(axis=0)
+    assert red < blue
+    assert (tmp_path / "gear/report.html").is_file()
+    assert re.search(r"Gaussians, \d+\.\d dB", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
+        (["--density", "nan"], "density must be a number > 0 in kg/m^3 (got nan)"),
+        (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
+        (["--gaussians", "0"], "gaussians must be at least 1 (got 0)"),
+    ],
+)
+def test_bad_option_of_bake_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
+    box_asset("gear").mesh.export(tmp_path / "gear.stl")
+    assert run("bake", tmp_path / "gear.stl", "-o", tmp_path / "gear", *options) == 2
+    assert capsys.readouterr().err == f"mitsplat: {sentence}\n"

@@ -1,0 +1,105 @@
+"""Commands that take a scene beside ``render``, and those that need nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from mitsplat.frames import frame
+from mitsplat.frames import mitsuba_xml as xml_scene
+from mitsplat.physics import settle
+from mitsplat.scene.layout import Layout
+from tests.cli.typed import Calls, run
+
+
+def test_preview_writes_a_picture(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    image = np.full((4, 6, 3), (10, 20, 30), dtype=np.uint8)
+    calls = Calls(SimpleNamespace(image=image))
+    monkeypatch.setattr(frame, "render_frame", calls)
+    options = ("--frame", 5, "-o", tmp_path / "a.png", "--size", "6x4", "--no-layers")
+    assert run("preview", scene_path, *options) == 0
+    scene, index = calls.args
+    assert (scene.spec.output.width, index) == (6, 5)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
+
+
+@pytest.mark.parametrize("name", ["a.gif", "no/such/folder/a.png"])
+def test_preview_refuses_a_bad_output_before_rendering(
+    scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    monkeypatch.setattr(frame, "render_frame", Calls(error=AssertionError("rendered")))
+    assert run("preview", scene_path, "-o", tmp_path / name) == 2
+
+
+def test_export(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls = Calls()
+    monkeypatch.setattr(xml_scene, "export_xml", calls)
+    assert run("export", scene_path, "--frame", 2, "-o", tmp_path / "a.xml") == 0
+    assert calls.args[1:] == (2, tmp_path / "a.xml")
+
+
+def test_settle_prints_certificates_and_shows_the_drop(
+    scene_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The GIF moves, ends on the layout at rest, and shows the drop every 0.04 s as fast as it was."""
+    monkeypatch.setattr(settle, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setenv("COLUMNS", "80")  # its headings and numbers are whole all the same
+    gif = tmp_path / "drop.gif"
+    assert run("settle", scene_path, "-n", 2, "--preview", "-o", gif, "--size", "64x36") == 0
+    out = capsys.readouterr().out
+    layouts = [Layout.from_json(json.loads(path.read_bytes())) for path in sorted((tmp_path / "cache").rglob("*.json"))]
+    assert [layout.index for layout in layouts] == [0, 1]
+    rows = [row.split("│")[1:-1] for row in out.splitlines() if row.startswith("│")]
+    for layout, row in zip(layouts, rows, strict=True):
+        assert int(row[0]) == layout.index
+        assert int(row[1]) == len(layout.instances)
+        assert float(row[2]) == pytest.approx(layout.certificate.time_to_rest, abs=0.005)
+        assert float(row[6]) == pytest.approx(layout.certificate.collider_penetration * 1e3, abs=5e-4)
+    pictures = int(re.search(rf"drop: {re.escape(str(gif))} \((\d+) pictures\)", out)[1])
+    assert pictures == pytest.approx(layouts[0].certificate.time_to_rest / 0.04 + 2, abs=1.5)
+    with Image.open(gif) as picture:
+        shown = [
+            (np.array(frame.convert("RGB"), dtype=float), frame.info["duration"])
+            for frame in ImageSequence.Iterator(picture)
+        ]
+    assert shown[0][0].shape == (36, 64, 3)
+    assert np.abs(shown[0][0] - shown[-1][0]).max() > 20
+    # Equal pictures are stored once: only how long all are shown tells their number.
+    assert sum(duration for _, duration in shown) == (pictures - 1) * 40 + 1500
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["-o", "drop.png"], "--out must end in .gif (got drop.png)"),
+        (["-o", "gone/drop.gif"], "--out must be in a folder that exists (got gone/drop.gif)"),
+        (["-n", "4"], "--layouts must be 1 to 3, the scene's output.layouts (got 4)"),
+        (["--workers", "0"], "workers must be at least 1 (got 0)"),
+    ],
+)
+def test_bad_option_of_settle_is_one_sentence(
+    scene_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
+    assert run("settle", scene_path, *options) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("schema") == 0
+    assert json.loads(capsys.readouterr().out)["properties"]["camera"]
+
+
+def test_doctor_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("doctor") == 0
+    assert "LLVM" in capsys.readouterr().out
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/no/such/libLLVM.so")
+    assert run("doctor") == 1
+    lines = capsys.readouterr().out.splitlines()
+    failing = next(number for number, line in enumerate(lines) if line.startswith("FAIL  LLVM: /no/such/libLLVM.so"))
+    assert "set DRJIT_LIBLLVM_PATH" in lines[failing + 1]

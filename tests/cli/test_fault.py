@@ -1,0 +1,124 @@
+"""What goes wrong: a sentence, a status, and a log for machines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mitsplat.errors import InputError, MissingResourceError, PartialResultError
+from tests.cli.typed import Calls, run
+from tests.conftest import box_asset
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            "bake plant.splat -o a",
+            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got splats, which an asset.yaml",
+        ),
+        (
+            "bake nut.step -o a",
+            "nut.step: must be a mesh (.glb, .obj, .stl, .ply) (got solids of a CAD program",
+        ),
+        ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
+        ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
+        ("check plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
+        ("render plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
+        (
+            "render part.stl",
+            "part.stl: must be a scene file (.yaml) (got a mesh, of which `mitsplat bake` makes an asset)",
+        ),
+        ("render nut", "nut: must be a scene file (.yaml) (got a folder: an asset, which a scene names"),
+        ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene, which `mitsplat render`"),
+        ("audit folder", "folder must be a dataset of mitsplat (dataset.json: No such file or directory)"),
+        ("audit gone", "gone must be a dataset of mitsplat (no such folder)"),
+        ("render gone.yaml --address auto", "--address and --resources are of a cluster: give --engine ray as well"),
+    ],
+)
+def test_another_kind_of_file_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: str, sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    box_asset("nut").save("nut")
+    box_asset("nut").splats.save("plant.splat")
+    box_asset("nut").mesh.export("part.stl")
+    Path("folder").mkdir()
+    Path("scene.xml").write_text('<scene version="3.9.0"/>')
+    Path("nut.step").touch()
+    assert run(*words.split()) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"mitsplat: {sentence}") and told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (InputError("a.ply: broken"), "mitsplat: a.ply: broken\n"),
+        (PermissionError(13, "Permission denied", "/out"), "mitsplat: /out: Permission denied\n"),
+        (OSError("disk on fire"), "mitsplat: disk on fire\n"),
+    ],
+)
+def test_input_and_file_errors_are_one_sentence(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: Exception, sentence: str
+) -> None:
+    write_dataset.error = error
+    assert run("render", scene_path) == 2
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(MissingResourceError("no GPU"), 3), (PartialResultError("too dark"), 4)]
+)
+def test_other_errors_have_a_status_of_their_own(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: Exception, status: int
+) -> None:
+    write_dataset.error = error
+    assert run("render", scene_path) == status
+    assert f"mitsplat: {error}\n" in capsys.readouterr().err
+
+
+def test_our_own_bugs_are_a_sentence(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dataset.error = ZeroDivisionError()
+    assert run("render", scene_path) == 70
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told.startswith(
+        "mitsplat: this is a fault of mitsplat, not of what it was given: ZeroDivisionError (the log"
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (InputError("a.ply: broken"), 2),
+        (MissingResourceError("disk full"), 3),
+        (OSError(28, "No space left on device"), 3),
+        (MemoryError(), 3),
+        (PartialResultError("half"), 4),
+        (KeyError("ours"), 70),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_a_log_for_machines_holds_the_error(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: BaseException, status: int
+) -> None:
+    write_dataset.error = error
+    assert run("render", scene_path, "--json") == status
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")]
+    assert [event["event"] for event in events] == ["started", "failed"]
+    assert (events[-1]["status"], events[-1]["error"]) == (status, type(error).__name__)
+
+
+def test_a_log_for_machines_holds_bad_scenes_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("render", "gone.yaml", "--json") == 2
+    event = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert (event["command"], event["status"], event["message"]) == ("render", 2, "gone.yaml: no such file")
+
+
+def test_interrupt_ends_with_130(scene_path: Path, write_dataset: Calls) -> None:
+    write_dataset.error = KeyboardInterrupt()
+    assert run("render", scene_path) == 130

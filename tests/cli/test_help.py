@@ -1,0 +1,42 @@
+"""Every command and option is explained, by itself and in the guide."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import typer
+import typer.core
+import typer.main
+
+from mitsplat.cli import app
+from tests.cli.typed import run
+
+
+def test_every_command_and_option_is_explained() -> None:
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    for name, command in group.commands.items():
+        assert command.get_short_help_str(80).endswith("."), name
+        unexplained = [param.name for param in command.params if not getattr(param, "help", None)]
+        assert unexplained == [], name
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    from importlib.metadata import version
+
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
+
+
+def test_every_command_and_option_is_documented() -> None:
+    page = (Path(__file__).parents[2] / "docs/first_dataset.md").read_text()
+    commands = typer.main.get_command(app).commands
+    assert set(commands) >= {"render", "audit", "report", "preview", "bake", "export", "schema", "doctor"}
+    for name, command in commands.items():
+        line = next((row for row in page.splitlines() if row.startswith(f"| `mitsplat {name}")), None)
+        assert line is not None, name
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and parameter.name != "help":
+                spelt = [form for o in parameter.opts for form in (f"`{o}`", f"/{o}", f"{o}/")]
+                assert any(form in line for form in spelt), parameter.opts

@@ -1,0 +1,193 @@
+"""Commands that make assets of photographs: ``capture``, ``fit``, ``mesh`` and ``asset``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from mitsplat import surroundings
+from mitsplat.boards.targets import Board
+from mitsplat.capture import pipeline as capturing
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.errors import InputError
+from mitsplat.fit import depth_network as depth_model
+from mitsplat.fit import depth_priors as depth_maps
+from mitsplat.fit.depth_priors import DepthMaps
+from mitsplat.fit.trainer import FitProgress, FitSettings
+from mitsplat.reconstruct import pipeline
+from mitsplat.reconstruct.evaluation import Verdict
+from mitsplat.reconstruct.pipeline import AssetResult
+from mitsplat.reconstruct.surface import SurfaceSettings
+from tests.cli.typed import Calls, run
+from tests.conftest import box_asset
+
+
+def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    status = run(
+        "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--densification", "classic", "--iterations", 80,
+        "--budget", "1.5min", "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--masks", "ignore",
+        "--background", "black", "--depth", 0.7, "--exposure", "--seed", 4, "--overwrite",
+    )  # fmt: skip
+    assert status == 0
+    assert fit_capture.args[:2] == (Path("photos"), tmp_path) and fit_capture.kwargs["overwrite"]
+    assert fit_capture.args[2] == FitSettings(
+        gaussians=70, densification="classic", iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2,
+        masks="ignore", background="black", depth_weight=0.7, exposure=True, seed=4,
+    )  # fmt: skip
+    assert "(12 Gaussians; 1 held-out photos: 28.00 dB, SSIM 0.900)" in capsys.readouterr().out
+    fit_capture.kwargs["progress"](FitProgress(40, 0.5, 24.5, 23.0, 60))
+
+
+def test_fit_defaults_are_those_of_the_settings(fit_capture: Calls, tmp_path: Path) -> None:
+    assert run("fit", "photos", "-o", tmp_path) == 0
+    assert fit_capture.args[2] == FitSettings() and not fit_capture.kwargs["overwrite"]
+
+
+def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
+    fit_capture: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Capture, "load", lambda folder: SimpleNamespace(training="photos"))
+    fit_capture.result = replace(fit_capture.result, warnings=("depth maps that are left out: a.jpg (…)",))
+    given, made = (Path("maps"), "photos", "metric"), ("photos", Path("a.onnx"), tmp_path / "depths", "metric")
+    for module, name, options, args in (
+        (depth_maps, "find_maps", ("--depths", "maps"), given),
+        (depth_model, "model_maps", ("--depth-model", "a.onnx"), made),
+    ):
+        found = Calls(DepthMaps({}, "metric"))
+        monkeypatch.setattr(module, name, found)
+        assert run("fit", "photos", "-o", tmp_path, "--depth-kind", "metric", *options) == 0
+        assert found.args == args and fit_capture.kwargs["depths"] is found.result
+        assert "warning: depth maps that are left out: a.jpg" in capsys.readouterr().out
+    for options, text in (
+        (("--depths", "maps", "--depth-model", "a.onnx"), "give --depths or --depth-model"),
+        (("--depth-kind", "metric"), "--depth-kind metric is of depth maps: give --depths or --depth-model"),
+        (("--depths", "maps", "--depth", 0), "depth maps are of no use with --depth 0"),
+    ):
+        assert run("fit", "photos", "-o", tmp_path, *options) == 2
+        assert text in capsys.readouterr().err
+
+
+def test_fit_below_its_target_exits_with_4(
+    fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run("fit", "photos", "-o", tmp_path, "--target-psnr", 30) == 4
+    out, err = capsys.readouterr()
+    assert "held-out photos: 28.00 dB" in out and "target: 29.00 dB on 1 photos set aside for it" in out
+    assert "PSNR must reach 30.00 dB (got 29.00)" in err
+
+
+@pytest.mark.parametrize("budget", ["10", "ten min", "1d"])
+def test_fit_wants_a_budget_with_a_unit(
+    fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path, budget: str
+) -> None:
+    assert run("fit", "photos", "-o", tmp_path, "--budget", budget) == 2
+    assert "--budget must be a time such as 90s" in capsys.readouterr().err
+
+
+def finished(folder: Path, **changes: Any) -> AssetResult:
+    figures = Verdict(
+        photos=9, rejected=1, psnr=27.0, psnr_object=26.0, splat_iou=0.97, mesh_iou=0.96, offset=0.001, spread=0.001,
+        lost=0.0, scale_error=None, units="metre", gaussians=12, faces=99, watertight=True, solid=True,
+    )  # fmt: skip
+    return AssetResult(folder, replace(figures, **changes), kept=False)
+
+
+def test_capture_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls = Calls(error=InputError("captured"))
+    monkeypatch.setattr(capturing, "capture_photos", calls)
+    common = (
+        "--frames", 40, "--max-size", 800, "--squares", "6x4", "--square", 0.02, "--tag", 0.05,
+        "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--metric", "--undistort",
+    )  # fmt: skip
+    told = {
+        "frames": 40, "max_size": 800, "board": Board(6, 4, 0.02), "tag": 0.05,
+        "scale_from": ("a.jpg", "b.jpg", 0.5), "poses": Path("model"), "metric": True, "undistorted": True,
+    }  # fmt: skip
+    for options, further in (
+        (("--masks", "masks"), {"masks": Path("masks")}),
+        (("--mask-model", "a.onnx"), {"mask_model": Path("a.onnx")}),
+        (("--kind", "environment"), {"kind": "environment"}),
+        (
+            ("--pick", "a.jpg:1,2", "--pick", "b.jpg:3,4", "--pick-not", "a.jpg:5,6", "--box", -1, -2, 0, 1, 2, 3),
+            {"picks": ("a.jpg:1,2", "b.jpg:3,4"), "picks_not": ("a.jpg:5,6",), "box": (-1, -2, 0, 1, 2, 3)},
+        ),
+    ):
+        assert run("capture", "photos", "-o", tmp_path, *common, *options) == 2
+        assert calls.args == (Path("photos"), tmp_path, CaptureSettings(**told, **further))
+
+
+@pytest.mark.parametrize(
+    ("kind", "maker"), [("object", (pipeline, "make_asset")), ("environment", (surroundings, "make_surroundings"))]
+)
+def test_mesh_passes_every_option_on(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
+    maker: tuple[Any, str],
+) -> None:
+    box_asset("nut").mesh.export(tmp_path / "cad.stl")
+    (tmp_path / "matrix.txt").write_text("2 0 0 1\n0 2 0 0\n0 0 2 0\n")
+    calls = Calls(finished(tmp_path / "nut"))
+    monkeypatch.setattr(*maker, calls)
+    status = run(
+        "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", kind,
+        "--faces", 500, "--voxels", 64, "--dissent", 1, "--size", 0.1, "--import", tmp_path / "cad.stl",
+        "--normalisation", tmp_path / "matrix.txt", "--units", 0.001,
+    )  # fmt: skip
+    assert status == 0
+    capture, fit_folder, out, job = calls.args
+    assert (capture, fit_folder, out) == (Path("capture"), Path("fit"), tmp_path / "nut")
+    assert (job.name, job.class_name, job.kind, job.settings.size) == ("m6", "nut", kind, 0.1)
+    assert job.settings.surface == SurfaceSettings(voxels=64, faces=500, dissent=1)
+    assert job.imported.metres_per_unit == 0.001
+    np.testing.assert_allclose(job.imported.capture_from_mesh @ [1, 0, 0, 1], [0, 0, 0, 1], atol=1e-12)
+    assert "held-out PSNR 27.00 dB; IoU with held-out masks splats 0.970, mesh 0.960" in capsys.readouterr().out
+
+
+def test_a_missed_threshold_is_status_4_and_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pipeline, "make_asset", Calls(finished(tmp_path, psnr=12.0)))
+    assert run("mesh", "capture", "fit", "-o", tmp_path) == 4
+    shown = capsys.readouterr()
+    assert "held-out photos are met at only 12.0 dB (at least 24 is wanted): use even light" in shown.err
+    assert f"report: {tmp_path / 'report.html'}" in shown.out
+    assert run("mesh", "capture", "fit", "-o", tmp_path, "--units", 0.001) == 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "maker", "masks"),
+    [
+        ("object", (pipeline, "make_photo_asset"), "alpha"),
+        ("environment", (surroundings, "make_photo_surroundings"), "off"),
+    ],
+)
+def test_asset_passes_every_option_on(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    kind: Literal["object", "environment"],
+    maker: tuple[Any, str],
+    masks: Literal["alpha", "off"],
+) -> None:
+    calls = Calls(finished(tmp_path))
+    monkeypatch.setattr(*maker, calls)
+    status = run(
+        "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", kind, "--size", 0.1,
+        "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--gaussians", 70,
+        "--iterations", 80, "--budget", "1.5min", "--edge", 90, "--faces", 500, "--voxels", 64, "--seed", 4,
+    )  # fmt: skip
+    assert status == 0
+    photos, out, job = calls.args
+    assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
+    assert (job.kind, job.settings.size, job.settings.surface) == (kind, 0.1, SurfaceSettings(voxels=64, faces=500))
+    assert calls.kwargs["capture"] == CaptureSettings(
+        kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
+    )
+    assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4, masks=masks)

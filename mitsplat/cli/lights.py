@@ -107,7 +107,8 @@ def lights(
 
 def _tell(estimate: LightEstimate) -> None:
     """A table of the lamps."""
-    typer.echo("lamp  azimuth  elevation  size            radiance  colour            share of irradiance")
+    if estimate.lamps:
+        typer.echo("lamp  azimuth  elevation  size            radiance  colour            share of irradiance")
     for number, lamp in enumerate(estimate.lamps, start=1):
         azimuth, elevation = lamp.angles
         width, height = lamp.angular_size

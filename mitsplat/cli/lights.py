@@ -15,6 +15,7 @@ from mitsplat.errors import InputError
 if TYPE_CHECKING:
     from mitsplat.lighting import LightEstimate
 
+_MIRROR = (1.0, 1.0, 1.0)
 _WHITE = 3.141592653589793
 """Irradiance under which white paper has a radiance of 1, which is display white [W/m^2]."""
 
@@ -44,7 +45,7 @@ def lights(
     ] = None,
     reflectivity: Annotated[
         tuple[float, float, float], typer.Option(metavar="R G B", help="Of the ball, above 0 to 1.")
-    ] = (1.0, 1.0, 1.0),
+    ] = _MIRROR,
     rotate_z: Annotated[float, typer.Option(help="Turn of the panorama about the vertical [degrees].")] = 0.0,
     around: Annotated[
         tuple[float, float, float],
@@ -79,6 +80,10 @@ def lights(
             raise InputError(
                 f"{images[-1]}: without --camera there must be one HDR panorama, {', '.join(HDR_SUFFIXES)}; give "
                 "--camera AZIMUTH ELEVATION for photographs of a mirror ball"
+            )
+        if ball is not None or fov_x is not None or exposures is not None or reflectivity != _MIRROR:
+            raise InputError(
+                "--ball, --fov-x, --exposures and --reflectivity are of photographs of a mirror ball: give --camera"
             )
         settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
         panorama = read_panorama(images[0])

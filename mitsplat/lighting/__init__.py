@@ -16,9 +16,11 @@ from mitsplat.lighting.estimate import (
     write_light,
 )
 from mitsplat.lighting.lamps import Lamp
+from mitsplat.lighting.mirror_ball import BallPanorama
 from mitsplat.lighting.panorama import read_panorama
 
 __all__ = [
+    "BallPanorama",
     "BallReading",
     "BallView",
     "Lamp",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ _WIDEST = 4096
 """Of panoramas that are written [px]."""
 _MIDDLE = 110.0
 """Mean level of the photograph that the ball is looked for in, about."""
+_SMALLEST = 20.0
+"""Radius of a ball in its photograph [px], of which 45 degrees around what is behind it are not seen."""
 _OUTLINE = (230, 40, 40)
 
 
@@ -180,6 +183,8 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
             f"{paths[0]}: the ball must be whole in the photograph, {width} x {height} px (got one of radius "
             f"{radius:.0f} around {x:.0f}, {y:.0f})"
         )
+    if radius < _SMALLEST:
+        raise InputError(f"{paths[0]}: the ball's radius must be {_SMALLEST:g} px or more (got {radius:.0f})")
     clipped = np.zeros((height, width), bool)
     if not hdr:
         part = tuple(slice(max(0, int(middle - radius) - 1), int(middle + radius) + 2) for middle in (y, x))
@@ -256,7 +261,7 @@ def light_lines(estimate: LightEstimate, image: str) -> str:
         lines.append(f"  - {{kind: environment, {_radiance(estimate.ambient / np.pi)}}}")
     else:
         turn = f", rotate_z: {settings.rotate_z:g}" if settings.rotate_z else ""
-        lines.append(f"  - {{kind: environment, image: {image}{turn}}}")
+        lines.append(f"  - {{kind: environment, image: {json.dumps(image, ensure_ascii=False)}{turn}}}")
     return "\n".join(lines) + "\n"
 
 

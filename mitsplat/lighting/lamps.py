@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.colour import LUMINANCE
 from mitsplat.lighting.panorama import angles, directions, level_irradiance, level_weights, resized, solid_angles
 
@@ -130,7 +130,7 @@ def _bright(panorama: Float32Array) -> BoolArray:
         bright = brighter
 
 
-def _grouped(points: Float32Array) -> Float64Array:
+def _grouped(points: Float32Array) -> Int32Array:
     """Number of the group of each unit vector (N,): what is linked by steps of less than ``_GAP``."""
     pairs = cKDTree(points).query_pairs(2 * np.sin(np.radians(_GAP) / 2), output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(points), len(points)))
@@ -147,7 +147,7 @@ def _surroundings(panorama: Float32Array, sight: Float32Array, own: BoolArray, b
 
 
 def _rectangle(radiance: Float32Array, sight: Float32Array, pixels: BoolArray, irradiance: Float64Array) -> Lamp | None:
-    """The lamp of some pixels, or None if they reach too far around.
+    """The lamp of some pixels, or None if they reach too far around, or are below the horizon by their middle.
 
     Its middle is that of the light. Its area, in the plane that is perpendicular to that, and the ratio of its sides,
     which is that of second moments, are those of its core: what has half of the mean radiance that its light leaves
@@ -160,7 +160,7 @@ def _rectangle(radiance: Float32Array, sight: Float32Array, pixels: BoolArray, i
     middle /= max(float(np.linalg.norm(middle)), 1e-12)
     core = luminance >= 0.5 * (light @ luminance) / light.sum()
     depth = (sight @ middle)[core]
-    if depth.min() < np.cos(np.radians(_WIDEST)):
+    if depth.min() < np.cos(np.radians(_WIDEST)) or middle[2] <= 0:
         return None
     axes = rectangle_axes(middle)
     area = solid[core] / depth**3

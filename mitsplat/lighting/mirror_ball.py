@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter
 
 from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
 from mitsplat.camera import Camera
-from mitsplat.lighting.panorama import directions, resized, unit_vector
+from mitsplat.lighting.panorama import directions, resized, solid_angles, unit_vector
 
 WIDTH = 1024
 """Of panoramas of balls [px]."""
@@ -25,6 +25,8 @@ _FAR = 1000.0
 """Focal length of a camera of which it is not known, in radii of the ball: its rays are parallel."""
 _COARSE, _FINE = 96, 700
 """Longest edges of the pictures that circles are looked for in, and measured in [px]."""
+_LOWEST = 10
+"""Shorter edge of the first one below which nothing is looked for [px]."""
 _SMALLEST = 0.1
 """Least radius of a ball that is found, as a share of the shorter edge."""
 _INSIDE = 0.7
@@ -41,7 +43,6 @@ _MARGIN = 1.5
 """Width of the ball's rim that is mixed with what is behind it [px]."""
 _RING = 10.0
 """Width of the ring around the blind spot by which it is filled [degrees]."""
-
 
 Circle = tuple[float, float, float]
 """Middle and radius [px]."""
@@ -73,8 +74,10 @@ def find_ball(picture: ByteImage) -> Circle | None:
         picture: RGB, (H, W, 3).
     """
     scale = _COARSE / max(picture.shape[:2])
+    if scale * min(picture.shape[:2]) < _LOWEST:
+        return None
     slopes = _Slopes.of(picture, scale)
-    height, width = slopes.across[0].shape[:2]
+    height, width = slopes.x.shape[:2]
     radii = np.geomspace(_SMALLEST * min(height, width), 0.55 * min(height, width), 45)
     circles = np.stack(np.meshgrid(np.arange(0, width, 2.0), np.arange(0, height, 2.0), radii), axis=-1).reshape(-1, 3)
     reach = _INSIDE * circles[:, 2:]
@@ -101,9 +104,10 @@ def find_ball(picture: ByteImage) -> Circle | None:
 
 @dataclass(frozen=True, eq=False)
 class _Slopes:
-    """Gradients of a picture in CIELAB along x and y, and how steep one must be to count fully."""
+    """Gradients of a picture in CIELAB along x and y, (H, W, 3), and how steep one must be to count fully."""
 
-    across: tuple[Float32Array, Float32Array]
+    x: Float32Array
+    y: Float32Array
     steep: float
 
     @classmethod
@@ -111,7 +115,7 @@ class _Slopes:
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         lab = cv2.GaussianBlur(np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2LAB), np.float32), (0, 0), 0.8)
         x, y = (np.asarray(cv2.Scharr(lab, cv2.CV_32F, *axis, scale=1 / 32), np.float32) for axis in ((1, 0), (0, 1)))
-        return cls((x, y), 1.0 + 1.5 * float(np.sqrt((x**2 + y**2).sum(axis=2)).mean()))
+        return cls(x, y, 1.0 + 1.5 * float(np.sqrt((x**2 + y**2).sum(axis=2)).mean()))
 
     def judge(self, circles: Float64Array) -> Float64Array:
         """How far each circle (x, y, radius), (N, 3), is an outline: up to 1."""
@@ -122,7 +126,7 @@ class _Slopes:
                 np.asarray(some[:, k : k + 1] + some[:, 2:] * wave(turn) - 0.5, np.float32)
                 for k, wave in enumerate((np.cos, np.sin))
             )
-            gx, gy = (np.asarray(cv2.remap(slope, x, y, cv2.INTER_LINEAR)) for slope in self.across)
+            gx, gy = (np.asarray(cv2.remap(slope, x, y, cv2.INTER_LINEAR)) for slope in (self.x, self.y))
             c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
             across, along = (
                 np.minimum(np.linalg.norm(part, axis=2) / self.steep, 1.0)
@@ -151,7 +155,7 @@ def unwrap_ball(
         ball: The ball's outline, all of it in the image.
         focal: Focal length of the camera [px], which is held level; None takes its rays for parallel.
         azimuth: Of the camera as seen from the ball [degrees].
-        elevation: The same.
+        elevation: Of it [degrees].
         clipped: Where radiance is a lower bound, (H, W).
     """
     height, width = image.shape[:2]
@@ -178,8 +182,8 @@ def unwrap_ball(
 
     angle = np.arccos(np.clip(directions(WIDTH // 2, WIDTH) @ towards, -1, 1))
     ring = (angle <= last) & (angle > last - np.radians(_RING))
-    level = np.broadcast_to(np.sin(np.pi * (np.arange(WIDTH // 2) + 0.5) * 2 / WIDTH)[:, None], ring.shape)
-    radiance[angle > last] = np.average(radiance[ring], axis=0, weights=level[ring])
+    weights = np.broadcast_to(solid_angles(*ring.shape), ring.shape)
+    radiance[angle > last] = np.average(radiance[ring], axis=0, weights=weights[ring])
 
     across, down = np.arange(width) + 0.5 - x, np.arange(height) + 0.5 - y
     disc = across**2 + down[:, None] ** 2 < radius**2

@@ -175,8 +175,8 @@ class TestLines:
         sky = painted((10, 60, 6, (20.0, 15.0, 10.0)), (100, 20, 9, (4.0, 5.0, 6.0)), rest=(0.2, 0.2, 0.25), turn=40)
         around = (0.2, -0.1, 0.3)
         found = estimated(sky, rest=rest, rotate_z=40.0, distance=2.0, around=around)
-        write_light(found, tmp_path / "cell.yaml")
-        lines = YAML(typ="safe").load(tmp_path / "cell.yaml")
+        write_light(found, tmp_path / "cell, one.yaml")
+        lines = YAML(typ="safe").load(tmp_path / "cell, one.yaml")
         scene = load_scene(write_scene(scene_data | lines))
         *areas, environment = scene.spec.lights
         assert len(areas) == 2
@@ -490,6 +490,11 @@ class TestInput:
             (["grey.png", *CAMERA, "--fov-x", 180], "--fov-x must be between 0 and 180 degrees (got 180)"),
             (["grey.png", *CAMERA, "--reflectivity", 0, 1, 1], "--reflectivity must be above 0 and at most 1"),
             (["grey.png", *CAMERA, "--ball", 5, 5, 0], "--ball must have a radius > 0"),
+            (["grey.png", *CAMERA, "--ball", 60, 30, 9], "grey.png: the ball's radius must be 20 px or more (got 9)"),
+            (
+                ["nan.exr", "--fov-x", 30],
+                "--ball, --fov-x, --exposures and --reflectivity are of photographs of a mirror",
+            ),
             (
                 ["grey.png", *CAMERA, "--rotate-z", 5],
                 "--rotate-z is of panoramas: the ball's is turned by --camera (got 5)",

@@ -5,6 +5,7 @@ Commands import what they need inside of their functions, so that the start of e
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from mitsplat.lighting import LightEstimate
 
 _MIRROR = (1.0, 1.0, 1.0)
-_WHITE = 3.141592653589793
+_WHITE = math.pi
 """Irradiance under which white paper has a radiance of 1, which is display white [W/m^2]."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,18 @@ class TestLamps:
         np.testing.assert_allclose(lamp.radiance, bright - rest, rtol=0.12)
         np.testing.assert_allclose(lamp.colour, (bright - rest) / ((bright - rest) @ LUMINANCE), rtol=0.01)
 
+    @pytest.mark.parametrize(("azimuth", "elevation"), [(40, 45), (90, 30), (200, 80)])
+    def test_a_large_rectangle(self, azimuth: float, elevation: float) -> None:
+        """As wide as 60 degrees: what its edges cover is larger in the panorama than in its plane."""
+        direction, extents = unit_vector(azimuth, elevation), np.array([1.15, 0.8])
+        sight = directions(HEIGHT, WIDTH)
+        plane = np.abs(sight @ rectangle_axes(direction).T / np.maximum(sight @ direction, 1e-3)[..., None])
+        sky = np.where((plane < extents / 2).all(axis=2)[..., None], np.float32(20), np.float32(0.2)).repeat(3, axis=2)
+        (lamp,) = estimated(sky).lamps
+        assert between(lamp.direction, direction) < 0.5
+        np.testing.assert_allclose(lamp.extents, extents, rtol=0.03)
+        np.testing.assert_allclose(lamp.radiance, 19.8, rtol=0.03)
+
     def test_several_by_their_share(self) -> None:
         discs = ((20, 50, 4, 20.0), (140, 30, 8, 5.0), (250, 60, 6, 20.0), (330, 20, 1, 10.0), (0, -40, 9, 40.0))
         sky = painted(*discs)
@@ -124,7 +137,7 @@ class TestLamps:
         none = estimated(sky, lamps=0)
         assert none.lamps == [] and (none.rest == sky).all()
 
-    @pytest.mark.parametrize(("gap", "lamps"), [(2.0, 1), (5.0, 2)])
+    @pytest.mark.parametrize(("gap", "lamps"), [(2.5, 1), (5.0, 2)])
     @pytest.mark.parametrize("azimuth", [10.0, 90.0])
     def test_what_is_close_is_one(self, gap: float, lamps: int, azimuth: float) -> None:
         tilt = 4.0 + gap / 2
@@ -139,7 +152,8 @@ class TestLamps:
         height = directions(HEIGHT, WIDTH)[..., 2:].repeat(3, axis=2)
         overcast = (1 + 2 * height.clip(0)) / 3  # CIE 1955
         assert estimated(overcast).lamps == []
-        assert estimated(np.where(height > 0, 9.0, 1.0).astype(np.float32)).lamps == []  # half of the sky is no lamp
+        windows = np.where((height > 0.2) & (height < 0.4), 30.0, 1.0).astype(np.float32)
+        assert estimated(windows).lamps == []  # all around
 
     def test_energy_is_kept_whatever_is_there(self) -> None:
         random = np.random.default_rng(5)
@@ -397,6 +411,12 @@ class TestRoom:
         assert "is white (from 250 of 255) in the shortest exposure" in reading.warnings[1]
         single = estimate_light(reading.panorama.radiance, LightSettings())
         assert between(single.lamps[0].direction, room.LAMPS[0].direction) < 15
+
+    def test_what_the_ball_swallows(self, shots: list[Path]) -> None:
+        ball = BallView(room.AZIMUTH, room.ELEVATION, ball=seen_ball_in_the_middle())
+        whole = read_ball(shots, ball).panorama.radiance
+        tinted = read_ball(shots, replace(ball, reflectivity=(1.0, 0.8, 0.25))).panorama.radiance
+        np.testing.assert_allclose(tinted * np.float32([1, 0.8, 0.25]), whole, rtol=1e-5)
 
     def test_the_command(self, shots: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         camera = ("--camera", room.AZIMUTH, room.ELEVATION)

@@ -21,7 +21,7 @@ FLOORS = (
     ("fit", "frames"),
     ("labels", "physics", "render"),
     ("capture", "engine", "plugins", "scene"),
-    ("boards", "isolation", "video"),
+    ("boards", "isolation", "lighting", "video"),
     ("spec",),
     ("ground",),
 )

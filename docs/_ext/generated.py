@@ -38,7 +38,7 @@ WINGS = (
         "report",
         "detector",
     ),
-    *("video", "boards", "capture", "fit", "reconstruct", "bake", "checks"),
+    *("video", "boards", "lighting", "capture", "fit", "reconstruct", "bake", "checks"),
 )
 
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from mitsplat.cli import assets, datasets, detectors, fault, photographs
+from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.version import __version__
 
@@ -45,6 +45,7 @@ for _command in (
     photographs.board,
     photographs.mesh,
     photographs.asset,
+    lights.lights,
     assets.import_,
     datasets.schema,
     datasets.check,

@@ -105,7 +105,7 @@ camera:  # about as the photos were taken
   azimuth: [{start}, {end}]
   accept: {{clearance: 0.1}}
   intrinsics: {{fov_x: {fov}}}
-lights:  # of a room; put those of yours in their place
+lights:  # of a room; `mitsplat lights` makes those of yours
   - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
   - {{kind: environment, radiance: 0.4}}
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}

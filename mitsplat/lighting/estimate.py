@@ -165,6 +165,8 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
     hdr = paths[0].suffix.lower() in HDR_SUFFIXES
     if hdr and len(paths) > 1:
         raise InputError(f"{paths[1]}: an HDR photograph must be the only one (got {len(paths)})")
+    if hdr and view.exposures is not None:
+        raise InputError(f"{paths[0]}: --exposures is of photographs of 8 bits; an HDR photograph is taken as it is")
     if hdr:
         image = read_radiance(paths[0])
         picture, focal = _shown(image), None

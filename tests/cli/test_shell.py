@@ -25,11 +25,13 @@ from ruamel.yaml import YAML
 
 from mitsplat.checks.preflight import check_scene
 from mitsplat.cli import app
+from mitsplat.lighting.panorama import write_exr
 from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.scene import load_scene
 from mitsplat.surfels import place_surfels
 from tests import rendered
 from tests.conftest import box_asset
+from tests.lighting import room
 
 if TYPE_CHECKING:
     from mitsplat.capture.pipeline import CaptureResult
@@ -104,7 +106,7 @@ def smaller(words: list[str]) -> list[str]:
 
 @pytest.fixture(scope="session")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what documented commands name: a scene with two kinds of parts, a mesh in mm, splats.
+    """A folder with what documented commands name: a scene with two kinds of parts, a mesh in mm, splats, captured light.
 
     The first commands settle layouts from nothing. Those that later ones take are there already: it is the same code.
     """
@@ -129,6 +131,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, mesh in (("bottle", bottle), ("room", floor)):
         surfels = place_surfels(mesh, 1.0, 2500, np.random.default_rng(0))
         surfels.splats(np.zeros((len(surfels), 1, 3))).save(folder / f"{name}.ply")
+    mirrored = room.render(room.room(room.ball(type="conductor", material="none")), room.SIZE, 16)
+    for name in ("ball", "photos/ball"):
+        (folder / name).mkdir(parents=True)
+        room.photographs(folder / name, mirrored, [0.01, 0.05, 0.25, 1.2], ".jpg")
+    write_exr(folder / "hall.exr", room.true_panorama(128, 8))
     return folder
 
 

@@ -138,7 +138,7 @@ def true_panorama(width: int, samples: int) -> Float32Array:
     return np.array(dr.ravel(radiance)).reshape(width // 2, width, samples, 3).mean(axis=2)
 
 
-def photographs(folder: Path, radiance: Float32Array, times: list[float]) -> list[Path]:
+def photographs(folder: Path, radiance: Float32Array, times: list[float], suffix: str = ".png") -> list[Path]:
     """8-bit photographs with a camera's noise, tone curve and EXIF; in 1 s a radiance of 0.25 becomes white."""
     random, files = np.random.default_rng(0), []
     for number, time in enumerate(times):
@@ -148,6 +148,6 @@ def photographs(folder: Path, radiance: Float32Array, times: list[float]) -> lis
         image = Image.fromarray(np.rint(255 * curved).astype(np.uint8))
         exif = image.getexif()
         exif.get_ifd(0x8769).update({0x829A: time, 0xA405: FOCAL})
-        files.append(folder / f"{number}.png")
+        files.append(folder / f"{number}{suffix}")
         image.save(files[-1], exif=exif.tobytes())
     return files

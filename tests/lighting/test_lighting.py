@@ -503,6 +503,7 @@ class TestInput:
             (["grey.png", *CAMERA, "--exposures", "1/0"], "--exposures must be times such as 1/60,1/8,1 (got 1/0)"),
             (["grey.png", "grey.png", *CAMERA, "--exposures", "1,-2"], "exposures must be finite and > 0 (got 1, -2)"),
             (["nan.exr", "grey.png", *CAMERA], "grey.png: an HDR photograph must be the only one (got 2)"),
+            (["nan.exr", *CAMERA, "--exposures", "1"], "nan.exr: --exposures is of photographs of 8 bits; an HDR"),
             (
                 ["grey.png", "--camera", 0, 90],
                 "--camera must be an azimuth and an elevation between -90 and 90 (got 0 90)",

@@ -22,7 +22,7 @@ from mitsplat.splats import Splats
 CELLS = 80
 """Cells of the grid along its longest side."""
 
-BOUNCE_RAYS = 4
+BOUNCE_RAYS = 6
 """Rays per object pixel, before neighbours are averaged."""
 
 

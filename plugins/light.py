@@ -13,8 +13,8 @@ less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitspla
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
 Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take next to no light,
-see :mod:`mitsplat.plugins.light_tiles`. All else gets ``FIRST_RAYS``, and as many more as the wanted error of light, as
-it looks in the picture, asks for.
+see :mod:`mitsplat.plugins.light_tiles`. All else gets as many as most need for the wanted error, and more where light,
+as it looks in the picture, errs by more.
 """
 
 from __future__ import annotations
@@ -48,11 +48,17 @@ Those of a pixel are Roberts', of whose own recurrence every 16th point is nearl
 of this one consecutive points are farthest apart.
 """
 
-FAINT = 0.5
+FAINT = 1.0
 """Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced by more than one ray."""
 
-FIRST_RAYS = 4
-"""Rays per point after which its error is first estimated."""
+FIRST = 0.3
+"""Rays per point after which its error is first estimated, times the wanted one: as many as most points need.
+
+With fewer, the estimates are so rough that they send rays to the wrong points, and take penumbras for even light.
+"""
+
+LEAST_FIRST = 4
+"""Least number of them."""
 
 LEVEL_BITS = 4
 """Of how often that number is doubled: 2^15 times it is more than any setting."""
@@ -75,6 +81,12 @@ class Accuracy:
     error: float
     most: int
     metered: bool = False
+
+    @property
+    def first(self) -> int:
+        """Rays per point after which its error is first estimated."""
+        wanted = max(LEAST_FIRST, round(FIRST / self.error)) if self.error > 0 else self.most
+        return min(wanted, self.most)
 
 
 def light_factor(
@@ -126,7 +138,7 @@ def light_factor(
     order = _blockwise(light_filter.place, view)
     points = Points.of(visible, here, index, light_filter.place, order)
     tracer = _Tracer(emitters, proxies, points.surface, dr.gather(mi.UInt32, index, points.owner), view, seed)
-    first = min(FIRST_RAYS, accuracy.most) if accuracy.error > 0 else accuracy.most
+    first = accuracy.first
     rows = points.rows(order)
     rays = points.shared(dr.opaque(mi.UInt32, first), rows)
     estimate = tracer.trace(rows, Estimate.nothing(dr.width(points.owner)), rays, first, points.turn(rows))

@@ -22,7 +22,7 @@ GUESS_WEIGHT = 1e-3
 SMALL = 64 / 9
 """Pixels of equal weight that have the noise of a mean over 3 x 3 with halves at the ends."""
 
-GAIN = 5.0
+GAIN = 20.0
 """By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3
 pixels. With this, ``python -m benchmarks.light.traced`` finds six tenths of a wanted error of 0.03 over all shadows."""
 

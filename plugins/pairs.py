@@ -65,8 +65,11 @@ def pair_records(
     quality: Quality,
     chosen: ChosenTiles | TileBox | None,
     numbered: bool,
+    groups: Any | None = None,
 ) -> Pairs | None:
     """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
+
+    ``groups`` are numbers of the records, below 2^DEPTH_BITS, that they are sorted by in a tile instead of by depth.
 
     Raises:
         CrowdedError: If there are more than :data:`PAIRS_MAX`, or their keys have no room for tiles or records.
@@ -109,12 +112,15 @@ def pair_records(
     def in_view(tile: Any, active: Any = True) -> Any:
         return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile, active)
 
-    depth_of = depths_by_tile(record, near, ellipsoid, in_view(first_tile, length > 0), view, quality)
+    if groups is None:
+        depth_of = depths_by_tile(record, near, ellipsoid, in_view(first_tile, length > 0), view, quality)
+    else:
+        group = dr.gather(mi.UInt32, groups, owner)
 
     def one_tile(k: Any) -> tuple[Any]:
         tile, pair = first_tile + k, pair_of + k
-        depth = depth_of(in_view(tile))
-        own = Pairs.key_of(tile, level_of(depth, view), pair if numbered else owner)
+        level = level_of(depth_of(in_view(tile)), view) if groups is None else group
+        own = Pairs.key_of(tile, level, pair if numbered else owner)
         dr.scatter(key, own, pair, mode=dr.ReduceMode.Permute)
         if numbered:
             dr.scatter(number, owner, pair, mode=dr.ReduceMode.Permute)

@@ -2,15 +2,15 @@
 
 A pixel belongs to an instance that is alone where it lets less than half of the light behind it through: the rule of
 the instance image, :class:`mitsplat.plugins.march.Image`, with what is left of a ray counted as environment. Opacity
-does not depend on the order of Gaussians, so all instances come from one set of tile lists: one packet of lanes walks a
-tile's list for each instance that is in it, and stops as soon as all its pixels are decided.
+does not depend on the order of Gaussians, so lists of tiles are sorted by instance instead of by depth: one packet of
+lanes walks what a tile has of an instance, and stops as soon as all its pixels are decided.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,9 +23,10 @@ from mitsplat.camera import Camera, Lens
 from mitsplat.masks import Silhouette
 from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
 from mitsplat.plugins.gaussian import RECORD
-from mitsplat.plugins.pairs import CrowdedError, prefix_ranges
+from mitsplat.plugins.pairs import CrowdedError
 from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH, View
+from mitsplat.plugins.tile_depths import DEPTH_BITS
 from mitsplat.plugins.tiles import TileLists, bin_gaussians
 from mitsplat.plugins.walk import exp2, faintest, largest, respond_along
 from mitsplat.quality import Quality
@@ -58,13 +59,16 @@ def splat_silhouettes(
 def _cover(
     clouds: CloudSet, objects: Sequence[Placement], canvas: View, quality: Quality, ids: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tile, instance (as position in ``ids``) and covered pixels of every pair of them, see :func:`_covered`.
+    """Tile, instance (as position in ``ids``) and covered pixels of every run, see :func:`_covered`.
 
     A canvas that is too crowded for the memory is looked at in parts.
     """
+    slots = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
+    slots[ids] = np.arange(len(ids), dtype=np.uint32)
+    if len(ids) > 1 << DEPTH_BITS:
+        raise CrowdedError
     try:
-        lists = bin_gaussians(clouds, objects, canvas, quality, fitted=True)
-        found = _occupied(lists, ids)
+        lists = bin_gaussians(clouds, objects, canvas, quality, fitted=True, groups=wrapped(mi.UInt32, slots))
     except CrowdedError:
         if canvas.tiles_y == 1:
             raise
@@ -74,12 +78,11 @@ def _cover(
         tile = np.concatenate([above, below + middle * canvas.tiles_x])
         slot, bits = (np.concatenate(parts) for parts in zip(rest, more, strict=True))
         return tile, slot, bits
-    if found is None:
+    if lists.pairs == 0:
         return (np.zeros(0, dtype=np.uint32),) * 3
-    place, slot = found
-    tile = dr.gather(mi.UInt32, lists.tiles, place)
-    instance = dr.gather(mi.Float, wrapped(mi.Float, ids.astype(np.float32)), slot)
-    return np.array(tile), np.array(slot), np.array(_covered(lists, canvas, quality, place, instance))
+    runs = _runs(lists)
+    tile = dr.gather(mi.UInt32, lists.tiles, runs.place)
+    return np.array(tile), np.array(runs.slot), np.array(_covered(lists, canvas, quality, runs))
 
 
 def proxy_silhouettes(
@@ -142,67 +145,69 @@ def _margin(
     return MARGINS[-1]
 
 
-def _occupied(lists: TileLists, ids: np.ndarray) -> tuple[Any, Any] | None:
-    """Every pair of a tile (as place in ``lists``) and an instance (in ``ids``) that has a Gaussian in it, or None.
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """What tiles have of instances.
 
-    They are found as one bit each.
+    Attributes:
+        place: Of the tile among those that have lists.
+        slot: Of the instance in the ids.
+        start, stop: Range of its entries.
     """
-    if lists.pairs == 0:
-        return None
-    tile = dr.arange(mi.UInt32, dr.width(lists.start))
-    slot_of_id = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
-    slot_of_id[ids] = np.arange(len(ids), dtype=np.uint32)
-    slots, words = wrapped(mi.UInt32, slot_of_id), dr.opaque(mi.UInt32, -(-len(ids) // 32))
-    seen = dr.zeros(mi.UInt32, dr.width(tile) * -(-len(ids) // 32))
 
-    def mark(i: Any) -> tuple[Any]:
-        record = dr.gather(mi.UInt32, lists.entries, i)
-        instance = dr.gather(mi.Float, lists.records, record * RECORD + RECORD - 1)
-        slot = dr.gather(mi.UInt32, slots, mi.UInt32(instance))
-        # A lane has words of its own; the default mode would write their number into the kernel.
-        bit, word = mi.UInt32(1) << (slot & 31), tile * words + (slot >> 5)
-        dr.scatter_reduce(dr.ReduceOp.Or, seen, bit, word, mode=dr.ReduceMode.NoConflicts)
-        return (i + 1,)
-
-    dr.while_loop((mi.UInt32(lists.start),), lambda i: i < lists.stop, mark, label="occupied")
-    dr.eval(seen)
-    begin, pairs = prefix_ranges(dr.popcnt(seen))
-    word = dr.arange(mi.UInt32, dr.width(seen))
-    owner, slot = dr.empty(mi.UInt32, pairs), dr.empty(mi.UInt32, pairs)
-
-    def emit(left: Any, place: Any) -> tuple[Any, Any]:
-        dr.scatter(owner, word // words, place, mode=dr.ReduceMode.Permute)
-        dr.scatter(slot, word % words * 32 + dr.tzcnt(left), place, mode=dr.ReduceMode.Permute)
-        return left & (left - 1), place + 1
-
-    dr.while_loop((mi.UInt32(seen), mi.UInt32(begin)), lambda left, _: left != 0, emit, label="occupied pairs")
-    dr.eval(owner, slot)
-    return owner, slot
+    place: Any
+    slot: Any
+    start: Any
+    stop: Any
 
 
-def _covered(lists: TileLists, view: View, quality: Quality, place: Any, instance: Any) -> Any:
-    """For every pair and each column of its tile, the pixels that the instance covers, as bits from the top."""
-    lane = dr.arange(mi.UInt32, dr.width(place) * TILE_WIDTH)
-    pair, column = lane // TILE_WIDTH, lane % TILE_WIDTH
-    place, instance = dr.gather(mi.UInt32, place, pair), dr.gather(mi.Float, instance, pair)
-    tile = dr.gather(mi.UInt32, lists.tiles, place)
+def _runs(lists: TileLists) -> _Runs:
+    """Every tile and instance that meet, of lists that are sorted by instance and not empty."""
+    entry, tile = dr.arange(mi.UInt32, lists.pairs), dr.arange(mi.UInt32, dr.width(lists.start))
+    slot, filled = lists.levels, lists.stop > lists.start
+    first = dr.zeros(mi.UInt32, lists.pairs)
+    dr.scatter(first, mi.UInt32(1), lists.start, filled, mode=dr.ReduceMode.Permute)
+    dr.eval(slot, first)
+    begins = (first > 0) | (slot != dr.gather(mi.UInt32, slot, entry - 1, entry > 0))
+    before, start = dr.prefix_sum(dr.select(begins, mi.UInt32(1), 0)), dr.compress(begins)
+    run, runs, end = dr.arange(mi.UInt32, dr.width(start)), dr.width(start), dr.opaque(mi.UInt32, lists.pairs)
+    count, last = dr.opaque(mi.UInt32, runs), run + 1
+    stop = dr.select(last < count, dr.gather(mi.UInt32, start, last, last < count), end)
+    inside, place = lists.stop < end, dr.empty(mi.UInt32, runs)
+    own = dr.gather(mi.UInt32, before, lists.start, filled)
+    after = dr.select(inside, dr.gather(mi.UInt32, before, lists.stop, inside), count)
+
+    def name(k: Any) -> tuple[Any]:
+        dr.scatter(place, tile, k, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
+
+    dr.while_loop((mi.UInt32(own),), lambda k: filled & (k < after), name, label="tiles of runs")
+    slot = dr.gather(mi.UInt32, slot, start)
+    dr.eval(place, slot, start, stop)
+    return _Runs(place, slot, start, stop)
+
+
+def _covered(lists: TileLists, view: View, quality: Quality, runs: _Runs) -> Any:
+    """For every run and each column of its tile, the pixels that the instance covers, as bits from the top."""
+    lane = dr.arange(mi.UInt32, dr.width(runs.place) * TILE_WIDTH)
+    run, column = lane // TILE_WIDTH, lane % TILE_WIDTH
+    tile = dr.gather(mi.UInt32, lists.tiles, dr.gather(mi.UInt32, runs.place, run))
     row = tile // view.tiles_x
     x = mi.Float((tile - row * view.tiles_x) * TILE_WIDTH + column)
     y = mi.Float(row * TILE_HEIGHT)
     centre = dr.opaque(mi.Float, 0.5)  # as in the instance image, whatever the number of samples
     slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
-    start, stop = dr.gather(mi.UInt32, lists.start, place), dr.gather(mi.UInt32, lists.stop, place)
+    start, stop = dr.gather(mi.UInt32, runs.start, run), dr.gather(mi.UInt32, runs.stop, run)
     cut, near, shared_column = faintest(quality), view.near_plane, not view.distortion
 
     def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
         record = dr.gather(
             mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
         )
-        mine = record[RECORD - 1] == instance
         responses = respond_along(record, lists, us, vs, shared_column, cap=None)
         return i + 1, [
-            dr.select(mine & (log_alpha > cut) & (z > near), t * (1 - exp2(log_alpha)), t)
+            dr.select((log_alpha > cut) & (z > near), t * (1 - exp2(log_alpha)), t)
             for t, (log_alpha, z) in zip(through, responses, strict=True)
         ]
 

@@ -72,6 +72,7 @@ def bin_gaussians(
     at_camera: bool = True,
     chosen: ChosenTiles | TileBox | None = None,
     fitted: bool = False,
+    groups: Any | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
     """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
@@ -84,6 +85,7 @@ def bin_gaussians(
         at_camera: Whether Gaussians that reach the camera's plane are seen.
         chosen: The only tiles that have lists; all of the view's if None.
         fitted: Whether only the tiles in a box around all that is seen have lists.
+        groups: By instance id, a number below 2^DEPTH_BITS that its entries have for a level, instead of their depth.
         for_gradients: Whether entries are to be known by record too.
 
     Raises:
@@ -108,7 +110,12 @@ def bin_gaussians(
     only = ids.pop() if len(ids) == 1 else None
     if fitted:
         chosen = TileBox.around(box, view)
-    return bin_records(records, near_rows, least, box, view, quality, only, chosen, for_gradients=for_gradients)
+    if groups is not None:
+        row = dr.arange(mi.UInt32, dr.width(least)) * RECORD
+        groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, row + (RECORD - 1))))
+    return bin_records(
+        records, near_rows, least, box, view, quality, only, chosen, groups=groups, for_gradients=for_gradients
+    )
 
 
 def bin_records(
@@ -121,14 +128,17 @@ def bin_records(
     only: int | None,
     chosen: ChosenTiles | TileBox | None = None,
     *,
+    groups: Any | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
     """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
 
+    ``groups`` are as of :func:`mitsplat.plugins.pairs.pair_records`.
+
     Raises:
         CrowdedError: If there are too many pairs to hold.
     """
-    pairs = pair_records(dr.detach(records), near, least, box, view, quality, chosen, for_gradients)
+    pairs = pair_records(dr.detach(records), near, least, box, view, quality, chosen, for_gradients, groups)
     if pairs is None:
         return _empty(view, chosen, records)
     tiles, own = _numbered(view, chosen)

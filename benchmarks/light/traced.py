@@ -4,9 +4,10 @@
 
 The truth is the ratio of ``--truth`` rays per pixel without a filter. Errors are the standard deviation of the light
 factor (mean of RGB) from it, where it matters: at objects that are lit anew, and where a shadow takes 1 % or more of
-the light. The PSNR [dB] is that of pictures as each frame's camera develops them, noise and all, to those of the truth:
-what highlights miss counts as well. Processor seconds of all threads are medians over frames, less those of the same
-frames without light.
+the light; but not at pixels beside which another instance begins, where a ray may meet the proxy of what the pixel does
+not show, and no number of rays without a filter is a truth. The PSNR [dB] is that of pictures, except for those pixels,
+as each frame's camera develops them, noise and all, to those of the truth: what highlights miss counts as well.
+Processor seconds of all threads are medians over frames, less those of the same frames without light.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 import mitsplat as ms
 from benchmarks.record import figure, recording
@@ -109,9 +111,14 @@ class Row:
         self.seconds.append(seconds - without)
         apart = pictures.developed(number, layers) - pictures.developed(number, truth)
         off = layers.light.mean(axis=-1) - truth.light.mean(axis=-1)
-        objects = truth.instance > 0
-        shadow = ~objects & (truth.light.mean(axis=-1) < 0.99)
-        for where, squares in (("picture", apart**2), ("objects", off[objects] ** 2), ("shadows", off[shadow] ** 2)):
+        inside = maximum_filter(truth.instance, 3) == minimum_filter(truth.instance, 3)
+        objects = inside & (truth.instance > 0)
+        shadow = inside & (truth.instance == 0) & (truth.light.mean(axis=-1) < 0.99)
+        for where, squares in (
+            ("picture", apart[inside] ** 2),
+            ("objects", off[objects] ** 2),
+            ("shadows", off[shadow] ** 2),
+        ):
             self.errors[where].append(float(np.mean(squares)))
 
     def tell(self) -> None:

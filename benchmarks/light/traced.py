@@ -69,7 +69,7 @@ class Pictures:
         self.frames: list[tuple[Any, Any]] = []
         self.plans: list[FramePlan] = []
         for index in range(frames):
-            plan = plan_frame(self.scene, index)
+            plan = plan_frame(self.scene, index, layout)
             self.frames.append((mi.load_dict(self.renderer.describe(layout, plan.lights)), plan.camera))
             self.plans.append(plan)
 

@@ -136,16 +136,17 @@ def _fresh(several: bool, late: Late) -> Pixel:
     return [mi.Float(1.0), *nothing, *tally, *extra]
 
 
-def _blend(pixel: Pixel, weight: Any, record: Any, z: Any, several: bool, late: Late) -> Pixel:
+def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: Late) -> Pixel:
     """The pixel after one more Gaussian."""
+    weight = pixel[T] * alpha
     transmittance = pixel[T] - weight
     colour = [record[6], record[7], record[8]]
     sums = [dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)]
     extra: list[Any] = []
     if late == "estimated":
-        extra = _add_to_error(pixel, weight, colour, z)
+        extra = _add_to_error(pixel, alpha, weight, colour, z)
     elif late == "amended":
-        change, extra = _amended(pixel, weight, colour, z)
+        change, extra = _amended(pixel, alpha, weight, colour, z)
         sums = [a + b for a, b in zip(sums, change, strict=True)]
     return [
         transmittance,
@@ -157,39 +158,43 @@ def _blend(pixel: Pixel, weight: Any, record: Any, z: Any, several: bool, late: 
     ]
 
 
-def _share_behind(pixel: Pixel, z: Any) -> Any:
-    """Share of the sums that lies behind a peak, see the module; where that is late."""
+def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, forgets: int) -> tuple[Any, Any]:
+    """Share of the sums that lies behind a peak if it is late, and that is left of them if it is the deepest one.
+
+    See the module. One division is enough for both.
+    """
     total, moment, *_ = pixel[SUMS]
     gap, reach = (pixel[DEEPEST] - z) * total, 2 * dr.fma(pixel[DEEPEST], total, -moment)
-    return dr.select(gap < reach, gap / reach, 1.0)
+    ratio = dr.select(late, gap, total) / dr.select(late, reach, dr.fma(forgets, weight, total))
+    return dr.select(gap < reach, ratio, 1.0), ratio
 
 
-def _add_to_error(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> list[Any]:
+def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> list[Any]:
     """The estimate after one more Gaussian, see the module."""
     total, _, *colours = pixel[SUMS]
-    deepest, opacity = pixel[DEEPEST], weight / pixel[T]
-    met = weight > 0
+    deepest, met = pixel[DEEPEST], weight > 0
     late = met & (z < deepest)
     change = mi.Float(0.0)
     for c, sum_c in zip(colour, colours, strict=True):
         change = dr.maximum(change, dr.abs(dr.fma(total, c, -sum_c)))
-    keep = dr.select(met & ~late, total / dr.fma(2, weight, total), 1.0)
+    behind, kept = _shares(pixel, weight, late, z, 2)
+    keep = dr.select(met & ~late, kept, 1.0)
     return [
-        dr.select(late, dr.fma(opacity * _share_behind(pixel, z), change, pixel[ERROR]), pixel[ERROR]),
+        dr.select(late, dr.fma(alpha * behind, change, pixel[ERROR]), pixel[ERROR]),
         dr.select(met, dr.maximum(z, deepest), deepest),
         *(dr.fma(keep, old, weight * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
     ]
 
 
-def _amended(pixel: Pixel, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
+def _amended(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
     """What one more Gaussian changes of the colour if it is late, and the state of late peaks after it."""
     total, _, *colours = pixel[SUMS]
-    deepest = pixel[DEEPEST]
-    met = weight > 0
+    deepest, met = pixel[DEEPEST], weight > 0
     late = met & (z < deepest)
-    taken = dr.select(late, weight / pixel[T] * _share_behind(pixel, z), 0.0)
+    behind, kept = _shares(pixel, weight, late, z, _FORGETS)
+    taken = dr.select(late, alpha * behind, 0.0)
     change = [taken * dr.fma(total, c, -sum_c) for c, sum_c in zip(colour, colours, strict=True)]
-    keep = dr.select(met & ~late, total / dr.fma(_FORGETS, weight, total), 1.0 - taken)
+    keep = dr.select(met & ~late, kept, 1.0 - taken)
     own = dr.fma(taken, total, weight)
     return change, [
         dr.select(met, dr.maximum(z, deepest), deepest),

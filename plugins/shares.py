@@ -77,7 +77,7 @@ def settle_instances(
             lists, view, quality, slopes, [far], lanes.start, dr.select(active, lanes.stop, lanes.start)
         )
         ((transmittance, own, left, *slots),) = walk(
-            rays, order, _nothing, lambda pixel, weight, record, _: _count(pixel, weight, record[15], last)
+            rays, order, _nothing, lambda pixel, alpha, record, _: _count(pixel, pixel[0] * alpha, record[15], last)
         )
         # The same in every walk, and 0 at first: what the ray shows of the environment.
         most = dr.maximum(most, own + transmittance)

@@ -31,9 +31,9 @@ Pixel = list[Any]
 """State of a ray, the transmittance first."""
 
 Blend = Callable[[Pixel, Any, Any, Any], Pixel]
-"""The state of a ray after one more Gaussian in front-to-back order: from the state, the Gaussian's weight, which the
-ray loses of its transmittance, its record, of which colour and instance may be asked for, and the depth of its peak. A
-weight of 0 changes nothing."""
+"""The state of a ray after one more Gaussian in front-to-back order: from the state, the Gaussian's opacity on the
+ray, its record, of which colour and instance may be asked for, and the depth of its peak. An opacity of 0 changes
+nothing."""
 
 
 class Lanes:
@@ -271,9 +271,8 @@ def _walk_in_tile_order(
         responses = rays.respond(record)
         for pixel, (log_alpha, z), z_far in zip(pixels, responses, far, strict=True):
             hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[0] > end)
-            weight = dr.select(hit, pixel[0] * exp2(log_alpha), 0.0)
-            z = dr.select(hit, z, 0.0)
-            blended.append(blend(pixel, weight, record, z))
+            alpha, z = dr.select(hit, exp2(log_alpha), 0.0), dr.select(hit, z, 0.0)
+            blended.append(blend(pixel, alpha, record, z))
         return i + 1, blended
 
     def alive(i: Any, pixels: list[Pixel]) -> Any:
@@ -307,7 +306,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
             )
             alpha, number = dr.select(deeper, slot_alpha, alpha), dr.select(deeper, slot_number, number)
             z = dr.minimum(z, slot_z)
-        return blend(pixel, pixel[0] * alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
+        return blend(pixel, alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
 
     def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
         return (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
@@ -330,8 +329,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
     for pixel, window in zip(pixels, windows, strict=True):
         for z, alpha, number in window:
             seen = (alpha > 0) & (pixel[0] > end)
-            weight = dr.select(seen, pixel[0] * alpha, 0.0)
-            pixel = blend(pixel, weight, _Fields(lists.records, number, seen), z)
+            pixel = blend(pixel, dr.select(seen, alpha, 0.0), _Fields(lists.records, number, seen), z)
         ends.append(pixel)
     return ends
 
@@ -405,9 +403,8 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
                 found = active & (z < dr.inf) & (pixel[0] > end)
                 number = dr.gather(mi.UInt32, lists.entries, i, found)
                 record = _Fields(lists.records, number, found)
-                weight = dr.select(found, pixel[0] * alpha, 0.0)
                 z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, which no weight makes 0
-                pixel = blend(pixel, weight, record, z)
+                pixel = blend(pixel, dr.select(found, alpha, 0.0), record, z)
             # A ray that has ended takes nothing more: no peak lies behind infinity.
             open_ray = pixel[0] > end
             z, _, i = own[-1]

@@ -168,7 +168,7 @@ def test_late_by_one_place_is_estimated_exactly() -> None:
     pixel = _fresh(False, "estimated")
     for colour, opacity, z in zip(colours, opacities, (2.0, 1.0), strict=True):
         record = {6: colour[0], 7: colour[1], 8: colour[2]}
-        pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, "estimated")
+        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "estimated")
     assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
 
 
@@ -181,7 +181,7 @@ def test_late_by_one_place_is_amended_exactly() -> None:
     pixel = _fresh(False, "amended")
     for colour, opacity, z in met:
         record = {6: colour[0], 7: colour[1], 8: colour[2]}
-        pixel = _blend(pixel, pixel[0] * opacity, record, mi.Float(z), False, "amended")
+        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "amended")
     expected, transmittance = np.zeros(3), 1.0
     for colour, opacity, _ in sorted(met, key=lambda peak: peak[2]):
         expected += transmittance * opacity * np.array(colour)

@@ -12,8 +12,8 @@ colours of the surroundings are exposed: an object taken in a light tent keeps i
 less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.plugins.bounce`. The highlight is what
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
-Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take next to no light,
-see :mod:`mitsplat.plugins.light_tiles`. All else gets as many as most need for the wanted error, and more where light,
+Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take no more light than
+the wanted error, see :mod:`mitsplat.plugins.light_tiles`. All else gets as many as most need for the wanted error, and more where light,
 as it looks in the picture, errs by more.
 """
 
@@ -47,9 +47,6 @@ RECURRENCE = (1996816038, 1246200886)
 Those of a pixel are Roberts', of whose own recurrence every 16th point is nearly the same. There are 4096 of the kind;
 of this one consecutive points are farthest apart.
 """
-
-FAINT = 1.0
-"""Share of the wanted error that a shadow must reach in a tile and its neighbours to be traced by more than one ray."""
 
 FIRST = 0.3
 """Rays per point after which its error is first estimated, times the wanted one: as many as most points need.
@@ -125,7 +122,7 @@ def light_factor(
         pixel, inside = block_order(view)
         tiles = _Tracer(emitters, proxies, visible.at(pixel), pixel, view, seed).search(inside)
         anew = everything.relit | (everything.specular > 0)
-        needed = everything.valid & (anew | tiles.differs(FAINT * accuracy.error))
+        needed = everything.valid & (anew | tiles.differs(accuracy.error))
         light = dr.select(everything.valid, tiles.light(), 1)
     dr.eval(needed, light)
     highlight = mi.Color3f(0)

@@ -1,6 +1,6 @@
 """Material of the experiment on detectors: assets of scanned objects, packages that no class is, labelled photographs.
 
-    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 90] [--device cuda]
+    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 90] [--device cuda] [--jobs 8]
 
 HOPE holds ``meshes/*.glb`` (textured scans [m], y up), ``photos/*.jpg`` named ``scene_NNNN_LLLL``, and ``labels.json``
 (COCO). WORK gets ``groceries/``, ``packages/`` and ``brands/`` (the scans as other brands print them), folders of
@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from dataclasses import replace
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
@@ -40,18 +42,16 @@ DENSITY = 600.0
 
 def bake(
     mesh: Path | trimesh.Trimesh, out: Path, class_name: str, settings: BakeSettings, up: Literal["y", "z"]
-) -> None:
-    """An asset of small files, unless it is there; its body is its convex hull, which cartons and cans all but fill."""
-    if (out / "asset.yaml").exists():
-        return
+) -> float:
+    """An asset of small files, whose PSNR [dB] this is; its body is its hull, which cartons and cans all but fill."""
     hull = parts_hull(mesh, up)
     result = bake_asset(
         mesh, name=out.name, class_name=class_name, settings=settings, up=up, density=DENSITY, pieces=[hull]
     )
     replace(result.asset, mesh=hull).save(out, splats="splats.spz")
     notes = "".join(f"; {warning}" for warning in result.warnings)
-    figure(result.psnr, "dB", out.name)
     print(f"{out.name}: {len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB{notes}", flush=True)
+    return result.psnr
 
 
 def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.Trimesh:
@@ -68,28 +68,52 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=50000, help="of each scan")
     parser.add_argument("--packages", type=int, default=90)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--jobs", type=int, default=1, help="assets that are baked at once")
     options = parser.parse_args()
-    with recording("detector.material", parser, options, ignore=("hope", "work"), gpu=options.device != "cpu"):
+    with recording("detector.material", parser, options, ignore=("hope", "work", "jobs"), gpu=options.device != "cpu"):
         make(options)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """An asset: a scan, a scan as another brand prints it (its number), or a package (without a scan)."""
+
+    out: Path
+    scan: Path | None = None
+    seed: int = 0
+    brand: bool = False
+
+    def bake(self, gaussians: int, device: str) -> float:
+        """Its PSNR [dB]."""
+        use_device(device)
+        if self.scan is None:
+            return bake(make_package(self.seed), self.out, "package", PACKAGE, "z")
+        up = UP.get(self.scan.stem, "y")
+        if not self.brand:
+            return bake(self.scan, self.out, self.scan.stem, BakeSettings(gaussians=gaussians), up)
+        mesh = relabel(trimesh.load(self.scan, force="mesh"), self.seed, "xyz".index(up))
+        return bake(mesh, self.out, "package", PACKAGE, up)
 
 
 def make(options: argparse.Namespace) -> None:
     """Bake and copy what is not there."""
-    use_device(options.device)
     photos = options.work / "photos"
     if not photos.exists():
         shutil.copytree(options.hope / "photos", photos)
         shutil.copy(options.hope / "labels.json", photos / "labels.json")
-    scans = BakeSettings(gaussians=options.gaussians)
+    wanted = []
     for number, path in enumerate(sorted((options.hope / "meshes").glob("*.glb"))):
-        up = UP.get(path.stem, "y")
-        bake(path, options.work / "groceries" / path.stem, path.stem, scans, up)
-        scan = trimesh.load(path, force="mesh")
-        for brand in range(BRANDS[shape_of(scan)]):
-            out = options.work / "brands" / f"{path.stem}_{brand}"
-            bake(relabel(scan, 1000 * number + brand, "xyz".index(up)), out, "package", PACKAGE, up)
-    for seed in range(options.packages):
-        bake(make_package(seed), options.work / "packages" / f"package_{seed:02d}", "package", PACKAGE, "z")
+        wanted.append(Wanted(options.work / "groceries" / path.stem, path))
+        brands = options.work / "brands"
+        count = BRANDS[shape_of(trimesh.load(path, force="mesh"))]
+        wanted += [Wanted(brands / f"{path.stem}_{k}", path, 1000 * number + k, brand=True) for k in range(count)]
+    packages = options.work / "packages"
+    wanted += [Wanted(packages / f"package_{seed:02d}", seed=seed) for seed in range(options.packages)]
+    wanted = [one for one in wanted if not (one.out / "asset.yaml").exists()]
+    with ProcessPoolExecutor(options.jobs, get_context("spawn"), max_tasks_per_child=8) as pool:
+        baked = [pool.submit(one.bake, options.gaussians, options.device) for one in wanted]
+        for one, psnr in zip(wanted, baked, strict=True):
+            figure(psnr.result(), "dB", one.out.name)
 
 
 if __name__ == "__main__":

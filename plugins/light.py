@@ -13,8 +13,8 @@ less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitspla
 the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
 
 Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take no more light than
-the wanted error, see :mod:`mitsplat.plugins.light_tiles`. All else gets as many as most need for the wanted error, and more where light,
-as it looks in the picture, errs by more.
+the wanted error, see :mod:`mitsplat.plugins.light_tiles`. All else gets as many as most need for that error, and more
+where light, as it looks in the picture, errs by more.
 """
 
 from __future__ import annotations

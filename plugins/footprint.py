@@ -52,15 +52,22 @@ class Points:
         """
         count = dr.width(index)
         bends = _bends(here, index, place, visible.view)
-        among = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, bends, order)))
-        bent = dr.width(among)
+        in_image = dr.compress(bends)
+        bent = dr.width(in_image)
         slot = dr.full(mi.UInt32, NOWHERE, count)
         if not bent:
             return cls(here, dr.arange(mi.UInt32, count), slot, count, 0)
+        among = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, bends, order)))
         dr.scatter(slot, dr.arange(mi.UInt32, bent), among, mode=dr.ReduceMode.Permute)
         owner = concatenated([among] * len(OFFSETS))
         number = dr.arange(mi.UInt32, bent * len(OFFSETS)) // dr.opaque(mi.UInt32, bent)
-        around = gathered(_around(visible, index, bends), _rank(bends, owner) + number * dr.opaque(mi.UInt32, bent))
+        # Looked for in the order of the image: camera rays side by side meet the same triangles, which takes two fifths
+        # of the time.
+        offset = dr.gather(mi.Point2f, wrapped(mi.Float, np.array(OFFSETS, np.float32)), number)
+        around = visible.beside(dr.gather(mi.UInt32, index, concatenated([in_image] * len(OFFSETS))), offset)
+        rank = dr.empty(mi.UInt32, count)
+        dr.scatter(rank, dr.arange(mi.UInt32, bent), in_image, mode=dr.ReduceMode.Permute)
+        around = gathered(around, dr.gather(mi.UInt32, rank, owner) + number * dr.opaque(mi.UInt32, bent))
         # Where all of them miss what the middle shows, that is the only point.
         place_of, found = dr.gather(mi.UInt32, slot, owner), mi.Bool(False)
         for start in range(0, len(OFFSETS) * bent, bent):
@@ -114,26 +121,6 @@ class Points:
 
     def _starts(self) -> list[Any]:
         return [dr.opaque(mi.UInt32, self.count + number * self.bent) for number in range(len(OFFSETS))]
-
-
-def _around(visible: VisibleSurfaces, index: Any, bends: Any) -> Surface:
-    """The first points of those pixels of ``index`` that are bent, then their second, and so on.
-
-    In the order of the image: camera rays side by side meet the same triangles, which takes a third of the time.
-    """
-    bent = dr.compress(bends)
-    pixel = dr.gather(mi.UInt32, index, bent)
-    number = dr.arange(mi.UInt32, dr.width(bent) * len(OFFSETS)) // dr.opaque(mi.UInt32, dr.width(bent))
-    offset = dr.gather(mi.Point2f, wrapped(mi.Float, np.array(OFFSETS, np.float32)), number)
-    return visible.beside(concatenated([pixel] * len(OFFSETS)), offset)
-
-
-def _rank(bends: Any, places: Any) -> Any:
-    """How many bent pixels come before each of some places, in the order of the image."""
-    bent = dr.compress(bends)
-    rank = dr.empty(mi.UInt32, dr.width(bends))
-    dr.scatter(rank, dr.arange(mi.UInt32, dr.width(bent)), bent, mode=dr.ReduceMode.Permute)
-    return dr.gather(mi.UInt32, rank, places)
 
 
 def _bends(here: Surface, index: Any, place: Any, view: View) -> Any:

@@ -86,16 +86,16 @@ def lights(
             raise InputError(
                 "--ball, --fov-x, --exposures and --reflectivity are of photographs of a mirror ball: give --camera"
             )
-        settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
+    elif rotate_z:
+        raise InputError(f"--rotate-z is of panoramas: the ball's is turned by --camera (got {rotate_z:g})")
+    elif irradiance is None and images[0].suffix.lower() not in HDR_SUFFIXES:
+        irradiance = _WHITE
+    settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
+    if camera is None:
         panorama = read_panorama(images[0])
     else:
-        if rotate_z:
-            raise InputError(f"--rotate-z is of panoramas: the ball's is turned by --camera (got {rotate_z:g})")
         times = None if exposures is None else _times(exposures)
         view = BallView(*camera, ball=ball, fov_x=fov_x, exposures=times, reflectivity=reflectivity)
-        if irradiance is None and images[0].suffix.lower() not in HDR_SUFFIXES:
-            irradiance = _WHITE
-        settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
         found = read_ball(images, view)
         panorama, photograph = found.panorama.radiance, found.picture
         x, y, radius = found.ball

@@ -24,7 +24,7 @@ from mitsplat.lighting.panorama import HDR_SUFFIXES, level_irradiance, read_radi
 _WIDEST = 4096
 """Of panoramas that are written [px]."""
 _MIDDLE = 110.0
-"""Mean level of the photograph that the ball is looked for in, about."""
+"""Mean level of the photograph that the ball is shown in, about."""
 _SMALLEST = 20.0
 """Radius of a ball in its photograph [px], of which 45 degrees around what is behind it are not seen."""
 _OUTLINE = (230, 40, 40)
@@ -169,13 +169,13 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
         raise InputError(f"{paths[0]}: --exposures is of photographs of 8 bits; an HDR photograph is taken as it is")
     if hdr:
         image = read_radiance(paths[0])
-        picture, focal = _shown(image), None
+        pixels, focal = [_shown(image)], None
     else:
         photographs = [read_photograph(path) for path in paths]
         exposures = exposures_of(photographs, view.exposures)
         pixels, focal = [photograph.pixels for photograph in photographs], photographs[0].focal
-        picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MIDDLE))
-    ball = find_ball(picture) if view.ball is None else view.ball
+    picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MIDDLE))
+    ball = find_ball(*pixels) if view.ball is None else view.ball
     if ball is None:
         raise InputError(f"{paths[0]}: no ball stands out in it: give --ball X Y RADIUS")
     x, y, radius = ball

@@ -63,16 +63,22 @@ class BallPanorama:
     clipped: float
 
 
-def find_ball(picture: ByteImage) -> Circle | None:
-    """The circle that stands out as a ball's outline does, or None.
+def find_ball(*exposures: ByteImage) -> Circle | None:
+    """The circle that stands out as a ball's outline does in one of the exposures of a view, or None.
 
     Circles are judged by the gradient across them, averaged along them (Daugman 1993), which is capped so that no part
     outweighs the others, less that along them. All are tried in a small picture, and the best ones climb in finer ones.
     Where the ball mirrors a corner of the room as a circle within its outline, the largest counts.
 
     Args:
-        picture: RGB, (H, W, 3).
+        exposures: RGB, (H, W, 3).
     """
+    found = [ball for picture in exposures if (ball := _find_ball(picture)) is not None]
+    return max(found, key=lambda ball: ball[0])[1] if found else None
+
+
+def _find_ball(picture: ByteImage) -> tuple[float, Circle] | None:
+    """The circle that stands out most, and its score."""
     scale = _COARSE / max(picture.shape[:2])
     if scale * min(picture.shape[:2]) < _LOWEST:
         return None
@@ -99,7 +105,7 @@ def find_ball(picture: ByteImage) -> Circle | None:
     largest = near[peaks][near[peaks][:, 2].argmax()]
     ball = slopes.climb(largest[None])
     x, y, radius = (ball[0] / scale).tolist()
-    return x, y, radius
+    return float(score.max()), (x, y, radius)
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,7 +131,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, mesh in (("bottle", bottle), ("room", floor)):
         surfels = place_surfels(mesh, 1.0, 2500, np.random.default_rng(0))
         surfels.splats(np.zeros((len(surfels), 1, 3))).save(folder / f"{name}.ply")
-    mirrored = room.render(room.room(room.ball(type="conductor", material="none")), room.SIZE, 48)
+    mirrored = room.render(room.room(room.ball(type="conductor", material="none")), room.SIZE, 256)
     for name in ("ball", "photos/ball"):
         (folder / name).mkdir(parents=True)
         room.photographs(folder / name, mirrored, [0.01, 0.05, 0.25, 1.2], ".jpg")

@@ -326,8 +326,10 @@ class TestBall:
         columns, rows = np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5)
         disc = np.clip(0.5 + radius - np.hypot(columns - x, rows - y), 0, 1)[..., None]
         shown = np.rint(255 * encode_srgb(image / 2).clip(0, 1)).astype(np.uint8)
-        found = find_ball(np.rint(disc * shown + (1 - disc) * behind).astype(np.uint8))
+        picture = np.rint(disc * shown + (1 - disc) * behind).astype(np.uint8)
+        found = find_ball(picture)
         assert found == pytest.approx((x, y, radius), abs=0.02 * radius)  # 2 degrees of what is mirrored half-way out
+        assert find_ball(picture // 64, picture, np.full_like(picture, 255)) == found  # other exposures show it less
         assert find_ball(behind) is None
         assert find_ball(np.full((240, 240, 3), 90, np.uint8)) is None
 

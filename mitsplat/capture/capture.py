@@ -208,6 +208,22 @@ class Capture:
         """The photos that are not held out."""
         return tuple(photo for index, photo in enumerate(self.photos) if index % HELD_OUT_EVERY)
 
+    def picked(self, pick: str) -> tuple[Photo, tuple[float, float]]:
+        """The photo and the pixel that PHOTO:X,Y means.
+
+        Raises:
+            InputError: If it means none.
+        """
+        name, _, pixel = pick.rpartition(":")
+        photos = {photo.name: photo for photo in self.photos}
+        if name not in photos:
+            raise InputError(f"{pick}: a pick must be PHOTO:X,Y with a registered photo, such as {min(photos)}:400,300")
+        try:
+            x, y = map(float, pixel.split(","))
+        except ValueError:
+            raise InputError(f"{pick}: a pixel must be given as X,Y (got {pixel})") from None
+        return photos[name], (x, y)
+
     def transformed(self, matrix: npt.ArrayLike) -> Capture:
         """Cameras and points after a similarity transform (4, 4), near distances scaled; units and up are left.
 

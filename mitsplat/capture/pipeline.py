@@ -434,14 +434,8 @@ def _chosen(capture: Capture, settings: CaptureSettings) -> ChosenObject:
     views = {photo.name: View(photo.camera, photo.seen) for photo in capture.photos}
 
     def pick(spot: str) -> Pick:
-        name, _, pixel = spot.rpartition(":")
-        if name not in views:
-            raise InputError(f"{spot}: a pick must be PHOTO:X,Y with a registered photo, such as {min(views)}:400,300")
-        try:
-            x, y = map(float, pixel.split(","))
-        except ValueError:
-            raise InputError(f"{spot}: a pixel must be given as X,Y (got {pixel})") from None
-        return Pick(spot, views[name], (x, y))
+        photo, pixel = capture.picked(spot)
+        return Pick(spot, views[photo.name], pixel)
 
     picks, picks_not = ([pick(spot) for spot in spots] for spots in (settings.picks, settings.picks_not))
     return choose_object(capture.points, list(views.values()), picks=picks, picks_not=picks_not, box=settings.box)

@@ -54,6 +54,14 @@ Picks = Annotated[
 PicksNot = Annotated[
     list[str] | None, typer.Option("--pick-not", metavar="PHOTO:X,Y", help="Pixel on a thing that it is not.")
 ]
+Remove = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--remove",
+        metavar="PHOTO:X,Y",
+        help="Take the thing at this pixel, in CAPTURE/images, out of an environment; may be repeated.",
+    ),
+]
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that holds the object, in the capture's frame."),
@@ -269,6 +277,7 @@ def mesh(
     ] = None,
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
     refine: Refine = False,
+    remove: Remove = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset of SPLATS that were fitted to CAPTURE.
@@ -297,6 +306,7 @@ def mesh(
         kind=kind,
         settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
+        remove=tuple(remove or ()),
     )
     take_device(device)
     with progress_bar("steps") as progress:
@@ -329,6 +339,7 @@ def asset(
     faces: Faces = 10000,
     voxels: Voxels = 192,
     refine: Refine = False,
+    remove: Remove = None,
     device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
@@ -356,6 +367,7 @@ def asset(
             size=size,
             refine=MeshRefineSettings(seed=seed) if refine else None,
         ),
+        remove=tuple(remove or ()),
     )
     take_device(device)
     with progress_bar("steps") as progress:

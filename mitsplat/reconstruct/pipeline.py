@@ -44,6 +44,10 @@ class AssetJob:
         kind: Objects are isolated and can be dropped; environments stay whole.
         settings: How the asset is made of the splats.
         imported: A mesh to take instead of a reconstructed one.
+        remove: Things that are taken out of an environment, PHOTO:X,Y in pixels of the capture's photos.
+
+    Raises:
+        InputError: If an object's mesh cannot be refined, or things are to be removed from an object.
     """
 
     name: str
@@ -51,9 +55,12 @@ class AssetJob:
     kind: Literal["object", "environment"] = "object"
     settings: ReconstructSettings = field(default_factory=ReconstructSettings)
     imported: ImportedMesh | None = None
+    remove: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_refinable(self.settings, self.kind, self.imported)
+        if self.remove and self.kind != "environment":
+            raise InputError("things are removed from an environment only: give --kind environment, or leave it out")
 
 
 @dataclass(frozen=True)
@@ -215,7 +222,7 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
             None if matrix is None else matrix.tolist(),
             job.imported.metres_per_unit,
         ]
-    decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported]
+    decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove]
     digest = ContentHash()
     digest.add_json(decisive)
     for path in (*_files(folder, capture), splats):

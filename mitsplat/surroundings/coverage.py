@@ -19,9 +19,9 @@ CELLS = 80
 """Cells along the longer side."""
 ENOUGH = 3
 """Photos that must show a place."""
-_OFF = 0.012
+OFF = 0.012
 """Height up to which what a photo shows is the support, as a share of the typical depth."""
-_TALL = 0.6
+TALL = 0.6
 """Height up to which what is above a support stands on it, as a share of the typical depth."""
 _SMALLEST_HOLE = 0.005
 """Area of a hole that is worth a word, as a share of the support's."""
@@ -81,6 +81,14 @@ class Coverage:
             (np.asarray(cells, dtype=np.float64) + 0.5) * self.cell - np.array(self.photos.shape) * self.cell / 2
         )
 
+    def holding(self, flat: Float64Array) -> BoolArray:
+        """Which cells hold points (N, 2) of the support's frame, (X, Y)."""
+        shape = self.photos.shape
+        index = np.floor(flat / self.cell + np.array(shape) / 2).astype(np.int64)
+        held = np.zeros(shape, dtype=bool)
+        held[tuple(index[((index >= 0) & (index < shape)).all(axis=1)].T)] = True
+        return held
+
 
 def find_coverage(support: Support, views: Sequence[DepthView], points: SurfacePoints, scale: float) -> Coverage:
     """Look at a support in all photos.
@@ -103,13 +111,10 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
         height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
         # Height over the support of what the ray to a cell ends at.
         above = height * (1 - surface / depth)
-        photos += (np.abs(above) < _OFF * scale).reshape(shape)
+        photos += (np.abs(above) < OFF * scale).reshape(shape)
     local = (points.places - support.pose[:3, 3]) @ support.pose[:3, :3]
-    standing = (local[:, 2] > _OFF * scale) & (local[:, 2] < _TALL * scale)
-    index = np.floor(local[standing, :2] / cell + shape / 2).astype(np.int64)
-    index = index[((index >= 0) & (index < shape)).all(axis=1)]
-    covered = np.zeros(shape, dtype=bool)
-    covered[tuple(index.T)] = True
+    standing = (local[:, 2] > OFF * scale) & (local[:, 2] < TALL * scale)
+    covered = empty.holding(local[standing, :2])
     return Coverage(
         cell, photos, np.asarray(binary_closing(np.pad(covered, 3), np.ones((3, 3)), iterations=2)[3:-3, 3:-3])
     )

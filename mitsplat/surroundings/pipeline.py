@@ -18,18 +18,20 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.metric_frame import meeting_point
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.files import write_text
+from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.html import rgb_image
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.evaluation import VERDICT_FILE, sized_photo
+from mitsplat.reconstruct.evaluation import VERDICT_FILE, HeldOutView, show_held_out, sized_photo
 from mitsplat.reconstruct.pipeline import AssetJob, AssetResult, make_asset, make_photo_asset
 from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import ENOUGH, Coverage, Hole, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
+from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
+from mitsplat.surroundings.removal import RemovedThing, remove_thing
 from mitsplat.surroundings.supports import Support, find_supports, flattened
 
 _NEAR = 3.0
@@ -44,6 +46,8 @@ _ROUGH = 0.03
 """Height of the mesh over a support that is flattened, as a share of the typical depth."""
 _HIDDEN = 0.1
 """Largest share of the support that too few photos may show."""
+_SAME = 1.5 / 255
+"""Difference up to which a pixel shows nothing of what was removed."""
 _SMALLEST_REGION = 0.1
 """Least edge of a place that things can be dropped on [m]."""
 
@@ -112,6 +116,14 @@ def reconstruct_surroundings(
         capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
+    fitted, things = splats, list[RemovedThing]()
+    for pick in job.remove:
+        if progress is not None:
+            progress(len(things), len(job.remove), "removing things")
+        splats, thing = remove_thing(splats, pick, capture, found, points, scale)
+        things.append(thing)
+        views = depth_views(splats, [photo.camera for photo in capture.training])
+        points = surface_points(views)
     cameras = [photo.camera for photo in capture.training]
     beyond = _beyond(splats, cameras)
     imported = job.imported
@@ -141,11 +153,18 @@ def reconstruct_surroundings(
         named = [(photo.name, photo.camera) for photo in capture.training]
         holes = find_holes(found[0], coverage, splats, named)
         supports = [support.transformed(larger) for support in found]
+        filled = coverage.holding(np.concatenate([np.zeros((0, 2)), *(t.filled for t in things if t.support == 0)]))
         region = _region(coverage, found[0], factor)
         unit = "m" if made.asset.units == "metre" else "units"
         rows |= _rows(supports, coverage, holes, region, factor, unit)
         findings += _findings(coverage, holes, region, factor, unit, metric=made.asset.units == "metre")
-        sections.append(_map(found[0], coverage, splats))
+        if things:
+            rows["Removed things"] = "; ".join(_missing(thing, factor, unit) for thing in things)
+            record["removed_things"] = [
+                {"pick": t.pick, "gaussians": t.gaussians, "filled": factor**2 * t.area, "copied": t.copied}
+                for t in things
+            ]
+        sections.append(_map(coverage, filled))
         record["supports"] = [
             {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
         ]
@@ -163,7 +182,9 @@ def reconstruct_surroundings(
             "or give --scale-from"
         )
     # As the asset is rendered, not as the fit saw it.
-    shown = mean_psnr(made.held_out) if made.held_out else psnr
+    shown = psnr
+    if made.held_out:
+        shown = _psnr_beside(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
     verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
 
@@ -243,6 +264,27 @@ def _told(hole: Hole, factor: float, unit: str) -> str:
     return f"{place}: photograph it from near {hole.near}, {hole.height:.0f} degrees above it (shows {hole.shown:.0%})"
 
 
+def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
+    """What was removed and filled in, a clause."""
+    size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
+    x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
+    copied = "copies of what is around" if thing.copied > 0.99 else f"copies of what is around ({thing.copied:.0%})"
+    return (
+        f"{size} {unit} around x {x:.2f}, y {y:.2f} of surface {thing.support} ({thing.pick}), {thing.gaussians} "
+        f"Gaussians; {factor**2 * thing.area:.2g} {unit}² that it hid are invented, of {copied}"
+    )
+
+
+def _psnr_beside(after: Sequence[HeldOutView], before: Sequence[HeldOutView]) -> float:
+    """Mean PSNR [dB] of held-out photos where they show nothing that was removed."""
+    errors = []
+    for view, old in zip(after, before, strict=True):
+        same = np.abs(view.render - old.render).max(axis=2) < _SAME
+        if same.any():
+            errors.append(psnr_of(float(((view.render - view.photo)[same] ** 2).mean())))
+    return float(np.mean(errors))
+
+
 def _findings(
     coverage: Coverage, holes: Sequence[Hole], region: Region | None, factor: float, unit: str, *, metric: bool
 ) -> list[str]:
@@ -261,16 +303,18 @@ def _findings(
     return found
 
 
-def _map(support: Support, coverage: Coverage, splats: Splats) -> str:
-    """The support from above, with what is covered, free and hardly seen."""
+def _map(coverage: Coverage, filled: BoolArray) -> str:
+    """The support from above, with what is covered, free, hardly seen and filled in."""
     tint = np.full((*coverage.photos.shape, 3), 0.85)
     tint[coverage.free] = (0.55, 0.8, 0.55)
     tint[coverage.covered] = (0.35, 0.4, 0.5)
     tint[coverage.hidden] = (0.85, 0.3, 0.25)
+    tint[filled] = (0.9, 0.75, 0.3)
     picture = np.repeat(np.repeat(tint.transpose(1, 0, 2)[::-1], 5, axis=0), 5, axis=1)
+    invented = ", yellow was hidden by things that were removed and is invented" if filled.any() else ""
     note = (
         "The surface that things stand on, from above, x to the right and y up: green is free, dark is covered, red is "
-        f"in fewer than {ENOUGH} photos."
+        f"in fewer than {ENOUGH} photos{invented}."
     )
     return (
         f'<section aria-labelledby="support"><h2 id="support">Support</h2><p>{html.escape(note)}</p><figure>'

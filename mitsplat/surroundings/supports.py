@@ -23,6 +23,8 @@ _SAME = 25.0
 """Angle between the normal of a point and of a plane up to which it may belong to that [degrees]."""
 _TOLERANCE = 0.008
 """Distance from a plane up to which a point may belong to it, as a share of the typical depth."""
+_SPREADS, _LEAST = 5.0, 0.001
+"""The same once the plane is fitted: in median distances from it, and at least as a share of the typical depth."""
 _SMALLEST = 0.02
 """Share of the upward points from which a plane is looked into."""
 _MOST = 6
@@ -108,7 +110,7 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
         if plane is None or plane.share * len(rows) < _SMALLEST * total:
             break
         normal, height, spread = fit_plane(places[left], plane.normal, plane.height, _TOLERANCE * scale)
-        inside = left & (np.abs(places @ normal - height) < _TOLERANCE * scale)
+        inside = left & (np.abs(places @ normal - height) < max(_SPREADS * spread, _LEAST * scale))
         inside &= normals @ normal > np.cos(np.radians(_SAME))
         left &= np.abs(places @ normal - height) >= 2 * _TOLERANCE * scale
         if inside.any():

@@ -80,14 +80,7 @@ def cameras() -> list[Camera]:
     return found
 
 
-@pytest.fixture(scope="module")
-def splats() -> Splats:
-    return place()
-
-
-@pytest.fixture(scope="module")
-def captured(splats: Splats, tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    folder = tmp_path_factory.mktemp("photos")
+def photographed(splats: Splats, folder: Path) -> Capture:
     photos = []
     for number, view in enumerate(show_asset(splats, None, cameras())):
         file = folder / f"photo{number:02}.png"
@@ -95,6 +88,16 @@ def captured(splats: Splats, tmp_path_factory: pytest.TempPathFactory) -> Captur
         photos.append(Photo(file.name, file, view.camera, seen=np.arange(4, dtype=np.int32)))
     points = np.array([[x, y, HEIGHT] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
     return Capture(tuple(photos), points, np.full((4, 3), 128, dtype=np.uint8), units="metre", up="z")
+
+
+@pytest.fixture(scope="module")
+def splats() -> Splats:
+    return place()
+
+
+@pytest.fixture(scope="module")
+def captured(splats: Splats, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return photographed(splats, tmp_path_factory.mktemp("photos"))
 
 
 def test_the_table_is_found_with_its_edges(splats: Splats) -> None:

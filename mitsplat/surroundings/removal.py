@@ -1,0 +1,401 @@
+"""Take a thing away that stands on a support, and fill what it hid with what lies around.
+
+What goes is told by points: those that stand on the support fall into things that lie apart, and each Gaussian is of
+what the nearest point is of. No photo shows what was below. It is made of patches of the support, moved there from
+where their surroundings look most as those of the hole do (Efros and Leung 1999, by patches as Criminisi, Pérez and
+Toyama 2004), their colours made to meet these (Pérez, Gangnet and Blake 2003), and laid down as a sheet of flat
+Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, label
+from scipy.signal import fftconvolve
+from scipy.sparse import csr_array, diags_array, eye_array, kron
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import KDTree
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture
+from mitsplat.colour import encode_srgb
+from mitsplat.errors import InputError
+from mitsplat.render.layers import render_splats
+from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.splats import Splats
+from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL
+from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views
+from mitsplat.surroundings.supports import Support
+
+_CELL = 0.004
+"""Edge of the cells that a support is filled by, as a share of the typical depth."""
+_APART = 0.02
+"""Edge of the voxels by which things lie apart, as a share of the typical depth."""
+_SPARSE = 0.05
+"""Points in a voxel, as a share of the usual number, below which it is taken for free."""
+_PICKED = 3
+"""Voxels from a pick in which the thing must have a point."""
+_OVER = 3
+"""Voxels that a thing may stick out beyond its support."""
+_BESIDE = 4
+"""Voxels around a thing in which Gaussians are its own if it is nearer to them than all else."""
+_FLAT = 0.25
+"""Height up to which what photos show is the bare support, as a share of that by which it is told from things."""
+_RING = 10
+"""Width of the surroundings of a hole that patches are compared by [cells]."""
+_COMPARED = 0.5
+"""Share of these that a patch must have."""
+_PATCHES = 8
+_EDGE = 400
+"""Longest edge of the pictures that the support's colours are read from [px]."""
+_OPAQUE = 0.9
+_BORDER = cv2.BORDER_REPLICATE
+_DISC, _THICK = 0.7, 0.1
+"""Standard deviations of the sheet's Gaussians along it and across [cells]."""
+
+
+Value = TypeVar("Value", bound=np.generic)
+
+
+@dataclass(frozen=True, eq=False)
+class RemovedThing:
+    """What was taken away, in the support's frame.
+
+    Attributes:
+        pick: As it was given.
+        support: Number of the support that it stood on.
+        gaussians: Of the thing.
+        low: Least x, y and z of what photos saw of it.
+        high: Largest.
+        filled: Middles of the cells that were filled in, (N, 2).
+        area: Of these.
+        copied: Share of them that repeats other parts of the support; the rest has a plain colour.
+    """
+
+    pick: str
+    support: int
+    gaussians: int
+    low: Float64Array
+    high: Float64Array
+    filled: Float64Array
+    area: float
+    copied: float
+
+
+def remove_thing(
+    splats: Splats, pick: str, capture: Capture, supports: Sequence[Support], points: SurfacePoints, scale: float
+) -> tuple[Splats, RemovedThing]:
+    """The splats without a thing that was picked, and with what it hid filled in.
+
+    Args:
+        splats: Of the place.
+        pick: PHOTO:X,Y [px] on the thing.
+        capture: The photos, in the splats' frame.
+        supports: That things stand on.
+        points: What the training photos see.
+        scale: Their typical depth.
+
+    Raises:
+        InputError: If there is no such photo, or nothing is seen there that stands on a support.
+    """
+    number, spot = _picked(splats, pick, capture, supports, scale)
+    support = supports[number]
+    inverse: Float64Array = np.asarray(np.linalg.inv(support.pose))
+    flat = splats.transformed(inverse)
+    thing, others = _apart(points.transformed(inverse).places, spot, support, scale)
+    if thing is None:
+        raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
+    grid = _Grid.of(support, _CELL * scale)
+    cameras = [photo.camera.transformed(inverse) for photo in capture.training]
+    texture, seen = grid.look(flat, cameras, _FLAT * OFF * scale)
+    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / _CELL)
+    standing = grid.covered(others[(height > OFF * scale) & (height < top)])
+    footprint = _dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
+    parts, _ = label(~seen & ~standing)
+    hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
+    hole = _dilated(hidden & _dilated(footprint, 4 * margin), margin) & ~standing
+    gone = _of_thing(flat, thing, others, grid, footprint, hole, scale)
+    texture, copied = fill(texture, seen & ~hole & ~_dilated(standing, margin), hole)
+    # Around the hole, too, where what went was reaching to.
+    sheet = grid.sheet(texture, hole | (seen & _dilated(hole, margin))).transformed(support.pose)
+    removed = RemovedThing(
+        pick=pick,
+        support=number,
+        gaussians=int(gone.sum()),
+        low=thing.min(axis=0),
+        high=thing.max(axis=0),
+        filled=grid.middles[hole],
+        area=float(hole.sum()) * grid.cell**2,
+        copied=copied,
+    )
+    return Splats.concatenate([splats.select(~gone), sheet]), removed
+
+
+def _picked(
+    splats: Splats, pick: str, capture: Capture, supports: Sequence[Support], scale: float
+) -> tuple[int, Float64Array]:
+    """The support on which what is seen at a pixel stands, and the place (3,) in its frame."""
+    photo, pixel = capture.picked(pick)
+    camera = photo.camera
+    ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
+    (view,) = depth_views(splats, [camera])
+    depth = float(view.look(camera.centre + (scale * ray @ camera.world_from_camera[:3, :3].T)[None])[1][0])
+    spot = camera.centre + depth * ray @ camera.world_from_camera[:3, :3].T
+    found, lowest = -1, np.inf
+    for number, support in enumerate(supports):
+        local = (spot - support.pose[:3, 3]) @ support.pose[:3, :3]
+        above = OFF * scale < local[2] < min(lowest, TALL * scale)
+        if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
+            found, lowest = number, float(local[2])
+    if found < 0:
+        raise InputError(f"{pick}: what is to be removed must stand on a level surface that was found")
+    support = supports[found]
+    return found, np.asarray((spot - support.pose[:3, 3]) @ support.pose[:3, :3])
+
+
+def _apart(
+    points: Float64Array, spot: Float64Array, support: Support, scale: float
+) -> tuple[Float64Array | None, Float64Array]:
+    """Points of the thing at a place, None if there are none, and others without stray ones, in the support's frame.
+
+    What sticks out beyond the support by some voxels goes along.
+    """
+    over = (np.abs(points[:, :2]) <= np.array(support.size) / 2).all(axis=1)
+    high = (points[:, 2] > OFF * scale) & (points[:, 2] < TALL * scale)
+    standing = np.flatnonzero(over & high)
+    if not len(standing):
+        return None, points
+    edge = _APART * scale
+    voxel = np.floor(points[standing] / edge).astype(np.int64)
+    low = voxel.min(axis=0) - 1
+    voxel -= low
+    count: Int64Array = np.zeros(voxel.max(axis=0) + 2, dtype=np.int64)
+    np.add.at(count, tuple(voxel.T), 1)
+    parts = np.asarray(label(count > _SPARSE * np.median(count[count > 0]), np.ones((3, 3, 3)))[0])
+    near = np.argwhere(parts > 0)
+    gaps = np.linalg.norm((near + low + 0.5) * edge - spot, axis=1)
+    if not len(near) or gaps.min() > _PICKED * edge:
+        return None, points
+    part = parts[tuple(voxel.T)]
+    own = part == parts[tuple(near[gaps.argmin()])]
+    thing = points[standing[own]]
+    beside = np.flatnonzero(~over & high)
+    away = KDTree(_thinned(thing, 0.5 * edge)).query(points[beside], distance_upper_bound=_OVER * edge)[0]
+    beside = beside[np.isfinite(away)]
+    gone = np.concatenate([standing[own | (part == 0)], beside])
+    return np.concatenate([thing, points[beside]]), np.delete(points, gone, axis=0)
+
+
+def _of_thing(
+    splats: Splats,
+    thing: Float64Array,
+    others: Float64Array,
+    grid: _Grid,
+    footprint: BoolArray,
+    hole: BoolArray,
+    scale: float,
+) -> BoolArray:
+    """Which Gaussians (N,) go with a thing: its surface, what is inside of it, and what fills the hole by guess."""
+    reach, means = _APART * scale, splats.means.astype(np.float64)
+    beside = _BESIDE * reach
+    low, high = thing.min(axis=0) - beside, thing.max(axis=0) + beside
+    rows = np.flatnonzero(((means > low) & (means < high)).all(axis=1))
+    around = others[((others > low - beside) & (others < high + beside)).all(axis=1)]
+    surface, around = _thinned(thing, 0.25 * reach), _thinned(around, 0.25 * reach)
+    both = np.concatenate([surface, around])
+    nearest = KDTree(both).query(means[rows])[1]
+    own, bare = nearest < len(surface), both[nearest, 2] < OFF * scale
+    cells = grid.cells(means[rows, :2])
+    height = means[rows, 2]
+    floor, top = OFF * scale, float(thing[:, 2].max()) + 0.5 * reach
+    inside = np.asarray((cells >= 0).all(axis=1))
+    cells = np.where(inside[:, None], cells, 0)
+    over, in_hole = (inside & part[tuple(cells.T)] for part in (footprint, hole))
+    goes = (own | (over & bare & (height < top))) & (height > floor)
+    goes |= in_hole & (np.abs(height) <= floor)
+    gone = np.zeros(len(means), dtype=bool)
+    gone[rows[goes]] = True
+    return gone
+
+
+def _thinned(points: Float64Array, edge: float) -> Float64Array:
+    """One of the points (N, 3) in each cube of an edge."""
+    _, first = np.unique(np.floor(points / edge).astype(np.int64), axis=0, return_index=True)
+    return points[first]
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Cells of a support in its frame, first axis x.
+
+    Attributes:
+        cell: Their edge.
+        middles: Where they are, (X, Y, 2).
+    """
+
+    cell: float
+    middles: Float64Array
+
+    @classmethod
+    def of(cls, support: Support, cell: float) -> _Grid:
+        sides = [(np.arange(max(1, int(edge / cell))) + 0.5) * cell for edge in support.size]
+        x, y = (side - side.mean() for side in sides)
+        return cls(cell, np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
+
+    def cells(self, flat: Float64Array) -> Int64Array:
+        """Indices of the cells at places (N, 2), (N, 2); -1 off the support."""
+        index = np.floor((flat - self.middles[0, 0]) / self.cell + 0.5).astype(np.int64)
+        outside = ((index < 0) | (index >= self.middles.shape[:2])).any(axis=1)
+        return np.where(outside[:, None], -1, index)
+
+    def covered(self, points: Float64Array) -> BoolArray:
+        """Cells that have points (N, 2 or 3) in or over them, gaps between samples closed."""
+        covered = np.zeros(self.middles.shape[:2], dtype=bool)
+        cells = self.cells(points[:, :2])
+        covered[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
+        closed = np.asarray(binary_closing(np.pad(covered, 4), np.ones((3, 3)), iterations=3))
+        return closed[4:-4, 4:-4]
+
+    def outline(self, points: Float64Array) -> BoolArray:
+        """The same of one thing, without holes."""
+        return np.asarray(binary_fill_holes(self.covered(points)))
+
+    def look(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
+        """Display-encoded colours (X, Y, 3) that cameras see of the bare support, and where enough of them do.
+
+        Cameras that look from near and steeply have more of a say.
+        """
+        shape = self.middles.shape[:2]
+        places = np.concatenate([self.middles, np.zeros((*shape, 1))], axis=2).reshape(-1, 3)
+        colours, weights, count = np.zeros((*shape, 3)), np.full(shape, 1e-12), np.zeros(shape, dtype=np.int64)
+        for camera in cameras:
+            view, shown = _seen_by(splats, camera)
+            depth, surface = view.look(places)
+            bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # NaN is not
+            towards = places - view.camera.centre
+            weight = np.where(bare, -towards[:, 2] / np.linalg.norm(towards, axis=1) ** 3, 0.0).reshape(shape)
+            x, y = np.nan_to_num(view.camera.project(places)[0] - 0.5).astype(np.float32).T.reshape(2, *shape)
+            colours += weight[..., None] * np.asarray(cv2.remap(shown, x, y, cv2.INTER_LINEAR, borderMode=_BORDER))
+            weights += weight
+            count += bare.reshape(shape)
+        return colours / weights[..., None], np.asarray(count >= ENOUGH)
+
+    def sheet(self, texture: Float64Array, cells: BoolArray) -> Splats:
+        """Flat Gaussians of a texture's display-encoded colours (X, Y, 3) in some cells."""
+        flat = self.middles[cells]
+        count = len(flat)
+        return Splats(
+            means=np.column_stack([flat, np.zeros(count)]).astype(np.float32),
+            quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (count, 1)),
+            scales=np.tile(np.array([_DISC, _DISC, _THICK], dtype=np.float32) * np.float32(self.cell), (count, 1)),
+            opacities=np.full(count, 0.95, dtype=np.float32),
+            sh=((texture[cells] - 0.5) / SH_C0)[:, None].astype(np.float32),
+        )
+
+
+def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
+    """Depth and display-encoded colours from a camera, the longest edge :data:`_EDGE` px at most."""
+    scale = min(1.0, _EDGE / max(camera.width, camera.height))
+    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    layers = render_splats(splats, small, quality="balanced")
+    alpha = np.maximum(layers.alpha, 1e-6)[..., None]
+    depth = np.where(layers.alpha > _OPAQUE, layers.depth, np.inf).astype(np.float32)
+    return DepthView(small, depth), np.asarray(encode_srgb(layers.captured / alpha), dtype=np.float32)
+
+
+def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Float64Array, float]:
+    """A texture (X, Y, 3) whose hole is filled with moved parts of what is known, and the share of it that is these.
+
+    Where no part of what is known reaches, its place is filled without bends from the border.
+    """
+    texture, known, left = np.where(known[..., None], texture, 0.0), known.copy(), hole.copy()
+    source = known.copy()
+    for _ in range(_PATCHES):
+        if not left.any() or not source.any():
+            break
+        shift = _best_shift(texture, known, source, left)
+        if shift is None:
+            break
+        moved, there = _shifted(texture, shift), _shifted(source, shift)
+        patch = left & there
+        border = known & there & _dilated(patch, 3)
+        gap = np.where(border[..., None], texture - moved, 0.0)
+        texture = np.where(patch[..., None], moved + _membrane(gap, border, patch), texture)
+        known, left = known | patch, left & ~patch
+    copied = 1 - float(left.sum()) / max(int(hole.sum()), 1)
+    if left.any() and known.any():
+        border = known & _dilated(left, 3)
+        texture = np.where(left[..., None], _membrane(texture, border, left), texture)
+    return texture.clip(0, 1), copied
+
+
+def _best_shift(texture: Float64Array, known: BoolArray, source: BoolArray, hole: BoolArray) -> tuple[int, int] | None:
+    """The move by which what is known covers most of a hole and looks there as its surroundings do, up to a shade."""
+    ring = (known & _dilated(hole, _RING)).astype(np.float64)
+    valid, target = source.astype(np.float64), texture * ring[..., None]
+    there = texture * valid[..., None]
+
+    def correlated(one: Float64Array, other: Float64Array) -> Float64Array:
+        """Sum over places p of one(p) other(p + shift), the middle of the result being no shift."""
+        return np.asarray(fftconvolve(other, one[::-1, ::-1], mode="full"))
+
+    covers = correlated(hole.astype(np.float64), valid)
+    count = np.maximum(correlated(ring, valid), 1e-9)
+    error = np.zeros_like(count)
+    for k in range(3):
+        difference = correlated(target[..., k], valid) - correlated(ring, there[..., k])
+        squares = correlated(target[..., k] ** 2, valid) + correlated(ring, there[..., k] ** 2)
+        error += (squares - 2 * correlated(target[..., k], there[..., k])) / count - (difference / count) ** 2
+    usable = (count > _COMPARED * ring.sum()) & (covers > 0.5)
+    if not usable.any():
+        return None
+    most = covers[usable].max()
+    usable &= covers >= 0.95 * most
+    place = np.unravel_index(int(np.where(usable, error, np.inf).argmin()), error.shape)
+    return int(place[0]) - texture.shape[0] + 1, int(place[1]) - texture.shape[1] + 1
+
+
+def _shifted(image: npt.NDArray[Value], shift: tuple[int, int]) -> npt.NDArray[Value]:
+    """image(p + shift), zero where that is beyond it."""
+    result = np.zeros_like(image)
+    to, of = [], []
+    for size, step in zip(image.shape, shift, strict=False):
+        to.append(slice(max(0, -step), min(size, size - step)))
+        of.append(slice(max(0, step), min(size, size + step)))
+    result[tuple(to)] = image[tuple(of)]
+    return result
+
+
+def _membrane(values: Float64Array, border: BoolArray, inside: BoolArray) -> Float64Array:
+    """Values (X, Y, 3) inside that continue those of a border without bends: Laplace's equation.
+
+    It is solved on the border as well, whose values it follows only on the whole, as those of single cells are noise;
+    and it is level across all other edges.
+    """
+    cells = border | inside
+    x, y = (slice(int(rows.min()), int(rows.max()) + 1) for rows in np.nonzero(cells))
+    cells, fixed, given = cells[x, y], border[x, y], values[x, y]
+    differ = [diags_array([-1.0, 1.0], offsets=[0, 1], shape=(max(n - 1, 0), n)) for n in cells.shape]
+    across, down = kron(differ[0], eye_array(cells.shape[1])), kron(eye_array(cells.shape[0]), differ[1])
+    own = cells.ravel().astype(np.float64)
+    rows = [csr_array(step) for step in (across, down)]
+    kept = [row[np.asarray(abs(row) @ own) > 1.5] for row in rows]
+    laplace = sum((row.T @ row for row in kept), start=csr_array((own.size, own.size)))
+    weight = np.where(fixed, 1.0, 0.0).ravel()
+    system = laplace + diags_array(weight + np.where(own > 0, 1e-9, 1.0))
+    solved = spsolve(csr_array(system).tocsc(), weight[:, None] * given.reshape(-1, 3))
+    result = np.zeros_like(values)
+    result[x, y] = np.where(inside[x, y][..., None], solved.reshape(given.shape), 0.0)
+    return result
+
+
+def _dilated(cells: BoolArray, steps: int) -> BoolArray:
+    """Cells within so many of those given."""
+    return np.asarray(distance_transform_edt(~cells) <= steps) if cells.any() else cells

@@ -1,0 +1,192 @@
+"""Things that are taken out of a place: what goes, what stays, and what is put where nobody could see."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.asset import Asset
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture
+from mitsplat.errors import InputError
+from mitsplat.reconstruct.evaluation import show_asset
+from mitsplat.reconstruct.pipeline import AssetJob
+from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.splats import Splats
+from mitsplat.surroundings import make_surroundings
+from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.removal import fill, remove_thing
+from mitsplat.surroundings.supports import find_supports
+from tests.surroundings.test_surroundings import (
+    BOX,
+    HEIGHT,
+    SMALL,
+    TABLE,
+    UP,
+    cameras,
+    photographed,
+    place,
+    placed,
+    sheet,
+)
+
+CUBE = 0.1
+"""Edge of a second box [m], which stands at the place of :data:`BESIDE`."""
+BESIDE = (-0.2, 0.1)
+DEPTH = 0.9
+
+
+def cube() -> Splats:
+    x, y = BESIDE
+    sides = [
+        placed(sheet((CUBE, CUBE), 0.01, 11), (x, y, HEIGHT + CUBE)),
+        *(placed(sheet((CUBE, CUBE), 0.01, 12), (x + s * CUBE / 2, y, HEIGHT + CUBE / 2), 0) for s in (-1, 1)),
+        *(placed(sheet((CUBE, CUBE), 0.01, 13), (x, y + s * CUBE / 2, HEIGHT + CUBE / 2), 1) for s in (-1, 1)),
+    ]
+    return Splats.concatenate(sides)
+
+
+def shaded(splats: Splats) -> Splats:
+    """The splats with a colour that changes evenly with x and y."""
+    colour = np.stack(
+        [0.5 + 0.3 * splats.means[:, 0], 0.5 + 0.4 * splats.means[:, 1], np.full(len(splats), 0.5)], axis=1
+    )
+    return replace(splats, sh=((colour - 0.5) / SH_C0)[:, None].astype(np.float32))
+
+
+def pick(photo: int, spot: tuple[float, float, float]) -> str:
+    x, y = cameras()[photo].project(np.array([spot]))[0][0]
+    return f"photo{photo:02}.png:{x:.1f},{y:.1f}"
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return photographed(Splats.concatenate([place(), cube()]), tmp_path_factory.mktemp("photos"))
+
+
+def removed(splats: Splats, capture: Capture, what: str) -> Splats:
+    points = surface_points(depth_views(splats, [photo.camera for photo in capture.training]))
+    return remove_thing(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
+
+
+def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -> BoolArray:
+    """Which Gaussians are above the table in a rectangle."""
+    inside = ((splats.means[:, :2] > low) & (splats.means[:, :2] < high)).all(axis=1)
+    return np.asarray(inside & (splats.means[:, 2] > HEIGHT + 0.012))
+
+
+def test_one_thing_goes_and_the_other_stays(captured: Capture) -> None:
+    bare = shaded(place())
+    bare = bare.select(bare.means[:, 2] < HEIGHT + 1e-3)
+    box = place().select(place().means[:, 2] > HEIGHT + 1e-3)
+    whole = Splats.concatenate([bare, box, cube()])
+    left = removed(whole, captured, pick(12, (BESIDE[0], BESIDE[1], HEIGHT + CUBE)))
+    around = np.array(BESIDE)
+    assert not above(left, tuple(around - 0.1), tuple(around + 0.1)).any()
+    corner = (TABLE[0] / 2 - BOX[0] - 0.02, TABLE[1] / 2 - BOX[1] - 0.02)
+    assert above(left, corner, (1, 1)).sum() == above(whole, corner, (1, 1)).sum() > 0.9 * len(box)
+    below = np.abs(left.means[:, 2] - HEIGHT + 0.8) < 0.01
+    assert below.sum() == (np.abs(whole.means[:, 2] - HEIGHT + 0.8) < 0.01).sum()  # the floor
+    from_near = Camera.look_at((-0.2, -0.3, 0.6), (*BESIDE, HEIGHT), width=160, height=120, fov_x=40)
+    for camera in (cameras()[4], cameras()[12], from_near):
+        (shown,), (true,) = (show_asset(splats, None, [camera]) for splats in (left, Splats.concatenate([bare, box])))
+        assert np.abs(shown.picture - true.picture).max() < 0.03
+        assert np.abs(shown.alpha - true.alpha).max() < 0.05
+
+
+def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
+    splats = Splats.concatenate([place(), cube()])
+    for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)):  # on the table, on the floor
+        with pytest.raises(InputError, match=r"photo05\.png:.*: what is to be removed must stand on a level surface"):
+            removed(splats, captured, pick(5, spot))
+    with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y with a registered photo"):
+        removed(splats, captured, "none.png:3,4")
+    with pytest.raises(InputError, match=r"a pixel must be given as X,Y \(got 3\)"):
+        removed(splats, captured, "photo05.png:3")
+    with pytest.raises(InputError, match="removed from an environment only"):
+        AssetJob(name="mug", remove=("photo05.png:3,4",))
+
+
+def test_an_environment_says_what_was_removed(captured: Capture, tmp_path: Path) -> None:
+    captured.save(tmp_path / "capture")
+    (tmp_path / "fit").mkdir()
+    Splats.concatenate([place(), cube()]).save(tmp_path / "fit" / "splats.ply")
+    (tmp_path / "fit" / "fit.json").write_text('{"psnr": 31.5}')
+    what = pick(12, (*BESIDE, HEIGHT + CUBE))
+    job = AssetJob(name="cell", kind="environment", settings=SMALL, remove=(what,))
+    done = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", job)
+    size = done.verdict.rows["Removed things"].split(" m around x -0.")[0]
+    assert [float(edge) for edge in size.split(" x ")] == pytest.approx([CUBE, CUBE, CUBE], abs=0.015)
+    assert what in done.verdict.rows["Removed things"] and "are invented" in done.verdict.rows["Removed things"]
+    assert "was hidden by things that were removed" in (tmp_path / "cell" / "report.html").read_text()
+    (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_things"]
+    assert record["pick"] == what and record["filled"] == pytest.approx(0.015, abs=0.006) and record["copied"] == 1
+    assert done.verdict.psnr is not None and done.verdict.psnr > 35  # photos show the thing: that is left out
+    asset = Asset.load(tmp_path / "cell")
+    assert asset.mesh is not None
+    near = np.linalg.norm(asset.mesh.vertices[:, :2] - BESIDE, axis=1) < 0.08
+    level = asset.mesh.vertices[near & (np.abs(asset.mesh.vertices[:, 2]) < 0.5), 2]
+    assert len(level) and np.abs(level).max() < 0.01
+    again = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", job)
+    assert again.kept
+    other = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", replace(job, remove=()))
+    assert not other.kept and "Removed things" not in other.verdict.rows
+
+
+class TestFill:
+    """Textures of 60 x 50 cells with a hole of 14 x 12."""
+
+    @staticmethod
+    def hole() -> BoolArray:
+        hole = np.zeros((60, 50), dtype=bool)
+        hole[24:38, 20:32] = True
+        return hole
+
+    @staticmethod
+    def filled(texture: Float64Array, known: BoolArray | None = None) -> tuple[Float64Array, float]:
+        hole = TestFill.hole()
+        broken = np.where(hole[..., None], 7.0, texture)
+        result, copied = fill(broken, ~hole if known is None else known & ~hole, hole)
+        outside = ~hole if known is None else known & ~hole
+        assert (result[outside] == broken[outside]).all()
+        return result, copied
+
+    def test_a_plain_colour_stays(self) -> None:
+        texture = np.broadcast_to([0.2, 0.5, 0.7], (60, 50, 3))
+        result, copied = self.filled(texture)
+        np.testing.assert_allclose(result, texture, atol=1e-6)
+        assert copied == 1
+
+    def test_a_slope_goes_on(self) -> None:
+        x, y = np.mgrid[0:60, 0:50] / 60
+        texture = np.stack([0.2 + 0.5 * x, 0.8 - 0.4 * y, 0.3 + 0.3 * x * y], axis=-1)
+        np.testing.assert_allclose(self.filled(texture)[0], texture, atol=0.01)
+
+    def test_a_pattern_goes_on_in_step(self) -> None:
+        x, y = np.mgrid[0:60, 0:50]
+        pattern = 0.5 + 0.2 * np.sin(2 * np.pi * x / 7) * np.cos(2 * np.pi * y / 5) + 0.002 * x
+        texture = np.repeat(pattern[..., None], 3, axis=2)
+        result, copied = self.filled(texture)
+        assert copied == 1
+        np.testing.assert_allclose(result, texture, atol=0.02)
+
+    def test_where_nothing_is_large_enough_it_is_plain(self) -> None:
+        """A frame of three cells around the hole is all that is known."""
+        hole = self.hole()
+        known = np.zeros_like(hole)
+        known[21:41, 17:35] = True
+        x, _ = np.mgrid[0:60, 0:50] / 60
+        texture = np.repeat((0.2 + 0.5 * x)[..., None], 3, axis=2)
+        result, copied = self.filled(texture, known & ~hole)
+        assert copied < 1
+        np.testing.assert_allclose(result[hole], texture[hole], atol=0.02)
+
+    def test_where_nothing_is_known_nothing_breaks(self) -> None:
+        hole = self.hole()
+        result, copied = fill(np.full((60, 50, 3), 0.4), np.zeros_like(hole), hole)
+        assert copied == 0 and np.isfinite(result).all()

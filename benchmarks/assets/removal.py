@@ -27,6 +27,7 @@ from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
+from mitsplat.files import write_text
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.reconstruct.evaluation import VERDICT_FILE, show_held_out
 from mitsplat.reconstruct.pipeline import AssetJob
@@ -75,15 +76,17 @@ def measure(args: argparse.Namespace) -> int:
     gains = exposures(len(views))
     numbers = [int(photo.name.removeprefix("photo").removesuffix(".png")) for photo in chosen]
     folder, made = args.out / "removed", {}
-    shutil.rmtree(folder, ignore_errors=True)
+    traced = folder / "photos.json"
+    if not (traced.exists() and json.loads(traced.read_text()) == [args.samples, numbers]):
+        shutil.rmtree(folder, ignore_errors=True)
     empty = {name: thing for name, thing in room().items() if not name.startswith("thing")}
     for what, scene in (("with", room()), ("without", empty)):
-        photograph(
-            scene, [truth[photo.name] for photo in chosen], folder / what,
-            samples=args.samples, noise=0.0, gains=gains[numbers],
-        )  # fmt: skip
+        if not traced.exists():
+            cameras = [truth[photo.name] for photo in chosen]
+            photograph(scene, cameras, folder / what, samples=args.samples, noise=0.0, gains=gains[numbers])
         files = sorted((folder / what).iterdir())
         made[what] = [replace(photo, file=file) for photo, file in zip(chosen, files, strict=True)]
+    write_text(traced, json.dumps([args.samples, numbers]))
     spots = picks(capture, truth)
     job = AssetJob(name="room", kind="environment", remove=tuple(spots))
     done = make_surroundings(args.out / "cell" / "capture", args.out / "cell" / "fit", args.out / "cleared", job)

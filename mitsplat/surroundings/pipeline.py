@@ -31,7 +31,7 @@ from mitsplat.surroundings.coverage import ENOUGH, Coverage, Hole, find_coverage
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
-from mitsplat.surroundings.removal import RemovedThing, remove_thing
+from mitsplat.surroundings.removal import RemovedThing, remove_things
 from mitsplat.surroundings.supports import Support, find_supports, flattened
 
 _NEAR = 3.0
@@ -116,15 +116,12 @@ def reconstruct_surroundings(
         capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
-    fitted, things = splats, list[RemovedThing]()
-    for pick in job.remove:
-        if progress is not None:
-            progress(len(things), len(job.remove), "removing things")
-        splats, thing = remove_thing(splats, pick, capture, found, points, scale)
-        things.append(thing)
-        views = depth_views(splats, [photo.camera for photo in capture.training])
-        points = surface_points(views)
     cameras = [photo.camera for photo in capture.training]
+    fitted, things = splats, list[RemovedThing]()
+    if job.remove:
+        splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
+        views = depth_views(splats, cameras)
+        points = surface_points(views)
     beyond = _beyond(splats, cameras)
     imported = job.imported
     if imported is None:

@@ -27,6 +27,7 @@ from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
 from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
+from mitsplat.progress import Progress
 from mitsplat.render.layers import render_splats
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
@@ -89,42 +90,84 @@ class RemovedThing:
     copied: float
 
 
-def remove_thing(
-    splats: Splats, pick: str, capture: Capture, supports: Sequence[Support], points: SurfacePoints, scale: float
-) -> tuple[Splats, RemovedThing]:
-    """The splats without a thing that was picked, and with what it hid filled in.
+def remove_things(
+    splats: Splats,
+    picks: Sequence[str],
+    capture: Capture,
+    supports: Sequence[Support],
+    points: SurfacePoints,
+    scale: float,
+    progress: Progress | None = None,
+) -> tuple[Splats, list[RemovedThing]]:
+    """The splats without things that were picked, one after the other, and with what they hid filled in.
 
     Args:
         splats: Of the place.
-        pick: PHOTO:X,Y [px] on the thing.
+        picks: PHOTO:X,Y [px] on each thing.
         capture: The photos, in the splats' frame.
         supports: That things stand on.
         points: What the training photos see.
         scale: Their typical depth.
+        progress: Told after every thing.
 
     Raises:
         InputError: If there is no such photo, or nothing is seen there that stands on a support.
     """
-    number, spot = _picked(splats, pick, capture, supports, scale)
-    support = supports[number]
-    inverse: Float64Array = np.asarray(np.linalg.inv(support.pose))
-    flat = splats.transformed(inverse)
-    thing, others = _apart(points.transformed(inverse).places, spot, support, scale)
+    places, grounds, removed = points.places, dict[int, _Ground](), list[RemovedThing]()
+    for pick in picks:
+        number, spot = _picked(splats, pick, capture, supports, scale)
+        if number not in grounds:
+            grounds[number] = _Ground.of(supports[number], splats, capture, scale)
+        splats, places, thing = _remove(splats, pick, number, spot, grounds[number], places, scale)
+        removed.append(thing)
+        if progress is not None:
+            progress(len(removed), len(picks), "removing things")
+    return splats, removed
+
+
+@dataclass(eq=False)
+class _Ground:
+    """A support as photos see it, which changes as things are taken off.
+
+    Attributes:
+        support: Where.
+        grid: Its cells.
+        texture: Their display-encoded colours, (X, Y, 3).
+        seen: Those that enough photos show bare, or that are filled in, (X, Y).
+    """
+
+    support: Support
+    grid: _Grid
+    texture: Float64Array
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, support: Support, splats: Splats, capture: Capture, scale: float) -> _Ground:
+        inverse, grid = np.linalg.inv(support.pose), _Grid.of(support, _CELL * scale)
+        cameras = [photo.camera.transformed(inverse) for photo in capture.training]
+        return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _FLAT * OFF * scale))
+
+
+def _remove(
+    splats: Splats, pick: str, number: int, spot: Float64Array, ground: _Ground, places: Float64Array, scale: float
+) -> tuple[Splats, Float64Array, RemovedThing]:
+    """Splats and points (N, 3) without the thing at a place of a support, and what it was."""
+    support, grid = ground.support, ground.grid
+    inverse = np.asarray(np.linalg.inv(support.pose))
+    thing, others = _apart(places @ inverse[:3, :3].T + inverse[:3, 3], spot, support, scale)
     if thing is None:
         raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
-    grid = _Grid.of(support, _CELL * scale)
-    cameras = [photo.camera.transformed(inverse) for photo in capture.training]
-    texture, seen = grid.look(flat, cameras, _FLAT * OFF * scale)
     height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / _CELL)
     standing = grid.covered(others[(height > OFF * scale) & (height < top)])
     footprint = _dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
-    parts, _ = label(~seen & ~standing)
+    parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
     hole = _dilated(hidden & _dilated(footprint, 4 * margin), margin) & ~standing
-    gone = _of_thing(flat, thing, others, grid, footprint, hole, scale)
-    texture, copied = fill(texture, seen & ~hole & ~_dilated(standing, margin), hole)
+    gone = _of_thing(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
+    ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~_dilated(standing, margin), hole)
+    ground.seen = ground.seen | hole
     # Around the hole, too, where what went was reaching to.
-    sheet = grid.sheet(texture, hole | (seen & _dilated(hole, margin))).transformed(support.pose)
+    sheet = grid.sheet(ground.texture, ground.seen & _dilated(hole, margin)).transformed(support.pose)
     removed = RemovedThing(
         pick=pick,
         support=number,
@@ -135,7 +178,8 @@ def remove_thing(
         area=float(hole.sum()) * grid.cell**2,
         copied=copied,
     )
-    return Splats.concatenate([splats.select(~gone), sheet]), removed
+    left = others @ support.pose[:3, :3].T + support.pose[:3, 3]
+    return Splats.concatenate([splats.select(~gone), sheet]), left, removed
 
 
 def _picked(
@@ -315,8 +359,8 @@ def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Floa
 
     Where no part of what is known reaches, its place is filled without bends from the border.
     """
-    texture, known, left = np.where(known[..., None], texture, 0.0), known.copy(), hole.copy()
-    source = known.copy()
+    given, source, left = texture, known, hole
+    texture = np.where(known[..., None], texture, 0.0)
     for _ in range(_PATCHES):
         if not left.any() or not source.any():
             break
@@ -333,7 +377,7 @@ def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Floa
     if left.any() and known.any():
         border = known & _dilated(left, 3)
         texture = np.where(left[..., None], _membrane(texture, border, left), texture)
-    return texture.clip(0, 1), copied
+    return np.where(hole[..., None], texture.clip(0, 1), given), copied
 
 
 def _best_shift(texture: Float64Array, known: BoolArray, source: BoolArray, hole: BoolArray) -> tuple[int, int] | None:

@@ -20,7 +20,7 @@ from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.removal import fill, remove_thing
+from mitsplat.surroundings.removal import fill, remove_things
 from mitsplat.surroundings.supports import find_supports
 from tests.surroundings.test_surroundings import (
     BOX,
@@ -69,9 +69,9 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return photographed(Splats.concatenate([place(), cube()]), tmp_path_factory.mktemp("photos"))
 
 
-def removed(splats: Splats, capture: Capture, what: str) -> Splats:
+def removed(splats: Splats, capture: Capture, *what: str) -> Splats:
     points = surface_points(depth_views(splats, [photo.camera for photo in capture.training]))
-    return remove_thing(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
+    return remove_things(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
 
 
 def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -> BoolArray:
@@ -97,6 +97,23 @@ def test_one_thing_goes_and_the_other_stays(captured: Capture) -> None:
         (shown,), (true,) = (show_asset(splats, None, [camera]) for splats in (left, Splats.concatenate([bare, box])))
         assert np.abs(shown.picture - true.picture).max() < 0.03
         assert np.abs(shown.alpha - true.alpha).max() < 0.05
+
+
+def test_all_things_go(captured: Capture) -> None:
+    """From a table of an even slope, whose colour goes on below them."""
+    bare = shaded(place())
+    bare = bare.select(bare.means[:, 2] < HEIGHT + 1e-3)
+    box = place().select(place().means[:, 2] > HEIGHT + 1e-3)
+    on_box = (TABLE[0] / 2 - 0.7 * BOX[0], TABLE[1] / 2 - BOX[1], HEIGHT + BOX[2] / 2)
+    left = removed(
+        Splats.concatenate([bare, box, cube()]), captured, pick(12, (*BESIDE, HEIGHT + CUBE)), pick(8, on_box)
+    )
+    assert not (left.means[:, 2] > HEIGHT + 0.03).any()
+    for camera in cameras()[::6]:
+        (shown,), (true,) = (show_asset(splats, None, [camera]) for splats in (left, bare))
+        inside = true.alpha > 0.99
+        assert np.abs(shown.picture - true.picture)[inside].max() < 0.05
+        assert shown.alpha[inside].min() > 0.9
 
 
 def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:

@@ -45,7 +45,6 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
-from mitsplat.bake.path_tracing import trace_radiance
 from mitsplat.camera import Camera
 from mitsplat.colour import LUMINANCE, encode_srgb
 from mitsplat.frames.camera_response import light_image
@@ -58,6 +57,7 @@ from mitsplat.render.layers import (
     make_splats_shape,
     render_layers,
 )
+from mitsplat.render.path_tracing import trace_radiance
 from mitsplat.spec.image import Composite
 from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec, SpotLight
 from scenes.build import materials as m

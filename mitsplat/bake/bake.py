@@ -23,7 +23,6 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.bake.materials import Finish
 from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts, world_from_file
-from mitsplat.bake.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
 from mitsplat.camera import Camera, spiral
@@ -33,6 +32,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
 from mitsplat.progress import Progress
 from mitsplat.render.layers import ensure_variant
+from mitsplat.render.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
 from mitsplat.spec.lights import LightSpec
 from mitsplat.spherical_harmonics import sh_basis
 from mitsplat.surfels import Surfels, place_surfels

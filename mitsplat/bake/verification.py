@@ -15,12 +15,12 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.color import uv_to_color
 
 from mitsplat.arrays import Float64Array
-from mitsplat.bake.path_tracing import render_mesh
 from mitsplat.camera import Camera
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.progress import Progress
 from mitsplat.render.layers import render_splats
+from mitsplat.render.path_tracing import render_mesh
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats
 

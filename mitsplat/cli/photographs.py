@@ -62,6 +62,13 @@ Remove = Annotated[
         help="Take the thing at this pixel, in CAPTURE/images, out of an environment; may be repeated.",
     ),
 ]
+Delight = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="LIGHTS",
+        help="File of the lights that the object was photographed in, which its colours are freed of.",
+    ),
+]
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that holds the object, in the capture's frame."),
@@ -278,6 +285,7 @@ def mesh(
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
     refine: Refine = False,
     remove: Remove = None,
+    delight: Delight = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset of SPLATS that were fitted to CAPTURE.
@@ -307,6 +315,7 @@ def mesh(
         settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
         remove=tuple(remove or ()),
+        delight=delight,
     )
     take_device(device)
     with progress_bar("steps") as progress:
@@ -340,6 +349,7 @@ def asset(
     voxels: Voxels = 192,
     refine: Refine = False,
     remove: Remove = None,
+    delight: Delight = None,
     device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
@@ -368,6 +378,7 @@ def asset(
             refine=MeshRefineSettings(seed=seed) if refine else None,
         ),
         remove=tuple(remove or ()),
+        delight=delight,
     )
     take_device(device)
     with progress_bar("steps") as progress:

@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline import CaptureSettings, capture_photos
 from mitsplat.content_hash import ContentHash
@@ -21,6 +23,7 @@ from mitsplat.fit.folder import FIT_FILE, read_record
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.html import REPORT_FILE
 from mitsplat.progress import Progress
+from mitsplat.reconstruct.delight import LightFile, delight
 from mitsplat.reconstruct.evaluation import VERDICT_FILE, Verdict
 from mitsplat.reconstruct.reconstruct import (
     ImportedMesh,
@@ -45,9 +48,11 @@ class AssetJob:
         settings: How the asset is made of the splats.
         imported: A mesh to take instead of a reconstructed one.
         remove: Things that are taken out of an environment, PHOTO:X,Y in pixels of the capture's photos.
+        delight: File of the lights that an object was photographed in, which its colours are freed of.
 
     Raises:
-        InputError: If an object's mesh cannot be refined, or things are to be removed from an object.
+        InputError: If an object's mesh cannot be refined, things are to be removed from an object, or an environment
+            is to be freed of light.
     """
 
     name: str
@@ -56,11 +61,14 @@ class AssetJob:
     settings: ReconstructSettings = field(default_factory=ReconstructSettings)
     imported: ImportedMesh | None = None
     remove: tuple[str, ...] = ()
+    delight: Path | None = None
 
     def __post_init__(self) -> None:
         check_refinable(self.settings, self.kind, self.imported)
         if self.remove and self.kind != "environment":
             raise InputError("things are removed from an environment only: give --kind environment, or leave it out")
+        if self.delight is not None and self.kind != "object":
+            raise InputError("colours of objects only are freed of light: an environment is rendered in its own")
 
 
 @dataclass(frozen=True)
@@ -94,11 +102,38 @@ Maker = Callable[[Capture, Splats, AssetJob, float | None, str | None, Progress 
 def reconstruct_job(
     capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
 ) -> Reconstruction:
-    """A :data:`Maker`: :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset` as a job says."""
-    return reconstruct_asset(
+    """A :data:`Maker`: :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset` as a job says.
+
+    Raises:
+        InputError: As that, or if lights are given and are none, or nothing says where up is.
+    """
+    light = None if job.delight is None else LightFile.load(job.delight)
+    if light is not None and capture.up != "z":
+        raise InputError(f"{light.path}: lights are in a frame whose z is up, which the capture does not know")
+    made = reconstruct_asset(
         capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
         imported=job.imported, psnr=psnr, progress=progress,
     )  # fmt: skip
+    return made if light is None else _delighted(made, light, progress)
+
+
+def _delighted(made: Reconstruction, light: LightFile, progress: Progress | None) -> Reconstruction:
+    """The asset with its colours freed of light, and how that went in the verdict."""
+    if progress is not None:
+        progress(0, 1, "freeing colours of light")
+    if made.asset.mesh is None:
+        return made
+    turn = np.eye(4)  # from the asset to how its capture lies, as the lights do
+    turn[:3, :3] = made.asset_from_capture[:3, :3].T / np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3]))
+    mesh = made.asset.mesh.copy().apply_transform(turn)
+    done = delight(made.asset.splats.transformed(turn), mesh, light)
+    splats = done.splats.transformed(np.linalg.inv(turn)) if done.kept else made.asset.splats
+    return replace(
+        made,
+        asset=replace(made.asset, splats=splats),
+        verdict=replace(made.verdict, rows={**made.verdict.rows, "Light": done.told}),
+        record={**made.record, "light": {"kept": done.kept, "uneven": done.uneven, "slope": done.slope}},
+    )
 
 
 def read_fit(path: Path) -> tuple[Path, float | None]:
@@ -225,7 +260,8 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
     decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove]
     digest = ContentHash()
     digest.add_json(decisive)
-    for path in (*_files(folder, capture), splats):
+    lights = [] if job.delight is None else LightFile.load(job.delight).files
+    for path in (*_files(folder, capture), splats, *lights):
         digest.add_file(path)
     return digest.hexdigest()
 

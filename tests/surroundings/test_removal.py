@@ -142,7 +142,7 @@ def test_an_environment_says_what_was_removed(captured: Capture, tmp_path: Path)
     assert what in done.verdict.rows["Removed things"] and "are invented" in done.verdict.rows["Removed things"]
     assert "was hidden by things that were removed" in (tmp_path / "cell" / "report.html").read_text()
     (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_things"]
-    assert record["pick"] == what and record["filled"] == pytest.approx(0.015, abs=0.006) and record["copied"] == 1
+    assert record["pick"] == what and CUBE**2 < record["filled"] < 3 * CUBE**2 and record["copied"] == 1
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # photos show the thing: that is left out
     asset = Asset.load(tmp_path / "cell")
     assert asset.mesh is not None

@@ -91,6 +91,7 @@ def measure(args: argparse.Namespace) -> int:
     write_text(traced, json.dumps([args.samples, numbers]))
     spots = picks(capture, truth)
     job = AssetJob(name="room", kind="environment", remove=tuple(spots))
+    (args.out / "cleared" / VERDICT_FILE).unlink(missing_ok=True)  # made anew, by what the code is now
     done = make_surroundings(args.out / "cell" / "capture", args.out / "cell" / "fit", args.out / "cleared", job)
     for what, text in done.verdict.rows.items():
         print(f"  {what}: {text}", file=sys.stderr)

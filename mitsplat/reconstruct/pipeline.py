@@ -114,10 +114,10 @@ def reconstruct_job(
         capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
         imported=job.imported, psnr=psnr, progress=progress,
     )  # fmt: skip
-    return made if light is None else _delighted(made, light, progress)
+    return made if light is None else _delighted(made, light, capture.table, progress)
 
 
-def _delighted(made: Reconstruction, light: LightFile, progress: Progress | None) -> Reconstruction:
+def _delighted(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
     """The asset with its colours freed of light, and how that went in the verdict."""
     if progress is not None:
         progress(0, 1, "freeing colours of light")
@@ -126,13 +126,13 @@ def _delighted(made: Reconstruction, light: LightFile, progress: Progress | None
     turn = np.eye(4)  # from the asset to how its capture lies, as the lights do
     turn[:3, :3] = made.asset_from_capture[:3, :3].T / np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3]))
     mesh = made.asset.mesh.copy().apply_transform(turn)
-    done = delight(made.asset.splats.transformed(turn), mesh, light)
+    done = delight(made.asset.splats.transformed(turn), mesh, light, table=table)
     splats = done.splats.transformed(np.linalg.inv(turn)) if done.kept else made.asset.splats
     return replace(
         made,
         asset=replace(made.asset, splats=splats),
         verdict=replace(made.verdict, rows={**made.verdict.rows, "Light": done.told}),
-        record={**made.record, "light": {"kept": done.kept, "uneven": done.uneven, "slope": done.slope}},
+        record={**made.record, "light": {name: getattr(done, name) for name in _LIGHT}},
     )
 
 
@@ -244,6 +244,7 @@ def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     write_text(out / VERDICT_FILE, json.dumps(record, indent=1) + "\n")
 
 
+_LIGHT = ("kept", "uneven", "slope", "borne_out")
 _REMOVED = ("outside", "unseen", "needles", "floaters")
 
 

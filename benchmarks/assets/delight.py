@@ -137,7 +137,8 @@ def painted(width: int, shape: Any) -> Truth:
     ]
     alone, sensors = ray_scene({"type": "scene", "solid": shape}), Sensors()
     aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
-    albedo = [np.array(mi.render(alone, integrator=aov, sensor=sensors.like(view), spp=64))[..., -3:] for view in views]
+    shown = (mi.render(alone, integrator=aov, sensor=sensors.like(view), spp=64) for view in views)
+    albedo = [np.nan_to_num(np.array(picture)[..., -3:]) for picture in shown]
     inside = [binary_erosion(picture.min(axis=2) > 0.02, iterations=3) for picture in albedo]
     return Truth(views, np.array(albedo), np.array(inside))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,6 +155,22 @@ def test_an_environment_says_what_was_removed(captured: Capture, tmp_path: Path)
     assert again.kept
     other = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", replace(job, remove=()))
     assert not other.kept and "Removed things" not in other.verdict.rows
+
+
+@pytest.mark.slow
+def test_the_command_removes_by_itself(captured: Capture, tmp_path: Path) -> None:
+    captured.save(tmp_path / "capture")
+    Splats.concatenate([place(), cube()]).save(tmp_path / "splats.ply")
+    what = pick(12, (*BESIDE, HEIGHT + CUBE))
+    words = ["mesh", "capture", "splats.ply", "-o", "cell", "--kind", "environment", "--remove", what, "--voxels", "64"]
+    done = subprocess.run(
+        [Path(sys.executable).with_name("mitsplat"), *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode in (0, 4), done.stderr
+    assert "removed things: 0.1" in done.stdout and what in done.stdout
+    left = Asset.load(tmp_path / "cell").splats.means  # the table's middle is the origin
+    over = (np.abs(left[:, :2] - BESIDE) < 0.7 * CUBE).all(axis=1) & (left[:, 2] > 0.3 * CUBE)
+    assert not over.any()
 
 
 class TestFill:

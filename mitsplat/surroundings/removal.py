@@ -258,6 +258,7 @@ def _of_thing(
     reach, means = _APART * scale, splats.means.astype(np.float64)
     beside = _BESIDE * reach
     low, high = thing.min(axis=0) - beside, thing.max(axis=0) + beside
+    low[2] = -TALL * scale
     rows = np.flatnonzero(((means > low) & (means < high)).all(axis=1))
     around = others[((others > low - beside) & (others < high + beside)).all(axis=1)]
     surface, around = _thinned(thing, 0.25 * reach), _thinned(around, 0.25 * reach)
@@ -274,9 +275,28 @@ def _of_thing(
     axes = Rotation.from_quat(splats.quats[rows]).as_matrix()[:, 2]
     tip = height + _REACH * np.sqrt(((axes * splats.scales[rows]) ** 2).sum(axis=1))
     goes |= in_hole & (height <= floor) & ((height >= -floor) | (tip > floor))
-    gone = np.zeros(len(means), dtype=bool)
+    gone = _reaching(splats, grid.inside(thing, footprint, reach))
     gone[rows[goes]] = True
     return gone
+
+
+def _reaching(splats: Splats, places: Float64Array) -> BoolArray:
+    """Which Gaussians (N,) reach any of some places: as these were hidden, no photo has a say in what is there."""
+    found = np.zeros(len(splats), dtype=bool)
+    if not len(places):
+        return found
+    middle = places.mean(axis=0)
+    radius = np.linalg.norm(places - middle, axis=1).max()
+    away = np.linalg.norm(splats.means - middle, axis=1)
+    rows = np.flatnonzero(away < radius + _REACH * splats.scales.max(axis=1))
+    means, scales = splats.means[rows].astype(np.float64), splats.scales[rows]
+    axes = Rotation.from_quat(splats.quats[rows]).as_matrix()
+    reached = np.zeros(len(rows), dtype=bool)
+    for place in places:
+        local = np.einsum("nij,ni->nj", axes, place - means) / scales
+        reached |= (local**2).sum(axis=1) < _REACH**2
+    found[rows[reached]] = True
+    return found
 
 
 def _thinned(points: Float64Array, edge: float) -> Float64Array:
@@ -316,6 +336,23 @@ class _Grid:
         covered[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
         closed = np.asarray(binary_closing(np.pad(covered, 4), np.ones((3, 3)), iterations=3))
         return closed[4:-4, 4:-4]
+
+    def inside(self, points: Float64Array, footprint: BoolArray, depth: float) -> Float64Array:
+        """Places (M, 3) below points on a thing, that far from its sides, top and ground, in steps as long."""
+        top = np.zeros(footprint.shape)
+        cells = self.cells(points[:, :2])
+        own = (cells >= 0).all(axis=1)
+        np.maximum.at(top, tuple(cells[own].T), points[own, 2])
+        near = distance_transform_edt(top == 0, return_distances=False, return_indices=True)
+        deep = distance_transform_edt(np.pad(footprint, 1))[1:-1, 1:-1] * self.cell > depth
+        step = max(1, int(depth / self.cell))
+        x, y = np.nonzero(deep[::step, ::step])
+        columns = [
+            np.column_stack([np.tile(self.middles[i, j], (len(z), 1)), z])
+            for i, j in zip(step * x, step * y, strict=True)
+            if len(z := np.arange(depth, top[near[0, i, j], near[1, i, j]] - depth, depth))
+        ]
+        return np.concatenate([np.zeros((0, 3)), *columns])
 
     def outline(self, points: Float64Array) -> BoolArray:
         """The same of one thing, without holes."""

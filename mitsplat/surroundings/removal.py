@@ -1,25 +1,18 @@
 """Take a thing away that stands on a support, and fill what it hid with what lies around.
 
 What goes is told by points: those that stand on the support fall into things that lie apart, and each Gaussian is of
-what the nearest point is of. No photo shows what was below. It is made of patches of the support, moved there from
-where their surroundings look most as those of the hole do (Efros and Leung 1999, by patches as Criminisi, Pérez and
-Toyama 2004), their colours made to meet these (Pérez, Gangnet and Blake 2003), and laid down as a sheet of flat
-Gaussians.
+what the nearest point is of; so does what reaches into its volume. No photo shows what was below. It is made of pieces
+of the support (:mod:`.texture_fill`), and laid down as a sheet of flat Gaussians.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, label
-from scipy.signal import fftconvolve
-from scipy.sparse import csr_array, diags_array, eye_array, kron
-from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -35,6 +28,7 @@ from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL
 from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views
 from mitsplat.surroundings.supports import Support
+from mitsplat.surroundings.texture_fill import dilated, fill
 
 _CELL = 0.004
 """Edge of the cells that a support is filled by, as a share of the typical depth."""
@@ -56,20 +50,12 @@ _FLAT = 0.25
 """Height up to which what photos show is the bare support, as a share of that by which it is told from things."""
 _BLED = 2
 """Steps around what is hidden, each as high as what is told from the support, in which colours are the thing's, too."""
-_RING = 10
-"""Width of the surroundings of a hole that patches are compared by [cells]."""
-_COMPARED = 0.5
-"""Share of these that a patch must have."""
-_PATCHES = 8
 _EDGE = 400
 """Longest edge of the pictures that the support's colours are read from [px]."""
 _OPAQUE = 0.9
 _BORDER = cv2.BORDER_REPLICATE
 _DISC, _THICK = 0.7, 0.1
 """Standard deviations of the sheet's Gaussians along it and across [cells]."""
-
-
-Value = TypeVar("Value", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,16 +152,16 @@ def _remove(
         raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
     height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / _CELL)
     standing = grid.covered(others[(height > OFF * scale) & (height < top)])
-    footprint = _dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
+    footprint = dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
     parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
-    core = binary_fill_holes(hidden & _dilated(footprint, 4 * margin))
-    hole = _dilated(np.asarray(core), _BLED * margin) & ~standing
+    core = binary_fill_holes(hidden & dilated(footprint, 4 * margin))
+    hole = dilated(np.asarray(core), _BLED * margin) & ~standing
     gone = _of_thing(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
-    ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~_dilated(standing, margin), hole)
+    ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
     ground.seen = ground.seen | hole
     # Around the hole, too, where what went was reaching to.
-    sheet = grid.sheet(ground.texture, ground.seen & _dilated(hole, margin)).transformed(support.pose)
+    sheet = grid.sheet(ground.texture, ground.seen & dilated(hole, margin)).transformed(support.pose)
     removed = RemovedThing(
         pick=pick,
         support=number,
@@ -199,9 +185,9 @@ def _picked(
     ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
     (view,) = depth_views(splats, [camera])
     depth = float(view.look(camera.centre + (scale * ray @ camera.world_from_camera[:3, :3].T)[None])[1][0])
-    spot = camera.centre + depth * ray @ camera.world_from_camera[:3, :3].T
+    spot = camera.centre + (depth if np.isfinite(depth) else 0.0) * ray @ camera.world_from_camera[:3, :3].T
     found, lowest = -1, np.inf
-    for number, support in enumerate(supports):
+    for number, support in enumerate(supports if np.isfinite(depth) else ()):
         local = (spot - support.pose[:3, 3]) @ support.pose[:3, :3]
         above = OFF * scale < local[2] < min(lowest, TALL * scale)
         if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
@@ -399,94 +385,3 @@ def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
     alpha = np.maximum(layers.alpha, 1e-6)[..., None]
     depth = np.where(layers.alpha > _OPAQUE, layers.depth, np.inf).astype(np.float32)
     return DepthView(small, depth), np.asarray(encode_srgb(layers.captured / alpha), dtype=np.float32)
-
-
-def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Float64Array, float]:
-    """A texture (X, Y, 3) whose hole is filled with moved parts of what is known, and the share of it that is these.
-
-    Where no part of what is known reaches, its place is filled without bends from the border.
-    """
-    given, source, left = texture, known, hole
-    texture = np.where(known[..., None], texture, 0.0)
-    for _ in range(_PATCHES):
-        if not left.any() or not source.any():
-            break
-        shift = _best_shift(texture, known, source, left)
-        if shift is None:
-            break
-        moved, there = _shifted(texture, shift), _shifted(source, shift)
-        patch = left & there
-        border = known & there & _dilated(patch, 3)
-        gap = np.where(border[..., None], texture - moved, 0.0)
-        texture = np.where(patch[..., None], moved + _membrane(gap, border, patch), texture)
-        known, left = known | patch, left & ~patch
-    copied = 1 - float(left.sum()) / max(int(hole.sum()), 1)
-    if left.any() and known.any():
-        border = known & _dilated(left, 3)
-        texture = np.where(left[..., None], _membrane(texture, border, left), texture)
-    return np.where(hole[..., None], texture.clip(0, 1), given), copied
-
-
-def _best_shift(texture: Float64Array, known: BoolArray, source: BoolArray, hole: BoolArray) -> tuple[int, int] | None:
-    """The move by which what is known covers most of a hole and looks there as its surroundings do, up to a shade."""
-    ring = (known & _dilated(hole, _RING)).astype(np.float64)
-    valid, target = source.astype(np.float64), texture * ring[..., None]
-    there = texture * valid[..., None]
-
-    def correlated(one: Float64Array, other: Float64Array) -> Float64Array:
-        """Sum over places p of one(p) other(p + shift), the middle of the result being no shift."""
-        return np.asarray(fftconvolve(other, one[::-1, ::-1], mode="full"))
-
-    covers = correlated(hole.astype(np.float64), valid)
-    count = np.maximum(correlated(ring, valid), 1e-9)
-    error = np.zeros_like(count)
-    for k in range(3):
-        difference = correlated(target[..., k], valid) - correlated(ring, there[..., k])
-        squares = correlated(target[..., k] ** 2, valid) + correlated(ring, there[..., k] ** 2)
-        error += (squares - 2 * correlated(target[..., k], there[..., k])) / count - (difference / count) ** 2
-    usable = (count > _COMPARED * ring.sum()) & (covers > 0.5)
-    if not usable.any():
-        return None
-    most = covers[usable].max()
-    usable &= covers >= 0.95 * most
-    place = np.unravel_index(int(np.where(usable, error, np.inf).argmin()), error.shape)
-    return int(place[0]) - texture.shape[0] + 1, int(place[1]) - texture.shape[1] + 1
-
-
-def _shifted(image: npt.NDArray[Value], shift: tuple[int, int]) -> npt.NDArray[Value]:
-    """image(p + shift), zero where that is beyond it."""
-    result = np.zeros_like(image)
-    to, of = [], []
-    for size, step in zip(image.shape, shift, strict=False):
-        to.append(slice(max(0, -step), min(size, size - step)))
-        of.append(slice(max(0, step), min(size, size + step)))
-    result[tuple(to)] = image[tuple(of)]
-    return result
-
-
-def _membrane(values: Float64Array, border: BoolArray, inside: BoolArray) -> Float64Array:
-    """Values (X, Y, 3) inside that continue those of a border without bends: Laplace's equation.
-
-    It is solved on the border as well, whose values it follows only on the whole, as those of single cells are noise;
-    and it is level across all other edges.
-    """
-    cells = border | inside
-    x, y = (slice(int(rows.min()), int(rows.max()) + 1) for rows in np.nonzero(cells))
-    cells, fixed, given = cells[x, y], border[x, y], values[x, y]
-    differ = [diags_array([-1.0, 1.0], offsets=[0, 1], shape=(max(n - 1, 0), n)) for n in cells.shape]
-    across, down = kron(differ[0], eye_array(cells.shape[1])), kron(eye_array(cells.shape[0]), differ[1])
-    own = cells.ravel().astype(np.float64)
-    rows = [csr_array(step) for step in (across, down)]
-    kept = [row[np.asarray(abs(row) @ own) > 1.5] for row in rows]
-    laplace = sum((row.T @ row for row in kept), start=csr_array((own.size, own.size)))
-    weight = np.where(fixed, 1.0, 0.0).ravel()
-    system = laplace + diags_array(weight + np.where(own > 0, 1e-9, 1.0))
-    solved = spsolve(csr_array(system).tocsc(), weight[:, None] * given.reshape(-1, 3))
-    result = np.zeros_like(values)
-    result[x, y] = np.where(inside[x, y][..., None], solved.reshape(given.shape), 0.0)
-    return result
-
-
-def _dilated(cells: BoolArray, steps: int) -> BoolArray:
-    """Cells within so many of those given."""
-    return np.asarray(distance_transform_edt(~cells) <= steps) if cells.any() else cells

@@ -22,8 +22,9 @@ from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.removal import fill, remove_things
+from mitsplat.surroundings.removal import remove_things
 from mitsplat.surroundings.supports import find_supports
+from mitsplat.surroundings.texture_fill import fill
 from tests.surroundings.test_surroundings import (
     BOX,
     HEIGHT,
@@ -120,9 +121,10 @@ def test_all_things_go(captured: Capture) -> None:
 
 def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
     splats = Splats.concatenate([place(), cube()])
-    for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)):  # on the table, on the floor
+    on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
+    for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and where nothing is
         with pytest.raises(InputError, match=r"photo05\.png:.*: what is to be removed must stand on a level surface"):
-            removed(splats, captured, pick(5, spot))
+            removed(splats, captured, spot)
     with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y with a registered photo"):
         removed(splats, captured, "none.png:3,4")
     with pytest.raises(InputError, match=r"a pixel must be given as X,Y \(got 3\)"):

@@ -51,8 +51,8 @@ class AssetJob:
         delight: File of the lights that an object was photographed in, which its colours are freed of.
 
     Raises:
-        InputError: If an object's mesh cannot be refined, things are to be removed from an object, or an environment
-            is to be freed of light.
+        InputError: If an object's mesh cannot be refined, things are to be removed from an object or an imported mesh,
+            or an environment is to be freed of light.
     """
 
     name: str
@@ -67,6 +67,8 @@ class AssetJob:
         check_refinable(self.settings, self.kind, self.imported)
         if self.remove and self.kind != "environment":
             raise InputError("things are removed from an environment only: give --kind environment, or leave it out")
+        if self.remove and self.imported is not None:
+            raise InputError("things cannot be removed from an imported mesh: leave out either")
         if self.delight is not None and self.kind != "object":
             raise InputError("colours of objects only are freed of light: an environment is rendered in its own")
 
@@ -114,10 +116,10 @@ def reconstruct_job(
         capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
         imported=job.imported, psnr=psnr, progress=progress,
     )  # fmt: skip
-    return made if light is None else _delighted(made, light, capture.table, progress)
+    return made if light is None else delighted(made, light, capture.table, progress)
 
 
-def _delighted(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
+def delighted(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
     """The asset with its colours freed of light, and how that went in the verdict."""
     if progress is not None:
         progress(0, 1, "freeing colours of light")

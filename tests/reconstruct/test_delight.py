@@ -10,10 +10,14 @@ import pytest
 import trimesh
 
 from mitsplat.arrays import Float64Array
+from mitsplat.asset import Asset
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.lighting.panorama import unit_vector, write_exr
 from mitsplat.reconstruct.delight import FOLLOWS, LightFile, delight, trace_irradiance
+from mitsplat.reconstruct.evaluation import Verdict
+from mitsplat.reconstruct.pipeline import AssetJob, delighted
+from mitsplat.reconstruct.reconstruct import Reconstruction
 from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
@@ -117,6 +121,29 @@ class TestDelight:
         assert not delight(splats, ball(), file_of(tmp_path, *lights(30))).kept
         done = delight(splats, ball(), file_of(tmp_path, EnvironmentLight(kind="environment", radiance=1.0)))
         assert not done.kept and done.uneven < 0.03 and "left as they are" in done.told
+
+
+class TestJob:
+    def test_an_environment_keeps_its_light(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match="colours of objects only are freed of light"):
+            AssetJob(name="cell", kind="environment", delight=tmp_path / "l.yaml")
+
+    def test_an_asset_that_is_turned_and_scaled_is_lit_as_its_capture_lies(self, tmp_path: Path) -> None:
+        """A size turns the asset until its box lies along the axes; lights stay in the capture's frame."""
+        splats, reflectance = painted(30)
+        turn = trimesh.transformations.rotation_matrix(2.0, (0, 0, 1)) @ np.diag([0.5, 0.5, 0.5, 1.0])
+        asset = Asset(
+            name="ball", class_name="ball", splats=splats.transformed(turn), mesh=ball().apply_transform(turn)
+        )
+        verdict = Verdict(
+            photos=9, rejected=0, psnr=30.0, psnr_object=30.0, splat_iou=1.0, mesh_iou=1.0, offset=0.0, spread=0.0,
+            lost=0.0, scale_error=None, units="metre", gaussians=len(splats), faces=len(ball().faces),
+            watertight=True, solid=True,
+        )  # fmt: skip
+        made = Reconstruction(asset, verdict, [], None, None, None, turn)
+        done = delighted(made, file_of(tmp_path, *lights(30)), False, None)
+        assert done.record["light"]["kept"] and "it is taken out of them" in done.verdict.rows["Light"]
+        assert unlike(done.asset.splats, reflectance) < 0.03
 
 
 class TestFile:

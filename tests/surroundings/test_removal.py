@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
@@ -18,6 +19,7 @@ from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.reconstruct.evaluation import show_asset
 from mitsplat.reconstruct.pipeline import AssetJob
+from mitsplat.reconstruct.reconstruct import ImportedMesh
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 from mitsplat.surroundings import make_surroundings
@@ -131,6 +133,9 @@ def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
         removed(splats, captured, "photo05.png:3")
     with pytest.raises(InputError, match="removed from an environment only"):
         AssetJob(name="mug", remove=("photo05.png:3,4",))
+    mesh = ImportedMesh(trimesh.creation.box((1, 1, 1)))
+    with pytest.raises(InputError, match="cannot be removed from an imported mesh"):
+        AssetJob(name="cell", kind="environment", imported=mesh, remove=("photo05.png:3,4",))
 
 
 def test_an_environment_says_what_was_removed(captured: Capture, tmp_path: Path) -> None:

@@ -136,6 +136,9 @@ CASES = (
     Case("small on cloth", cloth=True, photos=36, zoom=0.6),
     Case("few noisy of a bowl", "bowl", photos=12, noise=0.03),
     Case("blurred plate", "plate", blur=6.0, photos=20),
+    Case("sixty photos", photos=60),
+    Case("close", zoom=1.4),
+    Case("close plate", "plate", zoom=1.4),
 )
 
 

@@ -139,6 +139,8 @@ CASES = (
     Case("sixty photos", photos=60),
     Case("close", zoom=1.4),
     Case("close plate", "plate", zoom=1.4),
+    Case("close sixty photos", photos=60, zoom=1.4),
+    Case("close slight blur", blur=4.0, zoom=1.4),
 )
 
 

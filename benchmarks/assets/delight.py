@@ -28,10 +28,11 @@ from benchmarks.assets.clutter import transforms
 from benchmarks.assets.judged import tell_wanted
 from benchmarks.assets.known import BOARD, cameras, solid, speckled, table_scene
 from benchmarks.assets.photographing import Sensors, by_name, photograph, show_where
+from benchmarks.assets.verdicts import views_around
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera, spiral
+from mitsplat.camera import Camera
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.fit.trainer import FitSettings
@@ -54,7 +55,6 @@ BALL, HIGH = 0.03, 0.05
 AZIMUTH, ELEVATION, AWAY, FOV = 250.0, 20.0, 0.5, 14.0
 """Of the camera that sees the ball, as seen from there [degrees, m]."""
 EXPOSURES = (0.02, 0.1, 0.5, 2.0)
-AROUND = 8
 
 
 def scene(light: str, thing: Any) -> dict[str, Any]:
@@ -128,13 +128,7 @@ class Truth:
 
 
 def painted(width: int, shape: Any) -> Truth:
-    mesh = solid()
-    middle = mesh.bounds.mean(axis=0)
-    sines = np.sin(np.radians(np.linspace(12, 65, AROUND)))
-    views = [
-        Camera.look_at(middle + 0.32 * way, middle, width=width, height=3 * width // 4, fov_x=26)
-        for way in spiral(sines)
-    ]
+    views = views_around(solid(), width, lowest=12)
     alone, sensors = ray_scene({"type": "scene", "solid": shape}), Sensors()
     aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
     shown = (mi.render(alone, integrator=aov, sensor=sensors.like(view), spp=64) for view in views)

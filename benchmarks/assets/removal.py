@@ -23,7 +23,7 @@ from PIL import Image
 
 from benchmarks.assets.clutter import exposures
 from benchmarks.assets.judged import tell_wanted
-from benchmarks.assets.photographing import photograph
+from benchmarks.assets.photographing import by_name, photograph
 from benchmarks.assets.room import room, things, walk
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
@@ -73,10 +73,10 @@ def measure(args: argparse.Namespace) -> int:
     """Print and keep the figures; how many of them miss what is wanted."""
     capture = Capture.load(args.out / "cell" / "capture")
     views = walk(*json.loads((args.out / "photos.json").read_text())[:2])
-    truth = {f"photo{number:02}.png": camera for number, camera in enumerate(views)}
+    truth = by_name(views)
     chosen = [photo for photo in capture.held_out if truth[photo.name].centre[1] < 0.2]
     gains = exposures(len(views))
-    numbers = [int(photo.name.removeprefix("photo").removesuffix(".png")) for photo in chosen]
+    numbers = [list(truth).index(photo.name) for photo in chosen]
     folder, made = args.out / "removed", {}
     traced = folder / "photos.json"
     if not (traced.exists() and json.loads(traced.read_text()) == [args.samples, numbers]):

@@ -183,12 +183,12 @@ def cameras(case: Case) -> list[Camera]:
     return [replace(camera, fx=case.zoom * camera.fx, fy=case.zoom * camera.fy) for camera in taken]
 
 
-def views_around(mesh: trimesh.Trimesh) -> list[Camera]:
+def views_around(mesh: trimesh.Trimesh, width: int = WIDTH, lowest: float = 10.0) -> list[Camera]:
     """From all around a solid above its support, of which there are no photos."""
-    sines = np.sin(np.radians(np.linspace(10, 65, AROUND)))
+    sines = np.sin(np.radians(np.linspace(lowest, 65, AROUND)))
     middle = mesh.bounds.mean(axis=0)
     return [
-        Camera.look_at(middle + 0.32 * way, middle, width=WIDTH, height=3 * WIDTH // 4, fov_x=CLOSE)
+        Camera.look_at(middle + 0.32 * way, middle, width=width, height=3 * width // 4, fov_x=CLOSE)
         for way in spiral(sines)
     ]
 

@@ -20,7 +20,7 @@ import trimesh
 from pydantic import Field
 from scipy.spatial import KDTree
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.mesh_distance import Surface
@@ -138,13 +138,14 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
         trace_irradiance(mesh, places, normals, lights, light.path.parent, table=below)
         for lights in _apart(light.lights)
     ]
-    each = np.stack([_smoothed(one, places, normals, np.ones(len(places))) for one in traced])
+    other, alike = _neighbours(places, normals)
+    each = np.stack([_smoothed(one, other, alike) for one in traced])
     whole = each.sum(axis=0)
     level = whole @ LUMINANCE
-    lit = near & (level > _UNLIT * np.median(level[near])) if near.any() else near
+    lit = level > _UNLIT * np.median(level[near]) if near.any() else near
     colours = decode_srgb((0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)).clip(0, 1))
-    seen = _smoothed(colours, places, normals, area * near) @ LUMINANCE  # single Gaussians are of many colours
-    own = lit & (seen > _DARKEST) & (area > 0)
+    seen = _smoothed(colours, other, alike * (area * near)[other]) @ LUMINANCE  # single Gaussians are of many colours
+    own = lit & near & (seen > _DARKEST) & (area > 0)
     uneven, slope, borne_out = _follow(seen[own], each[:, own] @ LUMINANCE, area[own])
 
     def done(told: str, gain: Float64Array | None = None) -> Delighting:
@@ -161,7 +162,7 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
             "capture's frame?"
         )
     mean = np.average(whole[own], axis=0, weights=area[own])
-    gain = np.where((level > _UNLIT * np.median(level[near]))[:, None], mean / np.maximum(whole, 1e-12), 1.0)
+    gain = np.where(lit[:, None], mean / np.maximum(whole, 1e-12), 1.0)
     return done(
         f"its irradiance differed by {uneven:.0%}, and colours with it (slope {slope:.2f}): it is taken out of them",
         gain.clip(1 / _STRONGEST, _STRONGEST),
@@ -227,10 +228,14 @@ def _matt(reflectance: list[float]) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}}}
 
 
-def _smoothed(values: Float64Array, places: Float64Array, normals: Float64Array, weight: Float64Array) -> Float64Array:
-    """Values (N, 3) averaged by weight (N,) over neighbours that face the same way."""
+def _neighbours(places: Float64Array, normals: Float64Array) -> tuple[Int64Array, Float64Array]:
+    """The nearest places to each (N, 3), itself among them, (N, K), and how far they face the same way, up to 1."""
     other = KDTree(places).query(places, k=min(_NEIGHBOURS, len(places)))[1].reshape(len(places), -1)
-    share = np.einsum("nkc,nc->nk", normals[other], normals).clip(0, 1) ** _ALIKE * weight[other]
+    return other, np.asarray(np.einsum("nkc,nc->nk", normals[other], normals).clip(0, 1) ** _ALIKE)
+
+
+def _smoothed(values: Float64Array, other: Int64Array, share: Float64Array) -> Float64Array:
+    """Values (N, 3) averaged over neighbours (N, K) by their shares (N, K)."""
     total = share.sum(axis=1, keepdims=True)
     return np.asarray((values[other] * share[..., None]).sum(axis=1) / np.maximum(total, 1e-30))
 

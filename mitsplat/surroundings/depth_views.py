@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.camera import Camera
-from mitsplat.render.layers import render_splats
+from mitsplat.render.layers import Layers, render_splats
 from mitsplat.splats import Splats
 
 SIZE = 240
@@ -32,6 +32,12 @@ class DepthView:
 
     camera: Camera
     depth: Float32Array
+
+    @classmethod
+    def of(cls, camera: Camera, layers: Layers, opaque: float = _OPAQUE) -> DepthView:
+        """What layers show whose alpha is above ``opaque``."""
+        seen = (layers.alpha > opaque) & (layers.depth > 0)
+        return cls(camera, np.where(seen, layers.depth, np.inf).astype(np.float32))
 
     def transformed(self, motion: Float64Array) -> DepthView:
         """What the camera sees after it and the place moved rigidly (4, 4)."""
@@ -69,14 +75,14 @@ class SurfacePoints:
 
 def depth_views(splats: Splats, cameras: Sequence[Camera], size: int = SIZE) -> list[DepthView]:
     """Depths of splats from cameras, the longest edge ``size`` px at most."""
-    views = []
-    for camera in cameras:
-        scale = min(1.0, size / max(camera.width, camera.height))
-        small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-        layers = render_splats(splats, small, quality="balanced")
-        seen = (layers.alpha > _OPAQUE) & (layers.depth > 0)
-        views.append(DepthView(small, np.where(seen, layers.depth, np.inf).astype(np.float32)))
-    return views
+    return [DepthView.of(*render_sized(splats, camera, size)) for camera in cameras]
+
+
+def render_sized(splats: Splats, camera: Camera, size: int) -> tuple[Camera, Layers]:
+    """Splats from a camera, the longest edge ``size`` px at most, and the camera of that picture."""
+    scale = min(1.0, size / max(camera.width, camera.height))
+    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    return small, render_splats(splats, small, quality="balanced")
 
 
 def surface_points(views: Sequence[DepthView]) -> SurfacePoints:

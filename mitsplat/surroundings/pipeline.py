@@ -29,7 +29,7 @@ from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import ENOUGH, Coverage, Hole, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.floaters import remove_floaters
+from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
 from mitsplat.surroundings.supports import Support, find_supports, flattened
@@ -179,8 +179,8 @@ def reconstruct_surroundings(
             "or give --scale-from"
         )
     # As the asset is rendered, not as the fit saw it.
-    shown = psnr
-    if made.held_out:
+    shown = mean_psnr(made.held_out) if made.held_out else psnr
+    if made.held_out and things:
         shown = _psnr_beside(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
     verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)

@@ -22,11 +22,10 @@ from mitsplat.capture.capture import Capture
 from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
-from mitsplat.render.layers import render_splats
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL
-from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views
+from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views, render_sized
 from mitsplat.surroundings.supports import Support
 from mitsplat.surroundings.texture_fill import dilated, fill
 
@@ -184,10 +183,11 @@ def _picked(
     camera = photo.camera
     ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
     (view,) = depth_views(splats, [camera])
-    depth = float(view.look(camera.centre + (scale * ray @ camera.world_from_camera[:3, :3].T)[None])[1][0])
-    spot = camera.centre + (depth if np.isfinite(depth) else 0.0) * ray @ camera.world_from_camera[:3, :3].T
+    ray = ray @ camera.world_from_camera[:3, :3].T
+    depth = float(view.look((camera.centre + scale * ray)[None])[1][0])
+    spot = camera.centre + (depth if np.isfinite(depth) else np.nan) * ray  # what is NaN stands on nothing
     found, lowest = -1, np.inf
-    for number, support in enumerate(supports if np.isfinite(depth) else ()):
+    for number, support in enumerate(supports):
         local = (spot - support.pose[:3, 3]) @ support.pose[:3, :3]
         above = OFF * scale < local[2] < min(lowest, TALL * scale)
         if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
@@ -379,9 +379,6 @@ class _Grid:
 
 def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
     """Depth and display-encoded colours from a camera, the longest edge :data:`_EDGE` px at most."""
-    scale = min(1.0, _EDGE / max(camera.width, camera.height))
-    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    layers = render_splats(splats, small, quality="balanced")
-    alpha = np.maximum(layers.alpha, 1e-6)[..., None]
-    depth = np.where(layers.alpha > _OPAQUE, layers.depth, np.inf).astype(np.float32)
-    return DepthView(small, depth), np.asarray(encode_srgb(layers.captured / alpha), dtype=np.float32)
+    small, layers = render_sized(splats, camera, _EDGE)
+    shown = encode_srgb(layers.captured / np.maximum(layers.alpha, 1e-6)[..., None])
+    return DepthView.of(small, layers, _OPAQUE), np.asarray(shown, dtype=np.float32)

@@ -64,6 +64,13 @@ def shaded(splats: Splats) -> Splats:
     return replace(splats, sh=((colour - 0.5) / SH_C0)[:, None].astype(np.float32))
 
 
+def table_and_box() -> tuple[Splats, Splats]:
+    """Table and floor in even slopes of colour, and the box in the corner."""
+    whole = place()
+    low = whole.means[:, 2] < HEIGHT + 1e-3
+    return shaded(whole.select(low)), whole.select(~low)
+
+
 def pick(photo: int, spot: tuple[float, float, float]) -> str:
     x, y = cameras()[photo].project(np.array([spot]))[0][0]
     return f"photo{photo:02}.png:{x:.1f},{y:.1f}"
@@ -86,9 +93,7 @@ def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -
 
 
 def test_one_thing_goes_and_the_other_stays(captured: Capture) -> None:
-    bare = shaded(place())
-    bare = bare.select(bare.means[:, 2] < HEIGHT + 1e-3)
-    box = place().select(place().means[:, 2] > HEIGHT + 1e-3)
+    bare, box = table_and_box()
     whole = Splats.concatenate([bare, box, cube()])
     left = removed(whole, captured, pick(12, (BESIDE[0], BESIDE[1], HEIGHT + CUBE)))
     around = np.array(BESIDE)
@@ -106,9 +111,7 @@ def test_one_thing_goes_and_the_other_stays(captured: Capture) -> None:
 
 def test_all_things_go(captured: Capture) -> None:
     """From a table of an even slope, whose colour goes on below them."""
-    bare = shaded(place())
-    bare = bare.select(bare.means[:, 2] < HEIGHT + 1e-3)
-    box = place().select(place().means[:, 2] > HEIGHT + 1e-3)
+    bare, box = table_and_box()
     on_box = (TABLE[0] / 2 - 0.7 * BOX[0], TABLE[1] / 2 - BOX[1], HEIGHT + BOX[2] / 2)
     left = removed(
         Splats.concatenate([bare, box, cube()]), captured, pick(12, (*BESIDE, HEIGHT + CUBE)), pick(8, on_box)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -110,10 +109,11 @@ def make(options: argparse.Namespace) -> None:
     packages = options.work / "packages"
     wanted += [Wanted(packages / f"package_{seed:02d}", seed=seed) for seed in range(options.packages)]
     wanted = [one for one in wanted if not (one.out / "asset.yaml").exists()]
-    with ProcessPoolExecutor(options.jobs, get_context("spawn"), max_tasks_per_child=8) as pool:
-        baked = [pool.submit(one.bake, options.gaussians, options.device) for one in wanted]
+    # Not an executor of concurrent.futures: with processes of so many tasks it waits for ever once all have ended.
+    with get_context("spawn").Pool(options.jobs, maxtasksperchild=8) as pool:
+        baked = [pool.apply_async(one.bake, (options.gaussians, options.device)) for one in wanted]
         for one, psnr in zip(wanted, baked, strict=True):
-            figure(psnr.result(), "dB", one.out.name)
+            figure(psnr.get(), "dB", one.out.name)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ HERE = Path(__file__).parent
 SAMPLES = 200
 """Draws of scenes with replacement."""
 LEAST_SEEN = 0.15
-"""Share of an object that a cut of a photograph must show for its label to stay, as ``min_visible`` of what is rendered."""
+"""Share of an object that a cut of a photograph must show to be labelled: ``min_visible`` of what is rendered."""
 
 
 def read_arms() -> dict[str, Any]:
@@ -142,18 +142,30 @@ def _mask(segmentation: dict[str, Any], image: Mapping[str, Any]) -> np.ndarray:
     return pixels
 
 
-def drawn(rendered: list[Path], count: int, folder: Path) -> Path:
-    """A YOLO folder that lists so many images of rendered ones: the first of an order which is the same for any number.
+def listed(rendered: list[Path], folder: Path, *, images: int | None, first: int | None) -> Path:
+    """A YOLO folder that lists some of the images of rendered ones.
+
+    Args:
+        rendered: Datasets.
+        folder: Where the list goes.
+        images: How many, of an order which is the same for any number; all if None.
+        first: The first so many images of each dataset, to compare what shows the same; all if None.
 
     Raises:
         SystemExit: If there are not so many.
     """
-    images = sorted(path.resolve() for one in rendered for path in (one / "images" / "train").iterdir())
-    if len(images) < count:
-        raise SystemExit(f"there are {len(images)} images, not {count}")
-    order = np.random.default_rng(0).permutation(len(images))[:count]
+    found = [sorted(path.resolve() for path in (one / "images" / "train").iterdir()) for one in rendered]
+    if first is not None:
+        for one, paths in zip(rendered, found, strict=True):
+            if len(paths) < first or int(paths[first - 1].stem) != first - 1:
+                raise SystemExit(f"{one}: its first {first} images are not all there")
+    some = [path for paths in found for path in paths[:first]]
+    if images is not None:
+        if len(some) < images:
+            raise SystemExit(f"there are {len(some)} images, not {images}")
+        some = [some[i] for i in sorted(np.random.default_rng(0).permutation(len(some))[:images])]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "train.txt").write_text("".join(f"{images[i]}\n" for i in sorted(order)))
+    (folder / "train.txt").write_text("".join(f"{path}\n" for path in some))
     names = YAML(typ="safe").load((rendered[0] / "data.yaml").read_text())["names"]
     with (folder / "data.yaml").open("w") as file:
         YAML(typ="safe").dump({"train": "train.txt", "names": names}, file)
@@ -180,8 +192,9 @@ def measure(options: argparse.Namespace) -> None:
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
-    if "images" in arm:
-        rendered = [drawn(rendered, arm["images"], work / "drawn" / f"{options.arm}-{options.seed}")]
+    if "images" in arm or "first" in arm:
+        folder = work / "listed" / f"{options.arm}-{options.seed}"
+        rendered = [listed(rendered, folder, images=arm.get("images"), first=arm.get("first"))]
     learns_photographs = arm.get("real", False)
     settings = TrainSettings(
         **(plan["train"] | arm.get("train", {})),
@@ -201,7 +214,9 @@ def measure(options: argparse.Namespace) -> None:
         # Without rendered images photographs are what is learnt, not what is mixed in.
         trained = train_detector(rendered or [real], run, settings, real=real if rendered else None)
         figure(trained.record["finished"]["seconds"], "s", "training", number)
-        found = evaluate_detector(run, everything, split="all", size=arm.get("test_size", plan["test_size"]), device=options.device)
+        found = evaluate_detector(
+            run, everything, split="all", size=arm.get("test_size", plan["test_size"]), device=options.device
+        )
         truth = json.loads((found.path / "truth.json").read_text())
         judged = {image["id"] for image in truth["images"] if scene_of(image["file_name"]) in fold}
         detections += [

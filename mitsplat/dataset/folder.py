@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -338,11 +339,16 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
 
 
 def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
-    """Dotted key and the two values, as JSON, where two JSON values differ first."""
+    """Dotted key and the two values, as JSON (null where there is none), where two JSON values differ first."""
     if isinstance(before, dict) and isinstance(now, dict):
         for name in sorted({*before, *now}):
             inner = first_difference(before.get(name), now.get(name), f"{key}.{name}" if key else name)
             if inner is not None:
                 return inner
         return None
+    if isinstance(before, list) and isinstance(now, list):
+        pairs = enumerate(zip_longest(before, now))
+        found = (first_difference(one, other, f"{key}[{place}]") for place, (one, other) in pairs)
+        if (inner := next(filter(None, found), None)) is not None:
+            return inner
     return None if before == now else (key, json.dumps(before), json.dumps(now))

@@ -305,6 +305,20 @@ def never_render(scene, index, *, layout):
     raise AssertionError("rendered although the output was refused")
 
 
+@pytest.mark.parametrize(
+    ("before", "now", "told"),
+    [
+        (["box", "can"], ["box", "can"], None),
+        (["box", "can"], ["box", "bottle", "can"], ("assets[1]", '"can"', '"bottle"')),
+        (["box"], ["box", "can"], ("assets[1]", "null", '"can"')),
+        ([{"name": "box", "size": [1, 2]}], [{"name": "box", "size": [1, 3]}], ("assets[0].size[1]", "2", "3")),
+        ([], [None], ("assets", "[]", "[null]")),
+    ],
+)
+def test_difference_names_the_place(before, now, told):
+    assert folder.first_difference({"assets": before}, {"assets": now}) == told
+
+
 class TestRefusals:
     def refuse(self, scene, out, message, **options):
         with pytest.raises(InputError, match=message):

@@ -32,8 +32,11 @@ PACKAGE = BakeSettings(
 UP: dict[str, Literal["y", "z"]] = {"bbq_sauce": "z"}
 """Axes of scans that stand along another than y: this one lies on its label."""
 
-BRANDS = {"box": 2, "bottle": 5, "can": 8}
-"""How many other brands of each scan there are, by its shape: most goods in cans and bottles come in these."""
+BRANDS = {"box": 4, "bottle": 5, "can": 8}
+"""How many other brands of each scan there are, by its shape: most goods in cans and bottles come in these.
+
+Every second one has the scan's colours: on photographs what shares a class's colours was taken for it, whatever was
+printed on it."""
 
 DENSITY = 600.0
 """Of packed food with air around it [kg/m^3]."""
@@ -90,7 +93,8 @@ class Wanted:
         up = UP.get(self.scan.stem, "y")
         if not self.brand:
             return bake(self.scan, self.out, self.scan.stem, BakeSettings(gaussians=gaussians), up)
-        mesh = relabel(trimesh.load(self.scan, force="mesh"), self.seed, "xyz".index(up))
+        scan = trimesh.load(self.scan, force="mesh")
+        mesh = relabel(scan, self.seed, "xyz".index(up), own_colours=self.seed % 2 == 0)
         return bake(mesh, self.out, "package", PACKAGE, up)
 
 

@@ -45,20 +45,21 @@ def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
     return "bottle" if extents[2] > 1.8 * extents[1] else "can"
 
 
-def relabel(scan: trimesh.Trimesh, seed: int, up: int) -> trimesh.Trimesh:
+def relabel(scan: trimesh.Trimesh, seed: int, up: int, *, own_colours: bool = False) -> trimesh.Trimesh:
     """A scan with another brand's print on it: all sides of a box, all around a bottle below its cap, or a can.
 
     Args:
         scan: With a texture, of which ends of cans stay.
         seed: Decides all that is printed.
         up: Axis along which print stands upright.
+        own_colours: Whether it is printed in colours of the scan, so that they do not tell one from the other.
     """
     rng = np.random.default_rng(seed)
     shape = shape_of(scan)
     corners = scan.triangles - scan.bounds.mean(axis=0)
     across, along = (up + 1) % 3, (up + 2) % 3  # from which the upright axis is the third of a right-handed frame
-    size, colours = scan.extents, _colours(rng)
     scanned = scan.visual.material.baseColorTexture.convert("RGB")
+    size, colours = scan.extents, _colours_of(scan, up, rng) if own_colours else _colours(rng)
     uv, sheets = scan.visual.uv[scan.faces], [scanned]
     side = np.zeros(len(corners), dtype=int)  # the sheet that is on a triangle
 
@@ -90,7 +91,7 @@ def relabel(scan: trimesh.Trimesh, seed: int, up: int) -> trimesh.Trimesh:
             sheet.paste(front, (place * front.width, 0))
         if shape == "bottle":
             cap = (0, 0, sheet.width, round(rng.uniform(0.1, 0.25) * sheet.height))
-            ImageDraw.Draw(sheet).rectangle(cap, fill=_any_colour(rng))
+            ImageDraw.Draw(sheet).rectangle(cap, fill=_any_colour(rng) if not own_colours else colours[1])
         printed = np.full(len(corners), True)
         if shape == "can":
             printed = np.abs(scan.face_normals[:, up]) < 0.7
@@ -119,6 +120,20 @@ def _colours(rng: np.random.Generator) -> Colours:
     saturations = rng.uniform(0.3, 1, 3) * (rng.random(3) > 0.2) * [1, 1, 0.3]
     rgb = matplotlib.colors.hsv_to_rgb(np.stack([hues, saturations, values], axis=1))
     return [tuple(round(255 * v) for v in row) for row in rgb]  # type: ignore[misc]
+
+
+def _colours_of(scan: trimesh.Trimesh, up: int, rng: np.random.Generator) -> Colours:
+    """Background, second colour, and ink: of the eight that the scan's sides have most of, ink unlike the first."""
+    simple = scan.copy()
+    simple.visual.material = scan.visual.material.to_simple()  # of others no colours are sampled
+    _, faces, sampled = trimesh.sample.sample_surface(simple, 20_000, sample_color=True, seed=rng)
+    sides = sampled[np.abs(scan.face_normals[faces, up]) < 0.7, :3].astype(np.uint8)
+    few = Image.fromarray(sides[None]).quantize(8, kmeans=8)
+    counts = sorted(few.getcolors(), reverse=True)
+    palette = np.array(few.getpalette()).reshape(-1, 3)[[index for _, index in counts]]
+    first, second = rng.permutation(4)[:2]
+    ink = np.abs(palette - palette[first]).sum(axis=1).argmax()
+    return [tuple(int(value) for value in palette[place]) for place in (first, second, ink)]  # type: ignore[misc]
 
 
 def _label(width: float, height: float, rng: np.random.Generator, colours: Colours) -> Image.Image:

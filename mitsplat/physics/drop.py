@@ -403,7 +403,8 @@ class Drop:
 
     def _place(self, items: Sequence[Item], ground: int, rng: np.random.Generator) -> Float64Array | None:
         spec = self.scene.spec
-        return draw_poses(items, self._grounds[ground].obstacles, spec.all_regions, rng, spec.settle.yaw)
+        settle = spec.settle
+        return draw_poses(items, self._grounds[ground].obstacles, spec.all_regions, rng, settle.yaw, settle.turned_over)
 
     def _items(
         self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None

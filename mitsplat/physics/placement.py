@@ -23,6 +23,8 @@ _SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
 _ROOM = (2e-3, 5e-3)  # between what is packed [m]
 _ASKEW = 3.0  # how far it is turned from quarter turns [degrees]
 _OFF_MIDDLE = 4e-3  # how far each of a tower is from the middle of what is below it, along x and y [m]
+_LEAN = np.radians(10)  # that must lift the middle of what is turned over
+_LIFT = 0.005  # by so much of its height above the ground
 _HOVER = 2e-4  # how closely objects are put on what is below them [m]
 
 
@@ -51,6 +53,7 @@ def draw_poses(
     regions: Sequence[tuple[Region, Arrangement]],
     rng: np.random.Generator,
     yaw: tuple[float, float] | None = None,
+    turned_over: float = 0.0,
 ) -> Float64Array | None:
     """Poses (N, 4, 4) of all items; None if they find no room. None that is drawn touches another or an obstacle.
 
@@ -61,9 +64,10 @@ def draw_poses(
         rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
         yaw: Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed; any if
             None.
+        turned_over: Share of those that stand on another side, see :func:`standing_turns`.
     """
     for _ in range(_DRAWS):
-        poses = _Draw(items, obstacles, rng, yaw).all_poses(regions)
+        poses = _Draw(items, obstacles, rng, yaw, turned_over).all_poses(regions)
         if poses is not None:
             return poses
     return None
@@ -81,6 +85,26 @@ def resting_turn(outline: Float64Array) -> Float64Array:
     return turn
 
 
+def standing_turns(outline: Float64Array) -> list[Float64Array]:
+    """Rotations (3, 3) about the y axis by one, two or three quarter turns, after which a convex hull (N, 3) stands.
+
+    What looks to -y goes on to do so: on its left side, its head, or its right side. It stands if leaning lifts the
+    middle of its bounds whichever way it leans, which it does not of what is round.
+    """
+    ways = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    lean = np.sin(_LEAN)
+    downs = np.stack([lean * np.cos(ways), lean * np.sin(ways), np.full(len(ways), -np.cos(_LEAN))])
+    found = []
+    for quarters in (1, 2, 3):
+        turn = Rotation.from_euler("y", 90 * quarters, degrees=True).as_matrix().round()
+        points = outline @ turn.T
+        points -= (points.min(axis=0) + points.max(axis=0)) / 2
+        height = -points[:, 2].min()
+        if (points @ downs).max(axis=0).min() > (1 + _LIFT) * height:
+            found.append(turn)
+    return found
+
+
 class _Draw:
     """One attempt to place all items."""
 
@@ -90,8 +114,10 @@ class _Draw:
         obstacles: Sequence[PlacedSurface],
         rng: np.random.Generator,
         yaw: tuple[float, float] | None,
+        turned_over: float,
     ) -> None:
         self._items, self._obstacles, self._rng, self._yaw = items, obstacles, rng, yaw
+        self._turned_over = turned_over
         self._low = self._high = self._foot = np.zeros(3)
         self._sky = np.inf
         self._poses = np.tile(np.eye(4), (len(items), 1, 1))
@@ -128,7 +154,7 @@ class _Draw:
             "drop": self._drop,
             "pile": self._pour,
             "scatter": self._scatter,
-            "upright": lambda i: self._stand(i, np.eye(3), self._yaw),
+            "upright": lambda i: self._stand(i, self._side(i), self._yaw),
         }
         return all(place[arrangement](i) for i in free)
 
@@ -200,12 +226,15 @@ class _Draw:
 
     def _build(self, members: Sequence[int]) -> bool:
         """All members upright on one another, the widest below, each turned for itself and a little off the middle."""
-        members = sorted(members, key=lambda i: -float(np.ptp(self._items[i].outline[:, :2], axis=0).prod()))
-        if members and not self._stand(members[0], np.eye(3), self._yaw):
+        sides = {i: self._side(i) for i in members}
+        members = sorted(
+            members, key=lambda i: -float(np.ptp((self._items[i].outline @ sides[i].T)[:, :2], axis=0).prod())
+        )
+        if members and not self._stand(members[0], sides[members[0]], self._yaw):
             return False
         for i in members[1:]:
             below, pose = self._taken[-1], np.eye(4)
-            pose[:3, :3] = self._turn(self._yaw)
+            pose[:3, :3] = self._turn(self._yaw) @ sides[i]
             bounds = _bounds(self._items[i].outline, pose)
             pose[:2, 3] = (below - bounds).mean(axis=0)[:2] + self._rng.uniform(-_OFF_MIDDLE, _OFF_MIDDLE, 2)
             pose[2, 3] = below[1][2] + _HOVER - bounds[0][2]
@@ -224,7 +253,7 @@ class _Draw:
                 angle = self._rng.uniform(*self._yaw)
             else:
                 angle = 90 * int(self._rng.integers(4)) + self._rng.uniform(-_ASKEW, _ASKEW)
-            pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+            pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix() @ self._side(i)
             bounds = _bounds(self._items[i].outline, pose)
             size, room = bounds[1] - bounds[0], self._rng.uniform(*_ROOM)
             if corner[0] + size[0] > self._high[0]:
@@ -258,6 +287,14 @@ class _Draw:
                 self._take(i, pose, _bounds(outline, pose))
                 return True
         return False
+
+    def _side(self, i: int) -> Float64Array:
+        """The rotation (3, 3) that brings down the side that an item stands on."""
+        if self._turned_over > 0 and self._rng.random() < self._turned_over:
+            turns = standing_turns(self._items[i].outline)
+            if turns:
+                return turns[int(self._rng.integers(len(turns)))]
+        return np.eye(3)
 
     def _turn(self, yaw: tuple[float, float] | None) -> Float64Array:
         """A rotation (3, 3) about the vertical by an angle from a range [degrees], or any."""

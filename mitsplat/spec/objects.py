@@ -205,6 +205,12 @@ class Settle(StrictModel):
         description="Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed, 0 "
         "as the asset stands: where fronts look. Any turn if absent, quarter turns of what is packed.",
     )
+    turned_over: Unit = Field(
+        0.0,
+        exclude_if=lambda share: share == 0,
+        description="Share of what is put down upright, as a tower or packed that stands on another side if it would "
+        "stand so: on its left or right, or its head, its front in front.",
+    )
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(
         5, ge=1, description="Draws of poses before what does not come to rest is left out of a layout."

@@ -227,16 +227,18 @@ class SceneSpec(StrictModel):
         return self
 
     def _check_regions(self) -> None:
-        """Refuse walls above their region, regions that are not told apart or not there, and a yaw for none of them."""
+        """Refuse walls above their region, regions that are not told apart or not there, and turns of nothing."""
         stated: list[tuple[tuple[str | int, ...], Region, Enclosure | None]] = [((), self.region, self.enclosure)]
         stated += [(("regions", i), region, region.enclosure) for i, region in enumerate(self.regions)]
         for keys, region, walls in stated:
             if walls is not None and walls.floor >= region.max[2]:
                 text = f"must be below the region's top at {region.max[2]:g} m (got {walls.floor:g})"
                 raise FieldError((*keys, "enclosure", "floor"), text)
-        if self.settle.yaw is not None and not {"upright", "tower", "packed"} & {way for _, way in self.all_regions}:
-            text = f"needs settle.arrangement upright, tower or packed (got {self.settle.arrangement})"
-            raise FieldError(("settle", "yaw"), text)
+        put_down = {"upright", "tower", "packed"} & {way for _, way in self.all_regions}
+        for key, stated_so in (("yaw", self.settle.yaw is not None), ("turned_over", self.settle.turned_over > 0)):
+            if stated_so and not put_down:
+                text = f"needs settle.arrangement upright, tower or packed (got {self.settle.arrangement})"
+                raise FieldError(("settle", key), text)
         names = self.region_names
         for number, name in enumerate(names[1:]):
             if name in names[: number + 1]:

@@ -24,6 +24,7 @@ from scipy.stats import kstest
 
 from mitsplat.dataset.prospects import layout_faults
 from mitsplat.errors import InputError
+from mitsplat.physics.placement import standing_turns
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts, try_alone
 from mitsplat.render.places import draw_place
 from mitsplat.scene.contents import draw_regions
@@ -657,6 +658,37 @@ def test_yaw_is_for_what_is_put_down(scene_data, write_scene):
     scene_data["settle"] = {"arrangement": "pile", "yaw": [0, 90]}
     with pytest.raises(InputError, match=r"settle.yaw: needs settle.arrangement upright, tower or packed \(got pile\)"):
         load_scene(write_scene(scene_data))
+    scene_data["settle"] = {"arrangement": "pile", "turned_over": 0.2}
+    with pytest.raises(InputError, match=r"settle.turned_over: needs settle.arrangement upright, tower or packed"):
+        load_scene(write_scene(scene_data))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "quarters"),
+    [
+        (trimesh.creation.box((0.08, 0.03, 0.05)), [1, 2, 3]),
+        (trimesh.creation.box((0.20, 0.01, 0.05)), [2]),  # a thin board does not stand on its short edge
+        (trimesh.creation.cylinder(0.033, 0.084, sections=64), [2]),
+        (trimesh.creation.cone(0.03, 0.09, sections=64), []),
+        (trimesh.creation.icosphere(4, 0.03), []),
+    ],
+    ids=["box", "board", "can", "cone", "ball"],
+)
+def test_what_stands_on_another_side(mesh, quarters):
+    turns = [Rotation.from_matrix(turn).as_euler("YXZ", degrees=True)[0] for turn in standing_turns(mesh.vertices)]
+    np.testing.assert_allclose(np.mod(turns, 360), np.multiply(quarters, 90.0), atol=1e-9)
+
+
+@pytest.mark.parametrize("arrangement", ["upright", "tower", "packed"])
+def test_what_is_put_down_may_stand_on_another_side(scene_data, write_scene, tmp_path, arrangement):
+    box_asset("block", (0.05, 0.03, 0.04)).save(tmp_path / "assets/block")
+    scene_data["objects"] = [{"asset": "assets/block", "count": 3}]
+    settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [-10, 10], "turned_over": 0.8}
+    _, layout = drop_layout(scene_data, write_scene, settle=settle)
+    poses = np.array([instance.world_from_object for instance in layout.instances])
+    assert (poses[:, 1, 1] > np.cos(np.radians(11))).all()  # fronts stay where yaw has them
+    ups = {round(np.degrees(np.arctan2(pose[0, 2], pose[2, 2])) / 90) % 4 for pose in poses}
+    assert ups - {0}
 
 
 def test_poses_may_be_given(scene_data, write_scene):

@@ -1,7 +1,7 @@
 """All arms and seeds of the experiment on detectors, side by side, as far as time allows.
 
     python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
-        [--minutes 20] [--images 900]
+        [--minutes 20] [--plan workshop.yaml]
 
 Datasets are rendered one after the other, and what learns from one starts when it is there. What was recorded is not
 done again; what was interrupted goes on.
@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
 
-from benchmarks.detector.experiment import read_arms, scenes_of, write_scene
+from benchmarks.detector.experiment import PLAN, read_arms, result_of, scenes_of, write_scene
 from benchmarks.record import RESULTS
 
 
@@ -25,7 +25,8 @@ def main() -> None:
     """Render, train, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--arms", nargs="*", help="all of arms.yaml, in its order, if absent")
+    parser.add_argument("--plan", type=Path, default=PLAN)
+    parser.add_argument("--arms", nargs="*", help="all of the plan, in its order, if absent")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--devices", nargs="+", default=["cuda:0"])
     parser.add_argument("--jobs", type=int, default=4, help="trainings at once on each device")
@@ -35,7 +36,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e9, help="after which nothing is begun")
     parser.add_argument("--weights", type=Path)
     options = parser.parse_args()
-    arms = read_arms()["arms"]
+    arms = read_arms(options.plan)["arms"]
     chosen = options.arms or list(arms)
     ends = time.monotonic() + 60 * options.minutes
     logs = options.work / "logs"
@@ -59,12 +60,12 @@ def main() -> None:
         return status == 0
 
     def train(arm: str, seed: int) -> None:
-        if (RESULTS / f"detector.experiment-{arm}-{seed}.json").exists() or time.monotonic() > ends:
+        if (RESULTS / f"{result_of(arm, seed, options.plan)}.json").exists() or time.monotonic() > ends:
             return
         device = free.get()
         try:
             words = [sys.executable, "-m", "benchmarks.detector.experiment", str(options.work), arm, str(seed)]
-            words += ["--device", device, "--workers", str(options.workers)]
+            words += ["--plan", str(options.plan), "--device", device, "--workers", str(options.workers)]
             command(f"{arm}-{seed}", words + (["--weights", str(options.weights)] if options.weights else []))
         finally:
             free.put(device)
@@ -76,7 +77,7 @@ def main() -> None:
                 if scene in rendered or time.monotonic() > ends:
                     continue
                 rendered.add(scene)
-                words = ["mitsplat", "render", str(write_scene(options.work, scene))]
+                words = ["mitsplat", "render", str(write_scene(options.work, scene, options.plan))]
                 words += ["-o", str(options.work / "data" / scene), "--resume", "--device", options.render_device]
                 command(f"render-{scene}", [*words, "--workers", str(options.render_workers)])
             for seed in options.seeds:

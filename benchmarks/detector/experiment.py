@@ -1,9 +1,10 @@
 """One arm of the experiment on detectors, with one seed: rendered, trained, and judged on photographs.
 
-    python -m benchmarks.detector.experiment WORK ARM SEED [--device cuda:0] [--weights FILE.pt]
+    python -m benchmarks.detector.experiment WORK ARM SEED [--plan workshop.yaml] [--device cuda:0] [--weights FILE.pt]
     python -m benchmarks.detector WORK                  # all arms and seeds, side by side
 
-WORK is what ``benchmarks.detector.material`` made; arms stand in ``arms.yaml``. Photographs are those of a few scenes
+WORK is what ``benchmarks.detector.material`` made, and arms stand in ``arms.yaml``; or, with ``--plan workshop.yaml``,
+what ``benchmarks.detector.workshop`` made, and arms stand there. Photographs are those of a few scenes
 under several lights: an arm that learns from photographs is trained once for each fold of scenes, on the other scenes,
 and judged on the fold; detections of all folds are judged together. Precision is also that of samples of scenes,
 drawn with replacement, the same ones for every arm, from which intervals of an arm and of differences follow.
@@ -30,15 +31,16 @@ from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
 
 HERE = Path(__file__).parent
+PLAN = Path("arms.yaml")
 SAMPLES = 200
 """Draws of scenes with replacement."""
 LEAST_SEEN = 0.15
 """Share of an object that a cut of a photograph must show to be labelled: ``min_visible`` of what is rendered."""
 
 
-def read_arms() -> dict[str, Any]:
-    """What ``arms.yaml`` says."""
-    return dict(YAML(typ="safe").load((HERE / "arms.yaml").read_text()))
+def read_arms(plan: Path = PLAN) -> dict[str, Any]:
+    """What ``arms.yaml``, or another plan beside it, says."""
+    return dict(YAML(typ="safe").load((HERE / plan).read_text()))
 
 
 def scenes_of(arm: Mapping[str, Any]) -> list[str]:
@@ -46,10 +48,16 @@ def scenes_of(arm: Mapping[str, Any]) -> list[str]:
     return ["+".join([scene, *([arm["change"]] if "change" in arm else [])]) for scene in arm.get("scenes", [])]
 
 
-def write_scene(work: Path, name: str) -> Path:
-    """The scene of a name: ``groceries.yaml`` with its changes, by dotted key; null takes away at the end."""
-    scene, plan = YAML(typ="safe").load((HERE / "groceries.yaml").read_text()), read_arms()
-    rows = [row for change in name.split("+") for row in plan["changes"][change].items()]
+def result_of(arm: str, seed: int, plan: Path = PLAN) -> str:
+    """The name of what is recorded of an arm and a seed."""
+    return f"detector.experiment-{arm}-{seed}" + ("" if plan == PLAN else f"-plan_{plan.stem}")
+
+
+def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
+    """The scene of a name: that of the plan with its changes, by dotted key; null takes away at the end."""
+    said = read_arms(plan)
+    scene = YAML(typ="safe").load((HERE / said["scene"]).read_text())
+    rows = [row for change in name.split("+") for row in said["changes"][change].items()]
     # What is later in a list goes first, so that places in it stay those of groceries.yaml.
     gone = sorted((row for row in rows if row[1] is None), reverse=True)
     for key, value in [row for row in rows if row[1] is not None] + gone:
@@ -178,6 +186,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("arm")
     parser.add_argument("seed", type=int)
+    parser.add_argument("--plan", type=Path, default=PLAN)
     parser.add_argument("--weights", type=Path, help="to start from; random ones if absent")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--workers", type=int, default=4)
@@ -188,7 +197,7 @@ def main() -> None:
 
 def measure(options: argparse.Namespace) -> None:
     """Train what the arm says, and judge it."""
-    plan = read_arms()
+    plan = read_arms(options.plan)
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
     rendered = [work / "data" / scene for scene in scenes_of(arm)]

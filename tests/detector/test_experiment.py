@@ -12,25 +12,32 @@ import cv2
 import numpy as np
 import pycocotools.mask as coco_mask
 import pytest
+import trimesh
 from ruamel.yaml import YAML
 
 from benchmarks import record
-from benchmarks.detector import experiment
-from benchmarks.detector.packages import make_package
+from benchmarks.detector import experiment, workshop
+from benchmarks.detector.packages import make_package, relabel
 from mitsplat.spec.spec import SceneSpec
 
-PLAN = experiment.read_arms()
-SCENES = sorted({scene for arm in PLAN["arms"].values() for scene in experiment.scenes_of(arm)})
+PLANS = [experiment.PLAN, Path("workshop.yaml")]
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_scenes_of_arms_may_be_written_so(tmp_path, name):
-    written = YAML(typ="safe").load(experiment.write_scene(tmp_path, name))
-    assert SceneSpec.model_validate(written).name == "groceries"
+def scenes_of(plan: Path) -> list[str]:
+    arms = experiment.read_arms(plan)["arms"].values()
+    return sorted({scene for arm in arms for scene in experiment.scenes_of(arm)})
 
 
-def test_every_change_is_that_of_a_scene():
-    assert {change for scene in SCENES for change in scene.split("+")} == set(PLAN["changes"])
+@pytest.mark.parametrize(("plan", "name"), [(plan, name) for plan in PLANS for name in scenes_of(plan)])
+def test_scenes_of_arms_may_be_written_so(tmp_path, plan, name):
+    written = YAML(typ="safe").load(experiment.write_scene(tmp_path, name, plan))
+    assert SceneSpec.model_validate(written).name == ("groceries" if plan == experiment.PLAN else "workcell")
+
+
+@pytest.mark.parametrize("plan", PLANS)
+def test_every_change_is_that_of_a_scene(plan):
+    changes = experiment.read_arms(plan)["changes"]
+    assert {change for scene in scenes_of(plan) for change in scene.split("+")} == set(changes)
 
 
 @pytest.fixture
@@ -83,13 +90,46 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
     monkeypatch.setattr(experiment, "train_detector", train)
     monkeypatch.setattr(experiment, "evaluate_detector", evaluate)
     monkeypatch.setattr(record, "_open", [{}])
-    experiment.measure(argparse.Namespace(work=work, arm=arm, seed=0, weights=None, device="cpu", workers=0))
+    options = argparse.Namespace(
+        work=work, arm=arm, seed=0, plan=experiment.PLAN, weights=None, device="cpu", workers=0
+    )
+    experiment.measure(options)
     figures = {name: value for name, (value, _) in record._open[0].items()}
     assert len(seen) == (1 if arm == "synthetic" else 2)
     assert all(len(names) in (0, 4, 6) for names in seen.values())
     assert figures["map50_95"] == pytest.approx(1.0 if arm != "synthetic" else 0.9, abs=0.01)
     assert (figures["scene.1"], figures["scene.0"] < 1) == (pytest.approx(1.0), arm == "synthetic")
     assert len(figures["samples"]) == experiment.SAMPLES
+
+
+def test_photographs_of_parts_are_labelled_by_what_is_seen(tmp_path, physics, monkeypatch):
+    monkeypatch.setattr(record, "_open", [{}])
+    options = argparse.Namespace(work=tmp_path, scenes=2, views=1, width=160, samples=4)
+    workshop.photograph_workshops(options)
+    labels = json.loads((tmp_path / "photos/labels.json").read_text())
+    assert [image["file_name"] for image in labels["images"]] == ["scene_0000_0000.jpg", "scene_0001_0000.jpg"]
+    assert len(labels["categories"]) == 12 and len(labels["annotations"]) >= 8
+    masks = [coco_mask.decode(one["segmentation"]) for one in labels["annotations"] if one["image_id"] == 1]
+    assert np.max(np.sum(masks, axis=0)) == 1  # of each pixel there is one part
+    photograph = cv2.imread(str(tmp_path / "photos/scene_0001_0000.jpg")).astype(float).mean(axis=2)
+    assert photograph.shape == masks[0].shape == (120, 160) and 40 < photograph.mean() < 215
+    edges = cv2.morphologyEx(np.max(masks, axis=0), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
+    change = cv2.morphologyEx(photograph, cv2.MORPH_GRADIENT, np.ones((3, 3)))
+    assert change[edges].mean() > 1.5 * np.median(change)  # outlines lie where the picture changes
+    assert experiment.scene_of(labels["images"][1]["file_name"]) == 1
+
+
+def test_a_brand_is_printed_in_the_colours_of_its_scan():
+    scan = make_package(1)  # a can
+    own, others = (relabel(scan, 5, 2, own_colours=own) for own in (True, False))
+
+    def hues(mesh: trimesh.Trimesh) -> np.ndarray:
+        pixels = np.asarray(mesh.visual.material.baseColorTexture.convert("HSV").resize((256, 256))).reshape(-1, 3)
+        counts = np.bincount(pixels[pixels[:, 1] > 60, 0] // 16, minlength=16)
+        return counts / counts.sum()
+
+    shared = [float(np.minimum(hues(scan), hues(mesh)).sum()) for mesh in (own, others)]
+    assert shared[0] > shared[1] + 0.1
 
 
 @pytest.mark.parametrize("seed", range(6))

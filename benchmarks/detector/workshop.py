@@ -1,0 +1,275 @@
+"""Photographs of the machine parts that no photograph is of: path-traced, elsewhere, by another camera.
+
+    python -m benchmarks.detector.workshop WORK [--scenes 10] [--views 5] [--width 960] [--samples 64] [--device cuda]
+
+Parts of the shipped scenes lie as they were dropped or poured, in their true materials, on benches of other workshops,
+under other lamps, and Mitsuba's path tracer takes their pictures. The camera is none of mitsplat's: its exposure,
+noise, tone curve, sharpening and JPEG are written here. WORK gets ``photos/``, a COCO folder with the masks of what is
+seen of each part, and ``assets/``, which ``workshop.yaml`` renders. Photographs that are there are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+# isort: off
+from mitsplat.device import use_device  # imports mitsplat, which must come before Dr.Jit
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pycocotools.mask as coco_mask
+import trimesh
+from ruamel.yaml import YAML
+from scipy.ndimage import gaussian_filter
+
+# isort: on
+from benchmarks.assets.photographing import Sensors
+from benchmarks.record import ROOT, figure, recording
+from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.camera import Camera
+from mitsplat.physics.settle import settle_layout
+from mitsplat.plugins.proxies import Occluder, Proxies
+from mitsplat.render.layers import make_sensor
+from mitsplat.scene.scene import load_scene
+from mitsplat.spec.lights import AreaLight, EnvironmentLight
+from scenes.build import materials as m
+from scenes.build.parts import build_part
+
+LEAST_SEEN = 0.15
+"""Share of a part that must be seen for it to be labelled, as of what is rendered."""
+
+
+def main() -> None:
+    """Read what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--scenes", type=int, default=10)
+    parser.add_argument("--views", type=int, default=5)
+    parser.add_argument("--width", type=int, default=960)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    with recording("detector.workshop", parser, options, ignore=("work",), gpu=options.device != "cpu"):
+        use_device(options.device)
+        photograph_workshops(options)
+
+
+def photograph_workshops(options: argparse.Namespace) -> None:
+    """Take the photographs of all scenes that are not there, and write the labels of all."""
+    photos, assets = options.work / "photos", options.work / "assets"
+    photos.mkdir(parents=True, exist_ok=True)
+    if not assets.exists():
+        shutil.copytree(ROOT / "scenes/assets", assets)
+    names = sorted(path.parent.name for path in assets.glob("*/asset.yaml") if path.parent.name != "workcell")
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for number in range(options.scenes):
+        stored = photos / f".scene_{number:04d}.json"
+        if not stored.exists():
+            stored.write_text(json.dumps(photograph_workshop(number, names, options)))
+        for shot in json.loads(stored.read_text()):
+            image = len(images)
+            images.append({"id": image, **shot["image"]})
+            annotations += [
+                {"id": len(annotations) + k, "image_id": image, **one} for k, one in enumerate(shot["objects"])
+            ]
+    categories = [{"id": k, "name": name} for k, name in enumerate(names, 1)]
+    labels = {"images": images, "annotations": annotations, "categories": categories}
+    (photos / "labels.json").write_text(json.dumps(labels))
+    figure(len(images), "", "photographs")
+    figure(len(annotations), "", "labelled parts")
+    print(f"{len(images)} photographs of {len(annotations)} parts: {photos}")
+
+
+def photograph_workshop(number: int, names: Sequence[str], options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Photographs of one layout in one workshop, and what is labelled in each."""
+    rng = np.random.default_rng([7, number])
+    poured = bool(number % 2)
+    lying = settled(options.work, number, poured=poured)
+    room = workshop(rng, poured=poured)
+    things = [placed(name, pose) for name, pose in lying]
+    scene = mitsuba_scene([*room, *(part for parts in things for part in parts)], lamps(rng))
+    integrator = mi.load_dict({"type": "path", "max_depth": 6})
+    sensors, shots = Sensors(), []
+    for view in range(options.views):
+        camera = hand_held(rng, options.width)
+        radiance = mi.render(scene, integrator=integrator, sensor=sensors.like(camera), spp=options.samples, seed=view)
+        name = f"scene_{number:04d}_{view:04d}.jpg"
+        picture = develop(np.nan_to_num(np.array(radiance)[..., :3].astype(np.float64)), rng)
+        cv2.imwrite(
+            str(options.work / "photos" / name),
+            picture[..., ::-1],
+            [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(80, 95))],
+        )
+        image = {"file_name": name, "width": camera.width, "height": camera.height}
+        shots.append({"image": image, "objects": labelled(camera, room, lying, things, names)})
+        print(name, len(shots[-1]["objects"]), flush=True)
+    return shots
+
+
+def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndarray]]:
+    """Names of parts and where they lie, poses of shape (4, 4) [m]: dropped on a bench, or poured into a tray."""
+    half = 0.12 if poured else 0.2
+    shapes: list[dict[str, Any]] = [
+        {"name": "bench", "friction": 0.6, "box": {"size": [1.2, 0.9, 0.05], "position": [0, 0, -0.025]}}
+    ]
+    if poured:
+        shapes.append({"name": "tray", "friction": 0.5, "bin": {"size": [0.28, 0.22, 0.05], "thickness": 0.004}})
+    scene = {
+        "name": "workshop",
+        "shapes": shapes,
+        "objects": [{"pool": "assets/*", "count": [10, 16] if poured else [8, 14]}],
+        "region": {"min": [-half, -0.8 * half, 0.03], "max": [half, 0.8 * half, 0.3]},
+        "enclosure": {"margin": 0.01 if poured else 0.15, "floor": 0.004 if poured else 0.0},
+        "settle": {"arrangement": "pile" if poured else "drop", "stepper": "mujoco", "attempts": 40},
+        "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.6, "height": 0.4},
+        "output": {"width": 64, "height": 48, "layouts": 1, "views": 1},
+        "seed": 1000 + number,
+    }
+    path = work / "layout.yaml"
+    with path.open("w") as file:
+        YAML(typ="safe").dump(scene, file)
+    loaded = load_scene(path)
+    layout = settle_layout(loaded, 0)
+    return [(loaded.assets[one.asset].name, np.array(one.world_from_object)) for one in layout.instances]
+
+
+def placed(name: str, pose: np.ndarray) -> tuple[Part, ...]:
+    """The true meshes of a part where it lies."""
+    scene = build_part(name, 0)[0].copy()
+    scene.apply_transform(pose)
+    return tuple(replace(part, name=f"{name} {part.name}") for part in read_parts(scene))
+
+
+def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[Part, ...]:
+    """A bench with a wall behind it and things that are none of the parts on it; the tray, where parts are poured."""
+    colours = [tuple(int(value) for value in rng.uniform(40, 225, 3)) for _ in range(12)]
+    scratched = m.scratched(m.cast(colours[1], rng), rng, count=80, length=(10, 120), gain=0.3)
+    tops = (m.concrete(rng, 512), m.beech(rng, 768, 512, 64), m.cast(colours[0], rng), scratched)
+    top, wall = tops[rng.integers(len(tops))], m.cast(colours[2], rng, strength=0.08)
+    room = {
+        "top": _worn(trimesh.creation.box(bounds=[(-0.6, -0.45, -0.05), (0.6, 0.45, 0)]), top, rng),
+        "wall": _worn(trimesh.creation.box(bounds=[(-2, 0.55, -0.8), (2, 0.6, 1.6)]), wall, rng),
+        "floor": _worn(trimesh.creation.box(bounds=[(-2, -2, -0.85), (2, 0.6, -0.8)]), m.concrete(rng, 256), rng),
+    }
+    for k in range(int(rng.integers(3, 7))):
+        size = rng.uniform((0.03, 0.03, 0.01), (0.14, 0.1, 0.12))
+        solid = (
+            trimesh.creation.box(size)
+            if rng.random() < 0.6
+            else trimesh.creation.cylinder(size[0] / 3, size[2], sections=48)
+        )
+        angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 0.42)
+        solid.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, np.pi), (0, 0, 1)))
+        solid.apply_translation((1.2 * away * np.cos(angle), away * np.sin(angle), size[2] / 2))
+        room[f"thing {k}"] = _worn(solid, m.cast(colours[3 + k], rng, size=64), rng)
+    if poured:
+        outer = trimesh.creation.box(bounds=[(-0.144, -0.114, 0), (0.144, 0.114, 0.05)])
+        inner = trimesh.creation.box(bounds=[(-0.14, -0.11, 0.004), (0.14, 0.11, 0.2)])
+        tray = trimesh.boolean.difference([outer, inner], engine="manifold")
+        room["tray"] = _worn(tray, m.cast(colours[10], rng, size=64), rng)
+    return read_parts(trimesh.Scene(room))
+
+
+def _worn(mesh: trimesh.Trimesh, image: m.Pixels, rng: np.random.Generator) -> trimesh.Trimesh:
+    return m.wear(mesh, image, m.box_uv(mesh, rng.uniform(0.15, 0.4)), roughness=rng.uniform(0.4, 0.9), metallic=0.0)
+
+
+def lamps(rng: np.random.Generator) -> dict[str, Any]:
+    """One to three lamps and what light is around."""
+    lights: list[Any] = [EnvironmentLight(kind="environment", radiance=float(rng.uniform(0.1, 0.5)))]
+    for _ in range(int(rng.integers(1, 4))):
+        turn, height, away = rng.uniform(-np.pi, 0), rng.uniform(0.5, 1.3), rng.uniform(0.8, 1.6)
+        place = away * np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
+        side = float(rng.uniform(0.05, 0.6))
+        warm = (1.0, float(rng.uniform(0.75, 1.0)), float(rng.uniform(0.5, 1.0)))
+        lights.append(
+            AreaLight(
+                kind="area",
+                position=tuple(place),
+                target=(0, 0, 0),
+                size=(side, side),
+                colour=warm,
+                radiance=float(rng.uniform(1.5, 5) / side**2),
+            )
+        )
+    return bake_lights(lights)
+
+
+def hand_held(rng: np.random.Generator, width: int) -> Camera:
+    """4:3, of a wider angle than the shipped scenes', from the free side of the bench."""
+    turn, height, away = rng.uniform(-2.8, -0.35), np.radians(rng.uniform(20, 75)), rng.uniform(0.38, 0.7)
+    target = np.array([*rng.uniform(-0.06, 0.06, 2), 0.01])
+    place = target + away * np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
+    up = np.array([0, 0, 1]) + rng.normal(0, 0.04, 3)
+    return Camera.look_at(place, target, up=up, width=width, height=width * 3 // 4, fov_x=62)
+
+
+def develop(radiance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What the camera makes of light (H, W, 3): uint8.
+
+    Metered by its middle tones, balanced a little wrong, with shot and read noise that neighbours share after
+    demosaicing, a filmic curve (Hable 2010), and sharpened.
+    """
+    height, width = radiance.shape[:2]
+    light = radiance * 0.3 * 2 ** rng.uniform(-0.6, 0.6) / max(float(np.quantile(radiance.mean(axis=2), 0.5)), 1e-6)
+    light *= rng.uniform(0.9, 1.1, 3)
+    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    light *= (1 - rng.uniform(0, 0.35) * (x**2 + y**2) / 2)[..., None]
+    grain = gaussian_filter(rng.normal(size=light.shape), (0.6, 0.6, 0))
+    light = np.maximum(light + grain / grain.std() * rng.uniform(0.2, 1) * np.sqrt(2e-4 * light.clip(0, 4) + 1e-5), 0)
+
+    def curve(value: np.ndarray | float) -> Any:
+        toe = value * (0.15 * value + 0.05) + 0.004
+        return toe / (value * (0.15 * value + 0.5) + 0.06) - 0.004 / 0.06
+
+    tone = (curve(4.0 * light) / curve(11.2)).clip(0, 1) ** (1 / 2.2)
+    amount, radius = rng.uniform(0.2, 1.0), rng.uniform(0.7, 1.4)
+    sharp = tone + amount * (tone - gaussian_filter(tone, (radius, radius, 0)))
+    return np.rint(255 * sharp.clip(0, 1)).astype(np.uint8)
+
+
+def labelled(
+    camera: Camera,
+    room: Sequence[Part],
+    lying: Sequence[tuple[str, np.ndarray]],
+    things: Sequence[Sequence[Part]],
+    names: Sequence[str],
+) -> list[dict[str, Any]]:
+    """COCO annotations of the parts of which enough is seen, by what the middle of each pixel shows."""
+    own = [[Occluder(part.mesh, k, dynamic=True) for part in parts] for k, parts in enumerate(things, 1)]
+    ways = make_sensor(camera).view().rays()
+
+    def shown(occluders: list[Occluder]) -> np.ndarray:
+        hit, _ = Proxies(occluders).nearest(ways)
+        return np.array(hit.instance).reshape(camera.height, camera.width)
+
+    seen = shown([*(Occluder(part.mesh, 0, dynamic=False) for part in room), *(one for some in own for one in some)])
+    objects = []
+    for number, ((name, _), occluders) in enumerate(zip(lying, own, strict=True), 1):
+        pixels, whole = seen == number, int((shown(occluders) == number).sum())
+        if whole == 0 or pixels.sum() < max(LEAST_SEEN * whole, 16):
+            continue
+        outline = coco_mask.encode(np.asfortranarray(pixels.astype(np.uint8)))
+        objects.append(
+            {
+                "category_id": names.index(name) + 1,
+                "segmentation": outline | {"counts": outline["counts"].decode()},
+                "bbox": coco_mask.toBbox(outline).tolist(),
+                "area": int(pixels.sum()),
+                "iscrowd": 0,
+                "visible_fraction": round(float(pixels.sum() / whole), 3),
+            }
+        )
+    return objects
+
+
+if __name__ == "__main__":
+    main()

@@ -22,9 +22,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import pycocotools.mask as coco_mask
 from ruamel.yaml import YAML
 
 from benchmarks.record import figure, recording
@@ -34,8 +32,6 @@ HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")
 SAMPLES = 200
 """Draws of scenes with replacement."""
-LEAST_SEEN = 0.15
-"""Share of an object that a cut of a photograph must show to be labelled: ``min_visible`` of what is rendered."""
 
 
 def read_arms(plan: Path = PLAN) -> dict[str, Any]:
@@ -101,53 +97,6 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
                 shutil.copy(work / "photos" / image["file_name"], folder)
         (folder / "labels.json").write_text(json.dumps(labels))
     return folder
-
-
-def cut_photographs(folder: Path, share: float) -> Path:
-    """A COCO folder beside another, of four overlapping cuts of each photograph: so much of its width and height."""
-    labels = json.loads((folder / "labels.json").read_text())
-    out = folder.with_name(f"{folder.name}_cut")
-    out.mkdir(exist_ok=True)
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    for image in labels["images"]:
-        picture = cv2.imread(str(folder / image["file_name"]))
-        height, width = (round(share * side) for side in picture.shape[:2])
-        objects = [one for one in labels["annotations"] if one["image_id"] == image["id"]]
-        masks = [_mask(one["segmentation"], image) for one in objects]
-        for top in (0, picture.shape[0] - height):
-            for left in (0, picture.shape[1] - width):
-                window = slice(top, top + height), slice(left, left + width)
-                name = f"{Path(image['file_name']).stem}_{top}_{left}.png"
-                images.append({"id": len(images), "file_name": name, "width": width, "height": height})
-                if not (out / name).exists():
-                    cv2.imwrite(str(out / name), picture[window])
-                for one, mask in zip(objects, masks, strict=True):
-                    seen = (one["visible_fraction"] or 1) * mask[window].sum() / mask.sum()
-                    if seen >= LEAST_SEEN:
-                        outline = coco_mask.encode(np.asfortranarray(mask[window]))
-                        annotations.append(
-                            {
-                                "id": len(annotations),
-                                "image_id": images[-1]["id"],
-                                "category_id": one["category_id"],
-                                "segmentation": outline | {"counts": outline["counts"].decode()},
-                                "bbox": coco_mask.toBbox(outline).tolist(),
-                                "area": int(coco_mask.area(outline)),
-                                "iscrowd": 0,
-                            }
-                        )
-    cut = {"images": images, "annotations": annotations, "categories": labels["categories"]}
-    (out / "labels.json").write_text(json.dumps(cut))
-    return out
-
-
-def _mask(segmentation: dict[str, Any], image: Mapping[str, Any]) -> np.ndarray:
-    """The pixels of run lengths, compressed or not, shape (height, width)."""
-    if isinstance(segmentation["counts"], list):
-        segmentation = coco_mask.frPyObjects(segmentation, image["height"], image["width"])
-    pixels: np.ndarray = coco_mask.decode(segmentation)
-    return pixels
 
 
 def listed(rendered: list[Path], folder: Path, *, images: int | None, first: int | None) -> Path:
@@ -218,8 +167,6 @@ def measure(options: argparse.Namespace) -> None:
     for number, fold in enumerate(folds if learns_photographs else [set().union(*folds)]):
         real = photographs(work, set().union(*folds) - fold, f"without_fold_{number}") if learns_photographs else None
         run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
-        if real is not None and "cut" in arm:
-            real = cut_photographs(real, arm["cut"])
         # Without rendered images photographs are what is learnt, not what is mixed in.
         trained = train_detector(rendered or [real], run, settings, real=real if rendered else None)
         figure(trained.record["finished"]["seconds"], "s", "training", number)

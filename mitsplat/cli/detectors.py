@@ -35,6 +35,13 @@ def train(
         typer.Option(metavar="DIR", help="Labelled photographs to mix in: a YOLO folder, a COCO folder or a dataset."),
     ] = None,
     share: Annotated[float, typer.Option(help="Of photographs among the images of every step.")] = 0.1,
+    real_size: Annotated[
+        int | None,
+        typer.Option(
+            help="Longer side at which photographs will be searched [px]: above --size they are cut to tiles that show "
+            "things as large."
+        ),
+    ] = None,
     model: Annotated[
         str, typer.Option(help="Network of Ultralytics: yolo11n-seg for masks, yolo11n for boxes; s and m are larger.")
     ] = "yolo11n-seg.yaml",
@@ -71,6 +78,7 @@ def train(
         batch=batch,
         size=size,
         share=share,
+        real_size=real_size,
         mirror=mirror,
         seed=seed,
         device=device,
@@ -153,6 +161,11 @@ def compare(
         for trait in traits:
             if trait.advice:
                 _tell(f"{name}: {trait.name}", trait)
+    typer.echo(
+        f"objects are as large on photographs of {found.same_size} px as on rendered images of {size} px: "
+        f"`mitsplat evaluate --size {found.same_size}`"
+        + (f", `mitsplat train --size {size} --real-size {found.same_size}`" if found.same_size > size else "")
+    )
     if out is not None:
         write_text(out, json.dumps(asdict(found), indent=1) + "\n")
         typer.echo(f"measured: {out}")

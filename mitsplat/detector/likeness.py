@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import binom
 
 from mitsplat.arrays import BoolArray, ByteImage
-from mitsplat.detector.sets import Instance, Sample, Split, in_classes, read_set
+from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress
@@ -36,7 +36,7 @@ _FLAT_QUANTILE = 0.4
 _DARK = 40
 """Bytes below which a sensor clips its noise."""
 
-BRIGHTNESS = "brightness of objects"
+BRIGHTNESS, SIZE = "brightness of objects", "size of objects"
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
         "of 255",
@@ -44,7 +44,7 @@ _TRAITS: dict[str, tuple[str, str, str]] = {
         "raise randomise.exposure, light objects more, or darken what lies around them",
     ),
     "saturation of objects": ("%", "lower randomise.saturation", "raise randomise.saturation, or give less gloss"),
-    "size of objects": ("px", "take cameras farther away", "take cameras nearer"),
+    SIZE: ("px", "take cameras farther away", "take cameras nearer"),
     "objects of an image": ("", "lower objects[].count", "raise objects[].count, or show more of them at once"),
     "objects cut by the border": ("% of an image's", "look at all of them, from farther", "let views cut more off"),
     "brightness of images": ("of 255", "darken the backdrop", "brighten the backdrop"),
@@ -86,12 +86,15 @@ class Likeness:
     Attributes:
         images: How many rendered images were measured.
         photographs: How many photographs.
+        same_size: Longer side of photographs, a multiple of 32, at which their objects are as large (median) as those
+            of rendered images [px].
         traits: Of all of them.
         classes: Brightness and saturation of each class that both show often enough.
     """
 
     images: int
     photographs: int
+    same_size: int
     traits: tuple[Trait, ...]
     classes: dict[str, tuple[Trait, ...]]
 
@@ -144,7 +147,9 @@ def compare_with_photographs(
         for index, name in enumerate(real.class_names)
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
-    return Likeness(len(ours), len(theirs), traits_of(None), classes)
+    ours_are, theirs_are = (float(np.median(side[SIZE, None] or 1.0)) for side in sides)
+    same_size = max(round(size * ours_are / theirs_are / STRIDE), 1) * STRIDE
+    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes)
 
 
 def _evenly(samples: list[Sample], most: int) -> list[Sample]:
@@ -164,7 +169,7 @@ def _measure(sample: Sample, size: int, values: _Values) -> None:
     objects, cut = [instance for instance in sample.instances if not instance.crowd], 0
     for instance in objects:
         x0, y0, x1, y1 = instance.box
-        values["size of objects", None].append(scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0))))
+        values[SIZE, None].append(scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0))))
         cut += bool(min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1)
         inside = _inside(instance, sample, width, height)
         if inside.sum() >= _SMALLEST:

@@ -41,6 +41,9 @@ Split = Literal["train", "val", "test", "all"]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Images that Ultralytics reads as well."""
 
+STRIDE = 32
+"""What Ultralytics' networks divide the sides of images by [px]."""
+
 _BEYOND = 0.01
 """How far positions may lie outside of the image, as a share of its sides; they are cut off there."""
 _SMALLEST = 10

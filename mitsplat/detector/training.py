@@ -6,6 +6,7 @@ The folder of a run::
     weights.pt        the final weights, once it is finished
     weights/last.pt   the last checkpoint, until then
     data/             the images as links and their labels, until then
+    tiles/            what photographs are cut to, until then
     results.csv       losses and learning rates of every epoch of 50 steps, by Ultralytics
     args.yaml         all of Ultralytics' settings
 
@@ -34,18 +35,18 @@ from mitsplat.detector.libraries import (
     versions,
 )
 from mitsplat.detector.mix import plan_images
-from mitsplat.detector.sets import LabelledSet, check_masks, in_classes, read_set
+from mitsplat.detector.sets import STRIDE, LabelledSet, check_masks, in_classes, read_set
+from mitsplat.detector.tiles import cut_photographs
 from mitsplat.errors import InputError
 from mitsplat.files import storage_errors, write_text
 from mitsplat.progress import Progress
 
 RUN = "run.json"
 WEIGHTS = "weights.pt"
-_OWN = frozenset((RUN, WEIGHTS, "weights", "data", "results.csv", "args.yaml", ".lock", "evaluation"))
+_TILES = "tiles"
+_OWN = frozenset((RUN, WEIGHTS, "weights", "data", _TILES, "results.csv", "args.yaml", ".lock", "evaluation"))
 """Names of what may lie in the folder of a run, beside temporary files and evaluations."""
 _SETS = ("datasets", "real")
-_STRIDE = 32
-"""What Ultralytics' networks divide the sides of images by [px]."""
 _MOST_WORKERS = 8
 
 
@@ -60,6 +61,8 @@ class TrainSettings:
         batch: Images of a step.
         size: Longer side that images are scaled to [px], a multiple of 32.
         share: Of real images among those of each step, where there are some.
+        real_size: Longer side at which photographs will be searched [px]. If it is more than ``size``, they are cut to
+            tiles that show things as large.
         mirror: Whether half of the images are mirrored left to right: wrong of what is printed, and of left and right
             parts that are told apart.
         seed: Decides everything that is random.
@@ -73,20 +76,23 @@ class TrainSettings:
     batch: int = 16
     size: int = 640
     share: float = 0.1
+    real_size: int | None = None
     mirror: bool = True
     seed: int = 0
     device: str = "auto"
     workers: int | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("batch", 1), ("size", 2 * _STRIDE), ("seed", 0), ("workers", 0)):
+        for name, least in (("steps", 1), ("batch", 1), ("size", 2 * STRIDE), ("seed", 0), ("workers", 0)):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise InputError(f"{name} must be {least} or more (got {value})")
-        if self.size % _STRIDE:
-            raise InputError(f"size must be a multiple of {_STRIDE} px (got {self.size})")
+        if self.size % STRIDE:
+            raise InputError(f"size must be a multiple of {STRIDE} px (got {self.size})")
         if not 0 < self.share < 1:
             raise InputError(f"share of real images must lie between 0 and 1 (got {self.share:g})")
+        if self.real_size is not None and self.real_size < self.size:
+            raise InputError(f"real_size must be no less than size, {self.size} px (got {self.real_size})")
         check_device(self.device)
 
     def decisive(self) -> dict[str, Any]:
@@ -146,12 +152,15 @@ def train_detector(
 
     Raises:
         InputError: If images or labels are missing, torn or out of range, classes differ, masks are to be learnt from
-            boxes, weights do not fit, or the folder holds something else or a run with other settings.
+            boxes, weights do not fit, ``real_size`` is of no photographs, or the folder holds something else or a run
+            with other settings.
         MissingResourceError: If Ultralytics, the GPU or its memory is missing.
     """
     settings, out = settings or TrainSettings(), Path(out)
     if not datasets:
         raise InputError("there must be a dataset to learn from (got none)")
+    if settings.real_size is not None and real is None:
+        raise InputError("--real-size is that of photographs: name them by --real")
     if settings.weights is not None and not settings.weights.is_file():
         raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {settings.weights})")
     _check_folder(out)
@@ -180,8 +189,8 @@ def train_detector(
         write_text(out / RUN, json.dumps(record, indent=2) + "\n")
         finished = _train(sets, photographs, out, settings, masks=masks, device=device, progress=progress)
         write_text(out / RUN, json.dumps(record | {"finished": finished}, indent=2) + "\n")
-        shutil.rmtree(out / "data", ignore_errors=True)
-        shutil.rmtree(out / "weights", ignore_errors=True)
+        for name in ("data", _TILES, "weights"):
+            shutil.rmtree(out / name, ignore_errors=True)
         return Run(out, record | {"finished": finished})
 
 
@@ -265,6 +274,9 @@ def _train(
     from mitsplat.detector import fixed_steps  # optional: it derives from Ultralytics
 
     rendered = sum(len(found.samples) for found in sets)
+    if photographs is not None and settings.real_size is not None and settings.real_size > settings.size:
+        shutil.rmtree(out / _TILES, ignore_errors=True)
+        photographs = cut_photographs(photographs, settings.real_size, settings.size, out / _TILES)
     plan = plan_images(
         rendered,
         0 if photographs is None else len(photographs.samples),

@@ -140,32 +140,3 @@ def test_packages_are_closed_and_printed(seed):
     package.merge_vertices(merge_tex=True, merge_norm=True)
     assert package.is_watertight and package.volume > 0
     assert package.visual.uv.min() >= 0 and package.visual.uv.max() <= 1
-
-
-def test_photographs_are_cut_as_rendered_cameras_see(tmp_path):
-    picture = np.arange(40 * 60 * 3, dtype=np.uint8).reshape(40, 60, 3)
-    cv2.imwrite(str(tmp_path / "scene_0001_0000.png"), picture)
-    masks = {1: np.s_[30:38, 44:54], 2: np.s_[8:12, 10:50]}
-    annotations = []
-    for number, where in masks.items():
-        mask = np.zeros((40, 60), dtype=np.uint8, order="F")
-        mask[where] = 1
-        outline = coco_mask.encode(mask)
-        outline["counts"] = outline["counts"].decode()
-        annotations.append(
-            {"id": number, "image_id": 5, "category_id": number, "segmentation": outline, "visible_fraction": 0.2}
-        )
-    image = {"id": 5, "file_name": "scene_0001_0000.png", "width": 60, "height": 40}
-    (tmp_path / "labels.json").write_text(
-        json.dumps({"images": [image], "annotations": annotations, "categories": [{"id": 1, "name": "tin"}]})
-    )
-
-    out = experiment.cut_photographs(tmp_path, 0.5)
-
-    labels = json.loads((out / "labels.json").read_text())
-    names = {one["id"]: one["file_name"] for one in labels["images"]}
-    assert {experiment.scene_of(name) for name in names.values()} == {1}
-    np.testing.assert_array_equal(cv2.imread(str(out / "scene_0001_0000_20_30.png")), picture[20:, 30:])
-    found = {(names[one["image_id"]], one["category_id"]): one["bbox"] for one in labels["annotations"]}
-    # Of the long one, of which a fifth was seen, each half shows too little.
-    assert found == {("scene_0001_0000_20_30.png", 1): [14, 10, 10, 8]}

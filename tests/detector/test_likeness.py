@@ -54,6 +54,17 @@ def test_what_is_measured_is_what_was_painted(rendered: Path, photographs: Path)
     assert trait(found, "objects of an image").real[::2] == (1, 2)
 
 
+def test_photographs_that_show_things_small_are_searched_large(tmp_path: Path, rendered: Path) -> None:
+    photographs = write_coco(tmp_path / "photographs", 20, form="boxes", first=1000)
+    labels = json.loads((photographs / "labels.json").read_text())
+    for image in labels["images"]:  # each in the corner of a picture twice as large
+        path = photographs / "photos" / image["file_name"]
+        cv2.imwrite(str(path), np.pad(cv2.imread(str(path)), ((0, HEIGHT), (0, WIDTH), (0, 0))))
+        image.update(width=2 * WIDTH, height=2 * HEIGHT)
+    (photographs / "labels.json").write_text(json.dumps(labels))
+    assert compare_with_photographs([rendered], photographs, size=640).same_size == pytest.approx(1280, abs=130)
+
+
 @pytest.mark.parametrize(
     ("name", "do", "says"),
     [

@@ -51,6 +51,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
     "small": ({"size": 32}, r"size must be 64 or more \(got 32\)"),
     "odd": ({"size": 100}, r"size must be a multiple of 32 px \(got 100\)"),
     "share": ({"share": 1.0}, r"share of real images must lie between 0 and 1 \(got 1\)"),
+    "real_size": ({"real_size": 320}, r"real_size must be no less than size, 640 px \(got 320\)"),
     "seed": ({"seed": -1}, r"seed must be 0 or more"),
     "device": ({"device": "gpu"}, r"device must be auto, cpu, cuda or cuda:N \(got gpu\)"),
 }
@@ -120,6 +121,29 @@ def test_a_run_records_what_it_was_made_of(no_libraries: list[dict[str, Any]], t
     assert open_run(tmp_path / "run").class_names == ("disc", "box")
     over = train_detector([cell, cell], tmp_path / "run", TINY, real=photographs, overwrite=True)
     assert not over.was_finished and len(no_libraries) == 2
+
+
+def test_photographs_are_cut_to_the_size_at_which_they_will_be_searched(
+    no_libraries: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    cell = write_yolo(tmp_path / "cell", {"train": 5}, mitsplat=True)
+    photographs = write_coco(tmp_path / "photographs", 3, first=50)
+    listed: list[str] = []
+    train_job = sys.modules["mitsplat.detector.fixed_steps"].train_job
+
+    def look(job: Any, **settings: Any) -> Any:
+        listed.extend(job.images.read_text().splitlines())
+        return train_job(job, **settings)
+
+    sys.modules["mitsplat.detector.fixed_steps"].train_job = look  # type: ignore[attr-defined]
+    run = train_detector([cell], tmp_path / "run", _other(real_size=96), real=photographs)
+    assert len(listed) == 5 + 4 * 3 and run.record["real"]["images"] == 3
+    assert no_libraries[0]["job"].plan.max() >= 5 + 3
+    assert not (tmp_path / "run/tiles").exists()
+    with pytest.raises(InputError, match=r"was begun with real_size 96 \(got None\)"):
+        train_detector([cell], tmp_path / "run", TINY, real=photographs)
+    with pytest.raises(InputError, match="--real-size is that of photographs: name them by --real"):
+        train_detector([cell], tmp_path / "other", _other(real_size=96))
 
 
 def _other(**changes: Any) -> TrainSettings:

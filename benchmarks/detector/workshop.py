@@ -34,6 +34,7 @@ from benchmarks.assets.photographing import Sensors
 from benchmarks.record import ROOT, figure, recording
 from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
+from mitsplat.lighting.panorama import unit_vector
 from mitsplat.physics.settle import settle_layout
 from mitsplat.plugins.proxies import Occluder, Proxies
 from mitsplat.render.layers import make_sensor
@@ -186,8 +187,7 @@ def lamps(rng: np.random.Generator) -> dict[str, Any]:
     """One to three lamps and what light is around."""
     lights: list[Any] = [EnvironmentLight(kind="environment", radiance=float(rng.uniform(0.1, 0.5)))]
     for _ in range(int(rng.integers(1, 4))):
-        turn, height, away = rng.uniform(-np.pi, 0), rng.uniform(0.5, 1.3), rng.uniform(0.8, 1.6)
-        place = away * np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
+        place = rng.uniform(0.8, 1.6) * unit_vector(rng.uniform(-180, 0), rng.uniform(30, 75))
         side = float(rng.uniform(0.05, 0.6))
         warm = (1.0, float(rng.uniform(0.75, 1.0)), float(rng.uniform(0.5, 1.0)))
         lights.append(
@@ -205,9 +205,8 @@ def lamps(rng: np.random.Generator) -> dict[str, Any]:
 
 def hand_held(rng: np.random.Generator, width: int) -> Camera:
     """4:3, of a wider angle than the shipped scenes', from the free side of the bench."""
-    turn, height, away = rng.uniform(-2.8, -0.35), np.radians(rng.uniform(20, 75)), rng.uniform(0.38, 0.7)
     target = np.array([*rng.uniform(-0.06, 0.06, 2), 0.01])
-    place = target + away * np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
+    place = target + rng.uniform(0.38, 0.7) * unit_vector(rng.uniform(-160, -20), rng.uniform(20, 75))
     up = np.array([0, 0, 1]) + rng.normal(0, 0.04, 3)
     return Camera.look_at(place, target, up=up, width=width, height=width * 3 // 4, fov_x=62)
 

@@ -162,7 +162,7 @@ def compare(
             if trait.advice:
                 _tell(f"{name}: {trait.name}", trait)
     typer.echo(
-        f"objects are as large on photographs of {found.same_size} px as on rendered images of {size} px: "
+        f"objects are about as large on photographs of {found.same_size} px as on rendered images of {size} px: "
         f"`mitsplat evaluate --size {found.same_size}`"
         + (f", `mitsplat train --size {size} --real-size {found.same_size}`" if found.same_size > size else "")
     )

@@ -37,6 +37,7 @@ _DARK = 40
 """Bytes below which a sensor clips its noise."""
 
 BRIGHTNESS, SIZE = "brightness of objects", "size of objects"
+_WHOLE = "size of objects that no border cuts"
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
         "of 255",
@@ -86,8 +87,9 @@ class Likeness:
     Attributes:
         images: How many rendered images were measured.
         photographs: How many photographs.
-        same_size: Longer side of photographs, a multiple of 32, at which their objects are as large (median) as those
-            of rendered images [px].
+        same_size: Longer side of photographs, a multiple of 32, at which their objects are about as large as those of
+            rendered images [px]: by the median over classes of the ratio of upper quartiles, as what is hidden looks
+            smaller, of objects that no border cuts.
         traits: Of all of them.
         classes: Brightness and saturation of each class that both show often enough.
     """
@@ -147,9 +149,19 @@ def compare_with_photographs(
         for index, name in enumerate(real.class_names)
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
-    ours_are, theirs_are = (float(np.median(side[SIZE, None] or 1.0)) for side in sides)
-    same_size = max(round(size * ours_are / theirs_are / STRIDE), 1) * STRIDE
+    larger = _larger(sides, len(real.class_names))
+    same_size = max(round(size * larger / STRIDE), 1) * STRIDE
     return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes)
+
+
+def _larger(sides: tuple[_Values, _Values], classes: int) -> float:
+    """How much larger rendered objects are than photographed ones, 1 if no class is shown often enough by both."""
+    ratios = []
+    for index in range(classes):
+        ours, theirs = (side.get((_WHOLE, index), []) for side in sides)
+        if len(ours) >= FEWEST_RENDERED and len(theirs) >= FEWEST:
+            ratios.append(np.quantile(ours, 0.75) / np.quantile(theirs, 0.75))
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def _evenly(samples: list[Sample], most: int) -> list[Sample]:
@@ -169,8 +181,12 @@ def _measure(sample: Sample, size: int, values: _Values) -> None:
     objects, cut = [instance for instance in sample.instances if not instance.crowd], 0
     for instance in objects:
         x0, y0, x1, y1 = instance.box
-        values[SIZE, None].append(scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0))))
-        cut += bool(min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1)
+        side = scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0)))
+        values[SIZE, None].append(side)
+        if min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1:
+            cut += 1
+        else:
+            values[_WHOLE, instance.class_index].append(side)
         inside = _inside(instance, sample, width, height)
         if inside.sum() >= _SMALLEST:
             pixels = picture[inside].astype(float)

@@ -46,7 +46,7 @@ STRIDE = 32
 
 _BEYOND = 0.01
 """How far positions may lie outside of the image, as a share of its sides; they are cut off there."""
-_SMALLEST = 10
+SMALLEST = 10
 """Sides of images that Ultralytics takes [px]."""
 _ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
 """The EXIF tag by which OpenCV turns images as it reads them, and its values that swap width and height."""
@@ -478,8 +478,8 @@ def _look(path: Path) -> tuple[int, int, ContentHash]:
         raise InputError(f"{path}: cannot be read as an image ({error})") from error
     if jpeg and not data.endswith(b"\xff\xd9"):
         raise InputError(f"{path}: is torn: a JPEG file must end with its end marker")
-    if min(width, height) < _SMALLEST:
-        raise InputError(f"{path}: an image must have sides of {_SMALLEST} px or more (got {width} x {height})")
+    if min(width, height) < SMALLEST:
+        raise InputError(f"{path}: an image must have sides of {SMALLEST} px or more (got {width} x {height})")
     return (height, width, ContentHash(data)) if turned else (width, height, ContentHash(data))
 
 

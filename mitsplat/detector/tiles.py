@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pycocotools.mask as coco_mask
 
-from mitsplat.detector.sets import Instance, LabelledSet, Sample
+from mitsplat.detector.sets import SMALLEST, Instance, LabelledSet, Sample
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import outline
 
@@ -34,7 +34,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
         folder: Where tiles are written, as JPEG files.
 
     Raises:
-        InputError: If a photograph cannot be read.
+        InputError: If a photograph cannot be read, or its tiles are too small.
     """
     folder.mkdir(parents=True, exist_ok=True)
     samples = []
@@ -43,6 +43,11 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
         if picture is None:
             raise InputError(f"{sample.path}: cannot be read as an image")
         width, height = (max(round(side * size / real_size), 1) for side in (sample.width, sample.height))
+        if min(width, height) < SMALLEST:
+            raise InputError(
+                f"{sample.path}: a tile of it must have sides of {SMALLEST} px or more (got {width} x {height}): give "
+                f"a --real-size nearer to --size, {size}"
+            )
         for top in _starts(sample.height, height):
             for left in _starts(sample.width, width):
                 path = folder / f"{number:05d}_{top}_{left}.jpg"

@@ -99,6 +99,8 @@ def smaller(words: list[str]) -> list[str]:
         if option in kept:
             place = kept.index(option)
             del kept[place : place + 2]
+    if "--real-size" in kept:  # no more than half as much again as the smaller --size
+        kept[kept.index("--real-size") + 1] = "96"
     if "--only" in kept and "-n" in added:
         added = added[: added.index("-n")] + added[added.index("-n") + 2 :]
     return kept + added

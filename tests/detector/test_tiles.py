@@ -10,6 +10,7 @@ import pytest
 
 from mitsplat.detector.sets import Instance, LabelledSet, Sample, read_set
 from mitsplat.detector.tiles import cut_photographs
+from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from tests.detector.painted import HEIGHT, WIDTH, paint, write_coco, write_yolo
 
@@ -50,7 +51,15 @@ def test_boxes_are_cut_with_the_picture(tmp_path: Path) -> None:
     assert [one.box for one in tiles[3].instances] == [(0, 0, 5, 33)]
 
 
-@pytest.mark.parametrize("longer", [97, 128, 200, 960])
+def test_tiles_of_a_few_pixels_are_refused(tmp_path: Path) -> None:
+    photographs = read_set(write_yolo(tmp_path / "photographs", {"train": 1}), "all")
+    with pytest.raises(
+        InputError, match=r"sides of 10 px or more \(got 6 x 4\): give a --real-size nearer"
+    ):
+        cut_photographs(photographs, 960, 64, tmp_path / "tiles")
+
+
+@pytest.mark.parametrize("longer", [97, 128, 200, 480])
 def test_a_thing_of_a_third_of_a_tile_is_whole_in_one(tmp_path: Path, longer: int) -> None:
     photographs = read_set(write_yolo(tmp_path / "photographs", {"train": 1}), "all")
     tiles = cut_photographs(photographs, longer, 96, tmp_path / "tiles").samples

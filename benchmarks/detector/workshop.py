@@ -14,7 +14,6 @@ import argparse
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +30,15 @@ from scipy.ndimage import gaussian_filter
 
 # isort: on
 from benchmarks.assets.photographing import Sensors
+from benchmarks.light.shadows import block, nearest_object, placed, shipped, worn
 from benchmarks.record import ROOT, figure, recording
 from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.camera import Camera
 from mitsplat.lighting.panorama import unit_vector
 from mitsplat.physics.settle import settle_layout
-from mitsplat.plugins.proxies import Occluder, Proxies
-from mitsplat.render.layers import make_sensor
 from mitsplat.scene.scene import load_scene
 from mitsplat.spec.lights import AreaLight, EnvironmentLight
 from scenes.build import materials as m
-from scenes.build.parts import build_part
 
 LEAST_SEEN = 0.15
 """Share of a part that must be seen for it to be labelled, as of what is rendered."""
@@ -95,7 +92,7 @@ def photograph_workshop(number: int, names: Sequence[str], options: argparse.Nam
     poured = bool(number % 2)
     lying = settled(options.work, number, poured=poured)
     room = workshop(rng, poured=poured)
-    things = [placed(name, pose) for name, pose in lying]
+    things = [placed(shipped(name, pose)) for name, pose in lying]
     scene = mitsuba_scene([*room, *(part for parts in things for part in parts)], lamps(rng))
     integrator = mi.load_dict({"type": "path", "max_depth": 6})
     sensors, shots = Sensors(), []
@@ -142,13 +139,6 @@ def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndar
     return [(loaded.assets[one.asset].name, np.array(one.world_from_object)) for one in layout.instances]
 
 
-def placed(name: str, pose: np.ndarray) -> tuple[Part, ...]:
-    """The true meshes of a part where it lies."""
-    scene = build_part(name, 0)[0].copy()
-    scene.apply_transform(pose)
-    return tuple(replace(part, name=f"{name} {part.name}") for part in read_parts(scene))
-
-
 def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[Part, ...]:
     """A bench with a wall behind it and things that are none of the parts on it; the tray, where parts are poured."""
     colours = [tuple(int(value) for value in rng.uniform(40, 225, 3)) for _ in range(12)]
@@ -156,9 +146,9 @@ def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[Part, ...]:
     tops = (m.concrete(rng, 512), m.beech(rng, 768, 512, 64), m.cast(colours[0], rng), scratched)
     top, wall = tops[rng.integers(len(tops))], m.cast(colours[2], rng, strength=0.08)
     room = {
-        "top": _worn(trimesh.creation.box(bounds=[(-0.6, -0.45, -0.05), (0.6, 0.45, 0)]), top, rng),
-        "wall": _worn(trimesh.creation.box(bounds=[(-2, 0.55, -0.8), (2, 0.6, 1.6)]), wall, rng),
-        "floor": _worn(trimesh.creation.box(bounds=[(-2, -2, -0.85), (2, 0.6, -0.8)]), m.concrete(rng, 256), rng),
+        "top": _worn(block((-0.6, -0.45, -0.05), (0.6, 0.45, 0)), top, rng),
+        "wall": _worn(block((-2, 0.55, -0.8), (2, 0.6, 1.6)), wall, rng),
+        "floor": _worn(block((-2, -2, -0.85), (2, 0.6, -0.8)), m.concrete(rng, 256), rng),
     }
     for k in range(int(rng.integers(3, 7))):
         size = rng.uniform((0.03, 0.03, 0.01), (0.14, 0.1, 0.12))
@@ -172,15 +162,15 @@ def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[Part, ...]:
         solid.apply_translation((1.2 * away * np.cos(angle), away * np.sin(angle), size[2] / 2))
         room[f"thing {k}"] = _worn(solid, m.cast(colours[3 + k], rng, size=64), rng)
     if poured:
-        outer = trimesh.creation.box(bounds=[(-0.144, -0.114, 0), (0.144, 0.114, 0.05)])
-        inner = trimesh.creation.box(bounds=[(-0.14, -0.11, 0.004), (0.14, 0.11, 0.2)])
+        outer = block((-0.144, -0.114, 0), (0.144, 0.114, 0.05))
+        inner = block((-0.14, -0.11, 0.004), (0.14, 0.11, 0.2))
         tray = trimesh.boolean.difference([outer, inner], engine="manifold")
         room["tray"] = _worn(tray, m.cast(colours[10], rng, size=64), rng)
     return read_parts(trimesh.Scene(room))
 
 
 def _worn(mesh: trimesh.Trimesh, image: m.Pixels, rng: np.random.Generator) -> trimesh.Trimesh:
-    return m.wear(mesh, image, m.box_uv(mesh, rng.uniform(0.15, 0.4)), roughness=rng.uniform(0.4, 0.9), metallic=0.0)
+    return worn(mesh, image, tile=rng.uniform(0.15, 0.4), roughness=rng.uniform(0.4, 0.9))
 
 
 def lamps(rng: np.random.Generator) -> dict[str, Any]:
@@ -243,17 +233,10 @@ def labelled(
     names: Sequence[str],
 ) -> list[dict[str, Any]]:
     """COCO annotations of the parts of which enough is seen, by what the middle of each pixel shows."""
-    own = [[Occluder(part.mesh, k, dynamic=True) for part in parts] for k, parts in enumerate(things, 1)]
-    ways = make_sensor(camera).view().rays()
-
-    def shown(occluders: list[Occluder]) -> np.ndarray:
-        hit, _ = Proxies(occluders).nearest(ways)
-        return np.array(hit.instance).reshape(camera.height, camera.width)
-
-    seen = shown([*(Occluder(part.mesh, 0, dynamic=False) for part in room), *(one for some in own for one in some)])
+    seen = nearest_object(camera, room, things)
     objects = []
-    for number, ((name, _), occluders) in enumerate(zip(lying, own, strict=True), 1):
-        pixels, whole = seen == number, int((shown(occluders) == number).sum())
+    for number, ((name, _), parts) in enumerate(zip(lying, things, strict=True), 1):
+        pixels, whole = seen == number, np.count_nonzero(nearest_object(camera, (), [parts]))
         if whole == 0 or pixels.sum() < max(LEAST_SEEN * whole, 16):
             continue
         outline = coco_mask.encode(np.asfortranarray(pixels.astype(np.uint8)))

@@ -111,8 +111,10 @@ def pose(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> 
     return np.asarray(matrix)
 
 
-def worn(mesh: trimesh.Trimesh, image: m.Pixels, *, roughness: float = 0.7, metallic: float = 0.0) -> trimesh.Trimesh:
-    return m.wear(mesh, image, m.box_uv(mesh, 0.2), roughness=roughness, metallic=metallic)
+def worn(
+    mesh: trimesh.Trimesh, image: m.Pixels, *, tile: float = 0.2, roughness: float = 0.7, metallic: float = 0.0
+) -> trimesh.Trimesh:
+    return m.wear(mesh, image, m.box_uv(mesh, tile), roughness=roughness, metallic=metallic)
 
 
 def block(low: Sequence[float], high: Sequence[float]) -> trimesh.Trimesh:
@@ -298,7 +300,7 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     everything = [*room, *(part for parts in things for part in parts)]
     photo, _ = shots.take(f"{light}_photo", everything, lights)
     empty, _ = shots.take(f"{light}_empty", room, lights)
-    alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup, room, things)
+    alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup.camera, room, things)
     for number, (thing, parts) in enumerate(zip(setup.things, things, strict=True), 1):
         captured, own = shots.take(f"alone_{thing.name}", parts, bake_lights("uniform"))
         alone = np.where((seen == number)[..., None], captured / np.maximum(own, 1e-6)[..., None], alone)
@@ -315,12 +317,12 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
 
 
-def nearest_object(setup: Setup, room: Sequence[Part], things: Sequence[Sequence[Part]]) -> npt.NDArray[np.uint32]:
+def nearest_object(camera: Camera, room: Sequence[Part], things: Sequence[Sequence[Part]]) -> npt.NDArray[np.uint32]:
     """Number of the object that the middle of each pixel shows (H, W), 0 for the surroundings."""
     occluders = [Occluder(part.mesh, 0, dynamic=False) for part in room]
     occluders += [Occluder(part.mesh, i, dynamic=True) for i, parts in enumerate(things, 1) for part in parts]
-    hit, _ = Proxies(occluders).nearest(make_sensor(setup.camera).view().rays())
-    return np.array(hit.instance).reshape(setup.camera.height, setup.camera.width)
+    hit, _ = Proxies(occluders).nearest(make_sensor(camera).view().rays())
+    return np.array(hit.instance).reshape(camera.height, camera.width)
 
 
 def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth) -> dict[str, Float64Array]:

@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 import pycocotools.mask as coco_mask
 
-from mitsplat.detector.sets import SMALLEST, Instance, LabelledSet, Sample
+from mitsplat.arrays import BoolArray
+from mitsplat.detector.sets import SMALLEST, Instance, LabelledSet
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import outline
+from mitsplat.masks import Silhouette
 
 LEAST_SEEN = 0.15
 """Share of what a photograph shows of an object from which it is labelled in a tile."""
@@ -48,11 +50,18 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
                 f"{sample.path}: a tile of it must have sides of {SMALLEST} px or more (got {width} x {height}): give "
                 f"a --real-size nearer to --size, {size}"
             )
+        masks = [
+            np.asarray(coco_mask.decode(one.encoded(sample.width, sample.height)), dtype=bool) if one.has_mask else None
+            for one in sample.instances
+        ]
         for top in _starts(sample.height, height):
             for left in _starts(sample.width, width):
                 path = folder / f"{number:05d}_{top}_{left}.jpg"
                 cv2.imwrite(str(path), picture[top : top + height, left : left + width], _JPEG)
-                found = (_within(instance, sample, left, top, width, height) for instance in sample.instances)
+                found = (
+                    _within(instance, mask, left, top, width, height)
+                    for instance, mask in zip(sample.instances, masks, strict=True)
+                )
                 instances = tuple(instance for instance in found if instance is not None)
                 samples.append(replace(sample, path=path, width=width, height=height, instances=instances))
     return replace(photographs, samples=tuple(samples))
@@ -64,15 +73,15 @@ def _starts(side: int, tile: int) -> list[int]:
     return [round(start) for start in np.linspace(0, side - tile, int(np.ceil((side - tile) / step)) + 1)]
 
 
-def _within(instance: Instance, sample: Sample, left: int, top: int, width: int, height: int) -> Instance | None:
-    """What a tile shows of an object; None if that is too little."""
-    if instance.has_mask:
-        mask = np.asarray(coco_mask.decode(instance.encoded(sample.width, sample.height)), dtype=bool)
+def _within(
+    instance: Instance, mask: BoolArray | None, left: int, top: int, width: int, height: int
+) -> Instance | None:
+    """What a tile shows of an object, which has a mask or a box in the photograph; None if that is too little."""
+    if mask is not None:
         seen = mask[top : top + height, left : left + width]
         if seen.sum() < max(LEAST_SEEN * mask.sum(), 1):
             return None
-        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-        box = float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+        box = Silhouette.cropped(seen, 0, 0).box
         return Instance(instance.class_index, box, outline(seen), crowd=instance.crowd)
     low, high = np.reshape(instance.box, (2, 2))
     inside = np.clip([low, high], (left, top), (left + width, top + height))

@@ -161,11 +161,12 @@ def compare(
         for trait in traits:
             if trait.advice:
                 _tell(f"{name}: {trait.name}", trait)
-    typer.echo(
-        f"objects are about as large on photographs of {found.same_size} px as on rendered images of {size} px: "
-        f"`mitsplat evaluate --size {found.same_size}`"
-        + (f", `mitsplat train --size {size} --real-size {found.same_size}`" if found.same_size > size else "")
-    )
+    if found.same_size is not None:
+        typer.echo(
+            f"objects are about as large on photographs of {found.same_size} px as on rendered images of {size} px: "
+            f"`mitsplat evaluate --size {found.same_size}`"
+            + (f", `mitsplat train --size {size} --real-size {found.same_size}`" if found.same_size > size else "")
+        )
     if out is not None:
         write_text(out, json.dumps(asdict(found), indent=1) + "\n")
         typer.echo(f"measured: {out}")

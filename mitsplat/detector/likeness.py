@@ -89,14 +89,14 @@ class Likeness:
         photographs: How many photographs.
         same_size: Longer side of photographs, a multiple of 32, at which their objects are about as large as those of
             rendered images [px]: by the median over classes of the ratio of upper quartiles, as what is hidden looks
-            smaller, of objects that no border cuts.
+            smaller, of objects that no border cuts. None if no class is shown often enough by both.
         traits: Of all of them.
         classes: Brightness and saturation of each class that both show often enough.
     """
 
     images: int
     photographs: int
-    same_size: int
+    same_size: int | None
     traits: tuple[Trait, ...]
     classes: dict[str, tuple[Trait, ...]]
 
@@ -150,18 +150,18 @@ def compare_with_photographs(
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
     larger = _larger(sides, len(real.class_names))
-    same_size = max(round(size * larger / STRIDE), 1) * STRIDE
+    same_size = None if larger is None else max(round(size * larger / STRIDE), 1) * STRIDE
     return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes)
 
 
-def _larger(sides: tuple[_Values, _Values], classes: int) -> float:
-    """How much larger rendered objects are than photographed ones, 1 if no class is shown often enough by both."""
+def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:
+    """How much larger rendered objects are than photographed ones, None if no class is shown often enough by both."""
     ratios = []
     for index in range(classes):
         ours, theirs = (side.get((_WHOLE, index), []) for side in sides)
         if len(ours) >= FEWEST_RENDERED and len(theirs) >= FEWEST:
             ratios.append(np.quantile(ours, 0.75) / np.quantile(theirs, 0.75))
-    return float(np.median(ratios)) if ratios else 1.0
+    return float(np.median(ratios)) if ratios else None
 
 
 def _evenly(samples: list[Sample], most: int) -> list[Sample]:

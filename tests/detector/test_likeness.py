@@ -63,6 +63,7 @@ def test_photographs_that_show_things_small_are_searched_large(tmp_path: Path, r
         image.update(width=2 * WIDTH, height=2 * HEIGHT)
     (photographs / "labels.json").write_text(json.dumps(labels))
     assert compare_with_photographs([rendered], photographs, size=640).same_size == pytest.approx(1280, abs=130)
+    assert compare_with_photographs([rendered], photographs, size=640, most=4).same_size is None  # too few to tell
 
 
 @pytest.mark.parametrize(

@@ -53,15 +53,21 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
         "detector.experiment-real-0": run(0.25, list(draws - 0.15)),
         "detector.experiment-synthetic-0": run(0.40, list(draws)),
         "detector.experiment-synthetic-1": run(0.42, list(draws + 0.02)),
-        "detector.experiment-images_900-0": run(0.35, list(draws - 0.05)),
-        "detector.experiment-hybrid_cut-0": run(0.45, list(draws + 0.05)),
+        "detector.experiment-no_shadow-0": run(0.35, list(draws - 0.05)),
+        "detector.experiment-traced_shadow-0": run(0.45, list(draws + 0.05)),
+        "detector.experiment-images_900-0": run(0.38, list(draws - 0.02)),
+        "detector.experiment-synthetic-0-plan_workshop": run(0.3, list(draws - 0.1)),
+        "detector.experiment-no_shadow-0-plan_workshop": run(0.2, list(draws - 0.2)),
     }
-    *_, hybrid, _, real, synthetic = experiment_table(results).splitlines()
+    *_, earlier, shadow, real, synthetic, _ = experiment_table(results).splitlines()
     low, high = np.percentile(draws, [2.5, 97.5])
     interval = f"{low - 0.15:.3f} to {high - 0.15:.3f}"
     assert real == f"| `real` | 1 | 0.250 | {interval} | 0.500 | `synthetic` | 0.150 to 0.170 |"
     assert synthetic.startswith("| `synthetic` | 2 | 0.410 | ") and synthetic.endswith("| 0.820 | – | – |")
-    assert hybrid.endswith("| `images_900` | −0.100 to −0.100 |")  # of the same rendered images
+    assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")  # of the same views
+    assert earlier.endswith("| – | – |")  # of other scenes
+    *_, shadow, synthetic = experiment_table(results, "workshop").splitlines()
+    assert shadow.endswith("| `synthetic` | 0.100 to 0.100 |") and synthetic.startswith("| `synthetic` | 1 | 0.300 | ")
 
 
 @pytest.mark.parametrize(

@@ -11,21 +11,23 @@ import numpy as np
 
 REFERENCE = "synthetic"
 """The arm that others are compared with."""
-REFERENCES = {"hybrid_cut": "images_900"}
-"""Arms that are compared with another one, of the same rendered images."""
+REFERENCES = {"image_shadow": "traced_shadow", "no_shadow": "traced_shadow"}
+"""Arms that are compared with another one, where that is recorded: the same views of the same layouts."""
+EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000"})
+"""Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 
 
-def experiment_table(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """Precision of every arm that was recorded, with intervals of 95 %.
+def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "") -> str:
+    """Precision of every arm of a plan that was recorded, ``arms.yaml`` if none is named, with intervals of 95 %.
 
     Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
     drawn apart for each arm. An arm of one seed has only that of scenes.
     """
     seeds: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for name in sorted(results):
-        if found := re.fullmatch(r"detector\.experiment-(\w+)-\d+", name):
+        if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{plan and f'-plan_{plan}'}", name):
             seeds[found[1]].append(results[name]["figures"])
     rng = np.random.default_rng(0)
     draws = {arm: _redrawn(np.array([one["samples"][0] for one in found]), rng) for arm, found in seeds.items()}
@@ -36,8 +38,9 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]]) -> str:
     for arm, found in seeds.items():
         strict, loose = (np.mean([one[key][0] for one in found]) for key in ("map50_95", "map50"))
         reference = REFERENCES.get(arm, REFERENCE)
+        reference = reference if reference in draws else REFERENCE
         compared = "– | –"
-        if arm != reference and reference in draws:
+        if arm != reference and reference in draws and not (arm in EARLIER and not plan):
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"
         lines.append(f"| `{arm}` | {len(found)} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")
     return "\n".join(lines)

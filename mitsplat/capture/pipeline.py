@@ -15,6 +15,7 @@ import numpy as np
 from mitsplat.boards.board_mask import bare_squares
 from mitsplat.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
+from mitsplat.capture.choice import chosen_object
 from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
@@ -25,7 +26,7 @@ from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SU
 from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
-from mitsplat.isolation import ChosenObject, Pick, View, choose_object, hidden_share
+from mitsplat.isolation import ChosenObject, hidden_share
 from mitsplat.progress import Progress
 from mitsplat.video import ChosenFrames, choose_frames
 
@@ -407,7 +408,7 @@ def _masked(
         points = object_points(capture)
         above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
     else:
-        chosen = _chosen(capture, settings)
+        chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
         points, above = chosen.points, chosen.above
         capture = _without_hidden(capture, chosen)
     masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
@@ -427,15 +428,3 @@ def _without_hidden(capture: Capture, chosen: ChosenObject) -> Capture:
         else:
             photos.append(photo)
     return replace(capture, photos=tuple(photos), rejected=rejected)
-
-
-def _chosen(capture: Capture, settings: CaptureSettings) -> ChosenObject:
-    """The object, by the hints that there are."""
-    views = {photo.name: View(photo.camera, photo.seen) for photo in capture.photos}
-
-    def pick(spot: str) -> Pick:
-        photo, pixel = capture.picked(spot)
-        return Pick(spot, views[photo.name], pixel)
-
-    picks, picks_not = ([pick(spot) for spot in spots] for spots in (settings.picks, settings.picks_not))
-    return choose_object(capture.points, list(views.values()), picks=picks, picks_not=picks_not, box=settings.box)

@@ -109,6 +109,14 @@ class Page:
         """Whom to tell the index of a camera that was clicked."""
         self._clicked = clicked
 
+    def on_point(self, pointed: Callable[[Float64Array, Float64Array], object]) -> None:
+        """Whom to tell origin and direction, (3,) each, of the ray under a click, whatever it meets."""
+
+        def tell(event: viser.SceneClickEvent) -> None:
+            pointed(np.array(event.ray_origin), np.array(event.ray_direction))
+
+        self._server.scene.on_click()(tell)
+
     def on_move(self, moved: Callable[[Any], object]) -> None:
         """Whom to tell viser's camera when someone moves theirs, once it has been where the page looks from."""
 
@@ -241,8 +249,7 @@ class Page:
                 part.name, thing.segments, colours, thickness=2.0, thickness_units="screen", **place
             )
         if isinstance(thing, Points):
-            size = 0.002 * float(np.linalg.norm(np.ptp(thing.points, axis=0)) if len(thing.points) else 1.0)
-            return scene.add_point_cloud(part.name, thing.points, thing.colours, point_size=size, **place)
+            return scene.add_point_cloud(part.name, thing.points, thing.colours, point_size=thing.edge, **place)
         return self._add_frustum(part.name, thing, place)
 
     def _add_frustum(self, name: str, thing: Frustum, place: dict[str, Any]) -> Any:

@@ -85,10 +85,18 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points, shape (N, 3), with 8-bit colours of the same shape."""
+    """Points, shape (N, 3), with 8-bit colours of the same shape, drawn with an edge of ``size``."""
 
     points: Float64Array
     colours: npt.NDArray[np.uint8]
+    size: float | None = None
+
+    @property
+    def edge(self) -> float:
+        """Of a point that is drawn."""
+        if self.size is not None:
+            return self.size
+        return 0.002 * float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self.points) else 0.002
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import cv2
 import numpy as np
 
-from mitsplat.arrays import ByteImage
+from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.choice import chosen_object, pick_along
 from mitsplat.errors import InputError
 from mitsplat.splat_files import Axis, usual_up
 from mitsplat.splats import Splats
 from mitsplat.view.dataset_index import OVERLAYS, DatasetIndex, Filter, OverlayName
 from mitsplat.view.page import Page
-from mitsplat.view.parts import Cloud, Part, asset_parts, capture_parts
+from mitsplat.view.parts import Cloud, Frustum, Part, Points, asset_parts, capture_parts
 
 _ANY = "any"
 _EDGE = 960
@@ -24,6 +28,16 @@ _EDGE = 960
 _WIDE = 860
 """Of the panel with images of a dataset [px]."""
 _MASKS = ("outside darkened", "none")
+_PICK, _PICK_NOT, _REMOVE = "--pick", "--pick-not", "--remove"
+_NOTHING = "nothing"
+_CLICKS = {
+    _NOTHING: None,
+    "this is the object": _PICK,
+    "this is not the object": _PICK_NOT,
+    "take this out of the place": _REMOVE,
+}
+"""What a click may say, and the option of the command line that says it."""
+_COLOURS = {_PICK: (255, 210, 0), _PICK_NOT: (60, 120, 255), _REMOVE: (255, 60, 60)}
 
 
 class StillPage:
@@ -73,14 +87,19 @@ class SplatsPage(StillPage):
 
 
 class CapturePage(StillPage):
-    """A capture: points, cameras, and the photo of the one that is chosen, with its mask."""
+    """A capture: points, cameras, and the photo of the one that is chosen, with its mask; a click picks a thing."""
 
     def __init__(self, page: Page, folder: Path) -> None:
         self._page, self._capture = page, Capture.load(folder)
+        self._turn, self._picks = threading.RLock(), list[tuple[str, str]]()
         photos = self._capture.photos
         if not photos:
             raise InputError(f"{folder}: must have a photo to be shown (got none)")
         page.show(capture_parts(self._capture))
+        with page.gui.add_folder("Pick things by clicks"):
+            self._click = page.gui.add_dropdown("a click says", tuple(_CLICKS), initial_value=_NOTHING)
+            self._told = page.gui.add_markdown("")
+            back = page.gui.add_button_group("forget", ("the last", "all"))
         self._photo = page.gui.add_slider("photo", 0, max(len(photos) - 1, 1), 1, 0)
         self._mask = page.gui.add_dropdown("mask", _MASKS)
         through = page.gui.add_button("Look through this camera")
@@ -93,8 +112,56 @@ class CapturePage(StillPage):
         self._mask.on_update(lambda _: self._show())
         through.on_click(lambda _: page.look_through(self._chosen.camera))
         page.on_click(self._clicked)
+        page.on_point(self._pointed)
+        self._click.on_update(lambda _: self._show_picks())
+        back.on_click(lambda _: self._forget(all_of_them=back.value == "all"))
         page.look_around()
         self._show()
+
+    def _pointed(self, origin: Float64Array, direction: Float64Array) -> None:
+        """Take what a click points at for what is said of it, if it can be."""
+        with self._turn:
+            if (option := _CLICKS.get(self._click.value)) is None:
+                return
+            try:
+                pick = pick_along(self._capture, origin, direction)
+                self._chosen_parts([*self._picks, (option, pick)])
+            except InputError as error:
+                self._page.alert(str(error))
+                return
+            self._picks.append((option, pick))
+            name, _, _ = pick.rpartition(":")
+            self._photo.value = [photo.name for photo in self._capture.photos].index(name)
+            self._show_picks()
+
+    def _forget(self, *, all_of_them: bool) -> None:
+        with self._turn:
+            del self._picks[0 if all_of_them else -1 :]
+            self._show_picks()
+
+    def _show_picks(self) -> None:
+        """Show what the picks choose, and what to give on a command line; no cameras while a click picks."""
+        parts = list(capture_parts(self._capture))
+        if _CLICKS.get(self._click.value) is not None:  # a click on a camera would say something, too
+            parts = [part for part in parts if not isinstance(part.thing, Frustum)]
+        self._page.show([*parts, *self._chosen_parts(self._picks)])
+        self._show()
+        words = " ".join(f"{option} {shlex.quote(pick)}" for option, pick in self._picks)
+        self._told.content = f"```\n{words}\n```" if words else ""
+
+    def _chosen_parts(self, picks: Sequence[tuple[str, str]]) -> list[Part]:
+        """Points of what picks choose, as far as points tell."""
+        on, off, away = ([pick for kind, pick in picks if kind == option] for option in (_PICK, _PICK_NOT, _REMOVE))
+        parts = []
+        if on or off:
+            parts.append(self._highlighted("object", chosen_object(self._capture, on, off).above, _COLOURS[_PICK]))
+        if away:
+            parts.append(self._highlighted("removed", chosen_object(self._capture, away).above, _COLOURS[_REMOVE]))
+        return parts
+
+    def _highlighted(self, name: str, points: Float64Array, colour: tuple[int, int, int]) -> Part:
+        size = 2 * Points(self._capture.points, self._capture.colours).edge
+        return Part(f"/chosen/{name}", Points(points, np.full(points.shape, colour, dtype=np.uint8), size))
 
     @property
     def _chosen(self) -> Photo:
@@ -112,6 +179,11 @@ class CapturePage(StillPage):
             self._page.alert(str(error))
             return
         self._page.alert(None)
+        for option, pick in self._picks:
+            name, _, pixel = pick.rpartition(":")
+            if name == photo.name:
+                place = np.array([float(value) for value in pixel.split(",")]) * image.shape[1] / photo.camera.width
+                cv2.drawMarker(image, [round(value) for value in place], _COLOURS[option], cv2.MARKER_CROSS, 24, 2)
         masked = "" if photo.mask is None else ", with a mask"
         self._page.show_picture(image, f"{_literal(photo.name)}: sees {len(photo.seen)} points{masked}")
 

@@ -6,46 +6,17 @@ import numpy as np
 import pytest
 
 from mitsplat.arrays import Float64Array, Int64Array
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.isolation import Pick, View, choose_object
 from mitsplat.isolation.object_choice import focus_of
 from mitsplat.isolation.support import find_support
-
-THINGS = ((0.0, 0.0), (0.16, 0.02), (-0.03, 0.18))
-"""Middles of balls of 4 cm radius that lie on the ground."""
-
-
-def ground(places: Float64Array) -> Float64Array:
-    """A wavy, leaning ground: heights at places (N, 2 or more) [m]."""
-    return np.asarray(0.006 * np.sin(40 * places[:, 0]) * np.cos(30 * places[:, 1]) + 0.05 * places[:, 0])
+from tests.isolation.balls import THINGS, ground, three_balls
 
 
 @pytest.fixture(scope="module")
 def place() -> tuple[Float64Array, Int64Array, list[View]]:
     """Points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
-    rng = np.random.default_rng(0)
-    flat = rng.uniform(-0.4, 0.4, (3000, 3))
-    flat[:, 2] = ground(flat)
-    clear = np.all([np.linalg.norm(flat[:, :2] - middle, axis=1) > 0.03 for middle in THINGS], axis=0)
-    parts, labels = [flat[clear]], [np.zeros(clear.sum(), dtype=np.int64)]
-    for number, middle in enumerate(THINGS, 1):
-        ball = rng.normal(size=(500, 3))
-        ball *= 0.04 / np.linalg.norm(ball, axis=1, keepdims=True)
-        ball = ball[ball[:, 2] > -0.03] + (*middle, 0.04 + float(ground(np.array([middle]))[0]))
-        parts.append(ball)
-        labels.append(np.full(len(ball), number))
-    points = np.concatenate(parts) + rng.normal(0, 3e-4, (sum(map(len, parts)), 3))
-    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    eyes = np.column_stack([0.35 * np.cos(turns), 0.35 * np.sin(turns), np.full(16, 0.2)])
-    aims = np.array([0, 0, 0.03]) + rng.normal(0, 0.01, (16, 3))
-    cameras = [Camera.look_at(e, a, width=320, height=240, fov_x=60) for e, a in zip(eyes, aims, strict=True)]
-    views = []
-    for camera in cameras:
-        pixels, depth = camera.project(points)
-        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (320, 240)).all(axis=1)
-        views.append(View(camera, np.flatnonzero(inside).astype(np.int32)))
-    return points, np.concatenate(labels), views
+    return three_balls()
 
 
 def ball_of(points: Float64Array, place: tuple[Float64Array, Int64Array, list[View]]) -> set[int]:

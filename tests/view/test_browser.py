@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from ruamel.yaml import YAML
 
 from mitsplat.splats import Splats
 from tests.conftest import box_asset, small_scene
+from tests.isolation.balls import capture_of_balls
 
 pytestmark = pytest.mark.slow
 
@@ -92,18 +94,60 @@ def redness(pixels: np.ndarray) -> float:
     return float(((pixels[..., 0] > 90) & (pixels[..., 1:] < 70).all(axis=-1)).mean())
 
 
-def test_the_page_of_a_scene(browser, scene_file):
-    command = [sys.executable, "-c", BEGIN, "view", str(scene_file), "--port", "0"]
+@contextmanager
+def served(browser: Any, path: Path) -> Iterator[None]:
+    """A path's page in the browser, from a command that ends well by Ctrl-C."""
+    command = [sys.executable, "-c", BEGIN, "view", str(path), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
         try:
             browser.get(serving.stdout.readline().split()[1])
-            use_page(browser, scene_file)
+            yield
         except TimeoutError:
-            browser.save_screenshot(str(scene_file.with_name("browser.png")))
+            browser.save_screenshot(str(path.with_name("browser.png")))
             raise
         finally:
             serving.send_signal(signal.SIGINT)
             assert serving.wait(LONG) == 0
+
+
+def test_the_page_of_a_scene(browser, scene_file):
+    with served(browser, scene_file):
+        use_page(browser, scene_file)
+
+
+def test_a_click_on_a_capture_picks_what_is_there(browser, tmp_path):
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    def yellow() -> float:
+        pixels = screen(browser)[:, 480:770]
+        return float(((pixels[..., :2] > 160).all(axis=-1) & (pixels[..., 2] < 60)).mean())
+
+    def choice(says: str) -> Any:
+        """The box of choices while it says so; None otherwise."""
+        boxes = "[...document.querySelectorAll('input')]"
+        return browser.execute_script(
+            f"return {boxes}.find(box => box.value == arguments[0] && box.offsetParent)", says
+        )
+
+    capture_of_balls(tmp_path)
+    with served(browser, tmp_path / "capture"):
+        until(lambda: choice("nothing"))
+        until(lambda: screen(browser)[:, 480:770].std() > 10)  # the points are drawn
+        assert yellow() == 0
+        choice("nothing").click()
+        choice("nothing").send_keys(Keys.ARROW_DOWN, Keys.ENTER)
+        until(lambda: choice("this is the object"))
+        canvas = browser.find_elements(By.TAG_NAME, "canvas")[0]
+
+        def picked() -> bool:
+            ActionChains(browser).move_to_element(canvas).click().perform()
+            time.sleep(1)
+            return "--pick " in browser.find_element(By.TAG_NAME, "body").text
+
+        until(picked)
+        until(lambda: yellow() > 0.003)
 
 
 def use_page(browser: Any, scene_file: Path) -> None:

@@ -19,6 +19,7 @@ from mitsplat.view.page import Address, Page, splat_arrays
 from mitsplat.view.serve import kind_of
 from mitsplat.view.still_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, photo_picture
 from tests.conftest import KnownObject, box_asset
+from tests.isolation.balls import THINGS, capture_of_balls
 
 
 @pytest.fixture
@@ -133,6 +134,44 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
     outside = capture.photos[3].picture()[1] == 0
     assert np.array_equal(darkened[~outside], whole[~outside])
     assert darkened[outside] == pytest.approx(0.25 * whole[outside], abs=1)
+
+
+def test_clicks_on_a_capture_pick_things(page, tmp_path):
+    capture_of_balls(tmp_path)
+    shown = CapturePage(page, tmp_path / "capture")
+    eye = np.array([0.5, -0.4, 0.5])
+
+    def click(thing: int, says: str) -> None:
+        shown._click.value = says
+        x, y = THINGS[thing]
+        shown._pointed(eye, np.array([x, y, 0.07]) - eye)
+
+    click(0, "nothing")
+    click(0, "as no option says")  # as a browser might answer
+    assert shown._told.content == ""
+    assert "/cameras/0" in page._shown
+    click(1, "this is the object")
+    assert "/cameras/0" not in page._shown  # a click on it would pick what is behind
+    (pick,) = (text for _, text in shown._picks)
+    assert shown._told.content == f"```\n--pick {pick}\n```"
+    assert page._caption.content.startswith(pick.partition(".")[0])  # its photo is shown, with a cross
+    assert (page._picture.image != 90).any()
+    points = page._shown["/chosen/object"].thing.points
+    assert np.linalg.norm(points[:, :2] - THINGS[1], axis=1).max() < 0.05
+
+    click(1, "this is not the object")
+    assert "what was picked is also said not to be the object" in page._alert.content
+    assert shown._told.content == f"```\n--pick {pick}\n```" and "/chosen/object" in page._shown
+
+    click(2, "take this out of the place")
+    assert shown._told.content.count("--remove") == 1 and not page._alert.visible
+    points = page._shown["/chosen/removed"].thing.points
+    assert np.linalg.norm(points[:, :2] - THINGS[2], axis=1).max() < 0.05
+    shown._pointed(eye, np.array([0.0, 0.0, 1.0]))
+    assert "no point of the capture lies there" in page._alert.content
+    shown._forget(all_of_them=True)
+    assert shown._told.content == "" and not [name for name in page._shown if name.startswith("/chosen")]
+    shown._forget(all_of_them=False)  # of none
 
 
 def test_the_page_of_a_file_of_splats(page, tmp_path):

@@ -1,0 +1,65 @@
+"""From a ray to a pixel of a photo, and from pixels to the thing that they are on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.choice import chosen_object, pick_along
+from mitsplat.errors import InputError
+from tests.isolation.balls import THINGS, capture_of_balls, ground
+
+EYE = np.array([0.5, -0.4, 0.5])
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return capture_of_balls(tmp_path_factory.mktemp("balls"))
+
+
+def top_of(thing: int) -> np.ndarray:
+    x, y = THINGS[thing]
+    return np.array([x, y, 0.07 + float(ground(np.array([[x, y]]))[0])])
+
+
+@pytest.mark.parametrize("thing", [0, 1, 2])
+def test_a_ray_picks_the_thing_that_it_meets(capture: Capture, thing: int) -> None:
+    pick = pick_along(capture, EYE, top_of(thing) - EYE)
+    chosen = chosen_object(capture, [pick]).above
+    away = np.linalg.norm(chosen[:, :2] - THINGS[thing], axis=1)
+    assert len(chosen) > 200 and away.max() < 0.05
+
+
+def test_the_photo_looks_about_as_the_ray_does(capture: Capture) -> None:
+    ahead = top_of(0) - EYE
+    photo, pixel = capture.picked(pick_along(capture, EYE, ahead))
+    towards = top_of(0) - photo.camera.centre
+    every = [top_of(0) - one.camera.centre for one in capture.photos]
+    cosines = [float(one @ ahead / np.linalg.norm(one) / np.linalg.norm(ahead)) for one in every]
+    assert towards @ ahead / np.linalg.norm(towards) / np.linalg.norm(ahead) == pytest.approx(max(cosines), abs=0.02)
+    shown = photo.camera.project(top_of(0)[None])[0][0]
+    assert np.linalg.norm(shown - pixel) < 8  # px: half of a degree from the eye and what lies between points
+
+
+def test_a_ray_ends_at_what_stands_in_front(capture: Capture) -> None:
+    """Past the middle of the second ball to the first, level with both."""
+    start = np.array([0.5, 0.02 + 0.02 * 0.34 / 0.16, 0.05])
+    middle = np.array([*THINGS[1], 0.045])
+    pick = pick_along(capture, start, middle - start)
+    chosen = chosen_object(capture, [pick]).above
+    assert np.linalg.norm(chosen[:, :2] - THINGS[1], axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("ahead", [(0, 0, 1), (1, -1, 0.3)])
+def test_a_ray_into_the_air_picks_nothing(capture: Capture, ahead: tuple[float, float, float]) -> None:
+    with pytest.raises(InputError, match="no point of the capture lies there"):
+        pick_along(capture, EYE, ahead)
+
+
+def test_a_point_that_no_photo_shows_is_said(capture: Capture) -> None:
+    blind = replace(capture, photos=tuple(replace(one, seen=one.seen[:0]) for one in capture.photos))
+    with pytest.raises(InputError, match="no photo that was kept shows"):
+        pick_along(blind, EYE, top_of(0) - EYE)

@@ -1,6 +1,7 @@
 """A known solid that is photographed as most people do it, to an asset, against the truth.
 
-    python -m benchmarks.assets.clutter OUT [--views 60] [--width 640] [--iterations 3000] [--beside] [--known-poses]
+    python -m benchmarks.assets.clutter OUT [--views 60] [--width 640] [--iterations 3000] [--ground cushion] [--beside]
+        [--known-poses]
 
 There is no board: the solid of ``benchmarks.assets.known`` stands on a crumpled cloth among other things in a room, and
 is photographed by hand with an exposure that drifts. ``mitsplat asset --size`` makes an asset of the path-traced
@@ -14,7 +15,7 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -76,21 +77,15 @@ def walk(count: int, width: int, seed: int = 11) -> list[Camera]:
     return cameras
 
 
-def crumpled_cloth(seed: int = 4) -> trimesh.Trimesh:
-    """A cloth with folds of up to a centimetre, pressed flat under what stands in its middle [m]."""
+def ground(kind: str = "cloth", seed: int = 4) -> trimesh.Trimesh:
+    """What the solid stands on, flat under it [m]: one of :data:`GROUNDS`."""
     rng = np.random.default_rng(seed)
     cells = 441
     axis = np.linspace(-CLOTH / 2, CLOTH / 2, cells)
     x, y = np.meshgrid(axis, axis, indexing="ij")
-    bumps = sum(
-        weight * gaussian_filter(rng.normal(size=x.shape), sigma, mode="wrap") * sigma
-        for sigma, weight in ((4, 0.25), (9, 0.7), (22, 1.0))
-    )
-    ridged = 1 - np.abs(bumps / np.abs(bumps).max() * 3) % 1.0
-    height = 0.016 * (gaussian_filter(ridged, 1.2) - 0.6) + 0.008 * bumps / np.abs(bumps).max()
     away = np.hypot(x / 0.075, y / 0.06)
     pressed = np.clip((away - 0.75) / 0.6, 0, 1) ** 2 * (3 - 2 * np.clip((away - 0.75) / 0.6, 0, 1))
-    height = height * pressed - 0.0003
+    height = GROUNDS[kind](x, y, rng) * pressed - 0.0003
     vertices = np.column_stack([x.ravel(), y.ravel(), height.ravel()])
     corner = (np.arange(cells - 1)[:, None] * cells + np.arange(cells - 1)).ravel()
     faces = np.concatenate(
@@ -100,6 +95,43 @@ def crumpled_cloth(seed: int = 4) -> trimesh.Trimesh:
         ]
     )
     return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _cloth(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Folds of up to a centimetre."""
+    bumps = sum(
+        weight * gaussian_filter(rng.normal(size=x.shape), sigma, mode="wrap") * sigma
+        for sigma, weight in ((4, 0.25), (9, 0.7), (22, 1.0))
+    )
+    ridged = 1 - np.abs(bumps / np.abs(bumps).max() * 3) % 1.0
+    return np.asarray(0.016 * (gaussian_filter(ridged, 1.2) - 0.6) + 0.008 * bumps / np.abs(bumps).max())
+
+
+def _cushion(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A dome that falls by 8 cm, with a bulge around what lies on it."""
+    away = np.hypot(x, y)
+    return np.asarray(0.08 * (np.exp(-((away / 0.4) ** 2)) - 1) + 0.012 * np.exp(-(((away - 0.12) / 0.04) ** 2)))
+
+
+def _gravel(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Stones of a centimetre and two."""
+    stones = gaussian_filter(rng.normal(size=x.shape), 2.5, mode="wrap")
+    return np.asarray(0.005 * stones / np.abs(stones).max() * 2)
+
+
+def _ledge(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A table that ends 15 cm away, and the bench 8 cm below it."""
+    return np.asarray(np.where(x + 0.3 * y > 0.15, -0.08, 0.0))
+
+
+GROUNDS: Mapping[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]] = {
+    "cloth": _cloth,
+    "table": lambda x, y, rng: np.zeros_like(x),
+    "cushion": _cushion,
+    "gravel": _gravel,
+    "ledge": _ledge,
+}
+"""Heights of what the solid may stand on, at x and y [m]."""
 
 
 def coloured(mesh: trimesh.Trimesh, colours: np.ndarray) -> Any:
@@ -160,11 +192,14 @@ def things(cloth: trimesh.Trimesh, beside: bool) -> dict[str, Any]:
     return shapes
 
 
-def room(beside: bool = False) -> dict[str, Any]:
-    """A cloth on a bed in a papered room with a window, and things on it; the solid is not in it yet."""
+def room(beside: bool = False, kind: str = "cloth") -> dict[str, Any]:
+    """A cloth on a bed in a papered room with a window, and things on it; the solid is not in it yet.
+
+    In place of the cloth may be any of :data:`GROUNDS`.
+    """
     ensure_variant()
     rng = np.random.default_rng(5)
-    cloth = crumpled_cloth()
+    cloth = ground(kind)
     place = mi.ScalarTransform4f()
     scene: dict[str, Any] = {
         "type": "scene",
@@ -184,7 +219,7 @@ def room(beside: bool = False) -> dict[str, Any]:
         },
         "bed": {
             "type": "cube",
-            "to_world": place.translate([0, 0, -0.27]).scale([0.7, 0.7, 0.25]),
+            "to_world": place.translate([0, 0, -0.25 + min(-0.02, cloth.bounds[0, 2] - 0.005)]).scale([0.7, 0.7, 0.25]),
             "bsdf": paint(speckle(rng, 30, (0.6, 0.6, 0.65))),
         },
     }
@@ -250,6 +285,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--ground", choices=list(GROUNDS), default="cloth", help="what the solid stands on")
     parser.add_argument("--beside", action="store_true", help="another thing where the cameras look, and one click")
     parser.add_argument("--known-poses", action="store_true", help="give the true cameras, in unknown units")
     args = parser.parse_args()
@@ -261,10 +297,13 @@ def main() -> None:
 def measure(args: argparse.Namespace) -> int:
     """Print and keep the figures; how many of them miss what is wanted."""
     views, photos, mesh = walk(args.views, args.width), args.out / "photos", solid()
-    made, marker = json.dumps([args.views, args.width, args.samples, args.beside]), args.out / "photos.json"
+    made, marker = (
+        json.dumps([args.views, args.width, args.samples, args.beside, args.ground]),
+        args.out / "photos.json",
+    )
     if not (marker.exists() and marker.read_text() == made):
         shutil.rmtree(photos, ignore_errors=True)
-        scene = room(args.beside) | {"solid": speckled(mesh)}
+        scene = room(args.beside, args.ground) | {"solid": speckled(mesh)}
         photograph(scene, views, photos, samples=args.samples, noise=0.008, gains=exposures(len(views)))
         show_where(scene, "solid", views, args.out / "truth")
         marker.write_text(made)

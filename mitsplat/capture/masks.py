@@ -57,6 +57,9 @@ _DISSENT = 0.04
 _DOUBT = 0.04
 """Width on either side of the common outline in which a photo decides for itself, as a share of the object's size."""
 
+_FEWEST = 3
+"""Photos that can agree on an outline."""
+
 _ABOVE = 0.01
 """Height over the table from which a point belongs to the object, as a share of the cameras' distance."""
 
@@ -91,6 +94,32 @@ def add_masks(
         if progress is not None:
             progress(done, len(capture.photos), "cutting out")
     return replace(capture, photos=tuple(photos), rejected=rejected)
+
+
+def object_masks(
+    capture: Capture,
+    points: Float64Array,
+    above: Float64Array,
+    folder: Path,
+    *,
+    bare: Bare | None = None,
+    progress: Progress | None = None,
+) -> Capture:
+    """The capture with masks of an object that some of its points are on, cut out of each photo and then of all.
+
+    Args:
+        capture: Its photos' files must exist.
+        points: Of the object and of where it stands, shape (N, 3).
+        above: Of the object alone, which masks must cover, shape (M, 3).
+        folder: Where the masks are written.
+        bare: Finds what is surely not the object.
+        progress: Told the photos done.
+    """
+    masked = add_masks(capture, geometric_masks(points, bare), folder, progress=progress, points=above)
+    if len(masked.photos) < _FEWEST:
+        return masked
+    # What a photo was rejected for may be what the others set right.
+    return add_masks(capture, agreed_masks(masked, points, bare), folder, progress=progress, points=above)
 
 
 def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:

@@ -18,7 +18,7 @@ from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.choice import chosen_object
 from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.masks import add_masks, agreed_masks, geometric_masks, given_masks, model_masks, object_points
+from mitsplat.capture.masks import add_masks, given_masks, model_masks, object_masks, object_points
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.overview import capture_sheet
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
@@ -411,11 +411,7 @@ def _masked(
         chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
         points, above = chosen.points, chosen.above
         capture = _without_hidden(capture, chosen)
-    masked = add_masks(capture, geometric_masks(points, bare), mask_folder, progress=progress, points=above)
-    if len(masked.photos) < MIN_PHOTOS:
-        return masked
-    # What a photo was rejected for may be what the others set right.
-    return add_masks(capture, agreed_masks(masked, points, bare), mask_folder, progress=progress, points=above)
+    return object_masks(capture, points, above, mask_folder, bare=bare, progress=progress)
 
 
 def _without_hidden(capture: Capture, chosen: ChosenObject) -> Capture:

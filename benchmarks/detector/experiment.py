@@ -30,6 +30,8 @@ from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector
 
 HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")
+VIEWS = 8
+"""Of each layout, as ``groceries.yaml`` and the shipped scenes say it."""
 SAMPLES = 200
 """Draws of scenes with replacement."""
 
@@ -99,7 +101,9 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
     return folder
 
 
-def listed(rendered: list[Path], folder: Path, *, images: int | None, first: int | None) -> Path:
+def listed(
+    rendered: list[Path], folder: Path, *, images: int | None = None, first: int | None = None, views: int = VIEWS
+) -> Path:
     """A YOLO folder that lists some of the images of rendered ones.
 
     Args:
@@ -107,16 +111,20 @@ def listed(rendered: list[Path], folder: Path, *, images: int | None, first: int
         folder: Where the list goes.
         images: How many, of an order which is the same for any number; all if None.
         first: The first so many images of each dataset, to compare what shows the same; all if None.
+        views: Of each layout, the first so many of :data:`VIEWS`; the more layouts are there among the first images.
 
     Raises:
         SystemExit: If there are not so many.
     """
-    found = [sorted(path.resolve() for path in (one / "images" / "train").iterdir()) for one in rendered]
-    if first is not None:
-        for one, paths in zip(rendered, found, strict=True):
-            if len(paths) < first or int(paths[first - 1].stem) != first - 1:
+    some = []
+    for one in rendered:
+        found = {int(path.stem): path.resolve() for path in (one / "images" / "train").iterdir()}
+        wanted = [i for i in sorted(found) if i % VIEWS < views]
+        if first is not None:
+            wanted = [i for i in range(first * VIEWS // views) if i % VIEWS < views]
+            if not found.keys() >= set(wanted):
                 raise SystemExit(f"{one}: its first {first} images are not all there")
-    some = [path for paths in found for path in paths[:first]]
+        some += [found[i] for i in wanted]
     if images is not None:
         if len(some) < images:
             raise SystemExit(f"there are {len(some)} images, not {images}")
@@ -150,9 +158,8 @@ def measure(options: argparse.Namespace) -> None:
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
-    if "images" in arm or "first" in arm:
-        folder = work / "listed" / f"{options.arm}-{options.seed}"
-        rendered = [listed(rendered, folder, images=arm.get("images"), first=arm.get("first"))]
+    if some := {key: arm[key] for key in ("images", "first", "views") if key in arm}:
+        rendered = [listed(rendered, work / "listed" / f"{options.arm}-{options.seed}", **some)]
     learns_photographs = arm.get("real", False)
     settings = TrainSettings(
         **(plan["train"] | arm.get("train", {})),

@@ -140,3 +140,25 @@ def test_packages_are_closed_and_printed(seed):
     package.merge_vertices(merge_tex=True, merge_norm=True)
     assert package.is_watertight and package.volume > 0
     assert package.visual.uv.min() >= 0 and package.visual.uv.max() <= 1
+
+
+def test_of_more_layouts_fewer_views_are_listed(tmp_path):
+    folder = tmp_path / "table"
+    (folder / "images/train").mkdir(parents=True)
+    (folder / "data.yaml").write_text("names: {0: tin}\n")
+    for number in range(40):
+        (folder / f"images/train/{number:06d}.jpg").touch()
+
+    def numbers(**some: int) -> list[int]:
+        listing = experiment.listed([folder], tmp_path / "listed", **some) / "train.txt"
+        return [int(Path(line).stem) for line in listing.read_text().split()]
+
+    assert numbers(first=8) == list(range(8))
+    assert numbers(first=8, views=4) == [0, 1, 2, 3, 8, 9, 10, 11]
+    assert numbers(first=10, views=2) == [0, 1, 8, 9, 16, 17, 24, 25, 32, 33]
+    assert numbers(images=30, views=7) == [n for n in numbers(images=35, views=7) if n in numbers(images=30, views=7)]
+    (folder / "images/train/000017.jpg").unlink()
+    assert len(numbers(first=8, views=4)) == 8
+    for some in ({"first": 10, "views": 2}, {"first": 48}, {"images": 50}):
+        with pytest.raises(SystemExit, match=r"not all there|not 50"):
+            numbers(**some)

@@ -256,24 +256,25 @@ def light_lines(estimate: LightEstimate, image: str) -> str:
         position = np.array(settings.around) + settings.distance * lamp.direction
         width, height = settings.distance * np.array(lamp.extents)
         lines.append(
-            f"  - {{kind: area, position: {_list(position)}, target: {_list(settings.around)}, "
-            f"size: {_list((width, height))}, {_radiance(lamp.radiance)}}}"
+            f"  - {{kind: area, position: {list_of(position)}, target: {list_of(settings.around)}, "
+            f"size: {list_of((width, height))}, {radiance_keys(lamp.radiance)}}}"
         )
     if settings.rest == "constant":
-        lines.append(f"  - {{kind: environment, {_radiance(estimate.ambient / np.pi)}}}")
+        lines.append(f"  - {{kind: environment, {radiance_keys(estimate.ambient / np.pi)}}}")
     else:
         turn = f", rotate_z: {settings.rotate_z:g}" if settings.rotate_z else ""
         lines.append(f"  - {{kind: environment, image: {json.dumps(image, ensure_ascii=False)}{turn}}}")
     return "\n".join(lines) + "\n"
 
 
-def _radiance(rgb: Float64Array) -> str:
+def radiance_keys(rgb: Float64Array) -> str:
     """Its luminance as radiance, and its colour."""
     luminance = float(rgb @ LUMINANCE)
-    return f"radiance: {luminance:.5g}, colour: {_list(rgb / luminance)}"
+    return f"radiance: {luminance:.5g}, colour: {list_of(rgb / luminance)}"
 
 
-def _list(values: Sequence[float] | Float64Array) -> str:
+def list_of(values: Sequence[float] | Float64Array) -> str:
+    """Numbers as a scene file has them."""
     return f"[{', '.join(f'{value:.5g}' for value in values)}]"
 
 

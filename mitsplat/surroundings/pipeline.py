@@ -5,18 +5,20 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.ndimage import binary_erosion
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.metric_frame import meeting_point
 from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.colour import decode_srgb
 from mitsplat.files import write_text
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.trainer import FitSettings
@@ -27,11 +29,13 @@ from mitsplat.reconstruct.pipeline import AssetJob, AssetResult, make_asset, mak
 from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.splats import Splats
-from mitsplat.surroundings.coverage import ENOUGH, Coverage, Hole, find_coverage, find_holes, free_rectangle
-from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL, Coverage, Hole, find_coverage, find_holes, free_rectangle
+from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
+from mitsplat.surroundings.ground import Ground
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
+from mitsplat.surroundings.shading import ShadingLight, light_of_shading
 from mitsplat.surroundings.supports import Support, find_supports, flattened
 
 _NEAR = 3.0
@@ -48,6 +52,8 @@ _HIDDEN = 0.1
 """Largest share of the support that too few photos may show."""
 _SAME = 1.5 / 255
 """Difference up to which a pixel shows nothing of what was removed."""
+_ACROSS = 256
+"""Most cells along a support by which its light is told."""
 _SMALLEST_REGION = 0.1
 """Least edge of a place that things can be dropped on [m]."""
 
@@ -117,6 +123,7 @@ def reconstruct_surroundings(
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
     cameras = [photo.camera for photo in capture.training]
+    shades = _Shades.of(found[0], splats, capture, points, scale) if found else None
     fitted, things = splats, list[RemovedThing]()
     if job.remove:
         splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
@@ -166,8 +173,10 @@ def reconstruct_surroundings(
             {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
         ]
         if region is not None and made.asset.units == "metre":
+            light = None if shades is None else shades.light(factor)
+            rows["Light"] = "not told by shadows" if light is None else _lit(light)
             seen = [photo.camera for photo in capture.transformed(larger).photos]
-            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen)
+            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen, light)
     else:
         findings.append(
             "no level surface was found for things to stand on (one is wanted): photograph the table from above as "
@@ -184,6 +193,57 @@ def reconstruct_surroundings(
         shown = _psnr_beside(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
     verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shades:
+    """What tells the light on a support: its bare colours, and what stands on it.
+
+    Attributes:
+        colours: Linear RGB, (X, Y, 3).
+        heights: Of what stands there, (X, Y) [units].
+        bare: Cells whose colour is the surface's, (X, Y).
+        cell: Edge of the cells [units].
+    """
+
+    colours: Float64Array
+    heights: Float64Array
+    bare: BoolArray
+    cell: float
+
+    @classmethod
+    def of(cls, support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float) -> _Shades:
+        ground, inverse = Ground.of(support, splats, capture, scale), np.linalg.inv(support.pose)
+        places = points.places @ inverse[:3, :3].T + inverse[:3, 3]
+        heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
+        linear = decode_srgb(np.clip(ground.texture, 0, 1))
+        block = -(-max(heights.shape) // _ACROSS)
+
+        def blocks(values: Float64Array | BoolArray) -> Any:
+            x, y = (count // block for count in values.shape[:2])
+            return values[: x * block, : y * block].reshape(x, block, y, block, *values.shape[2:])
+
+        bare = np.asarray(binary_erosion(ground.seen))
+        return cls(
+            blocks(linear).mean(axis=(1, 3)),
+            blocks(heights).max(axis=(1, 3)),
+            blocks(bare).all(axis=(1, 3)),
+            block * ground.grid.cell,
+        )
+
+    def light(self, factor: float) -> ShadingLight | None:
+        """What light they tell, ``factor`` metres to a unit."""
+        return light_of_shading(self.colours, factor * self.heights, self.bare, factor * self.cell)
+
+
+def _lit(light: ShadingLight) -> str:
+    """Lamps by their directions from the middle of the support, and the rest, a clause."""
+    told = []
+    for lamp in light.lamps:
+        x, y, z = lamp.position
+        turn, rise = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
+        told.append(f"a lamp at azimuth {turn:.0f}°, elevation {rise:.0f}°")
+    return f"{', '.join(told)}; {light.ambient_share:.0%} from all sides, as shadows on the support tell"
 
 
 def _typical_depth(capture: Capture) -> float:

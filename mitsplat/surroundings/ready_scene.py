@@ -8,6 +8,9 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
+from mitsplat.colour import LUMINANCE
+from mitsplat.lighting.estimate import list_of, radiance_keys
+from mitsplat.surroundings.shading import ShadingLight
 from mitsplat.surroundings.supports import Support
 
 _MARGIN = 0.05
@@ -23,7 +26,14 @@ Region = tuple[float, float, float, float]
 """Least and largest x, least and largest y [m]."""
 
 
-def scene_text(name: str, folder: str, supports: Sequence[Support], free: Region, cameras: Sequence[Camera]) -> str:
+def scene_text(
+    name: str,
+    folder: str,
+    supports: Sequence[Support],
+    free: Region,
+    cameras: Sequence[Camera],
+    light: ShadingLight | None = None,
+) -> str:
     """A scene file.
 
     Args:
@@ -32,6 +42,7 @@ def scene_text(name: str, folder: str, supports: Sequence[Support], free: Region
         supports: In the asset's frame [m]; things are dropped on the first, whose top is z = 0.
         free: Part of that where nothing stands.
         cameras: Of the photos, in the same frame.
+        light: That of the place, relative to the first support's middle; that of some room if None.
     """
     margin = min(_MARGIN, 0.25 * min(free[1] - free[0], free[3] - free[2]))
     spans = []
@@ -53,7 +64,26 @@ def scene_text(name: str, folder: str, supports: Sequence[Support], free: Region
         name=name, folder=folder, boxes=boxes, x0=_m(x0), x1=_m(x1), y0=_m(y0), y1=_m(y1), margin=_m(margin),
         tx=_m(target[0]), ty=_m(target[1]), near=_m(near), far=_m(far), low=f"{low:.0f}", high=f"{high:.0f}",
         start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
+        lights=_ROOM if light is None else _lights(light, supports[0]),
     )  # fmt: skip
+
+
+def _lights(light: ShadingLight, support: Support) -> str:
+    """The key ``lights``: white paper in the support's middle would be white."""
+    whole = light.ambient + np.sum([lamp.irradiance for lamp in light.lamps], axis=0)
+    white = np.pi / float(whole @ LUMINANCE)
+    middle = support.pose[:3, 3].round(3) + 0.0
+    lines = ["lights:  # told by the shadows on the table; `mitsplat lights` measures those of yours"]
+    for lamp in light.lamps:
+        away = float(np.linalg.norm(lamp.position))
+        radiance = white * lamp.irradiance * away**3 / (lamp.size**2 * lamp.position[2])
+        place = support.pose[:3, :3] @ lamp.position + support.pose[:3, 3]
+        lines.append(
+            f"  - {{kind: area, position: {list_of(place.round(3))}, target: {list_of(middle)}, "
+            f"size: {list_of((lamp.size, lamp.size))}, {radiance_keys(radiance)}}}"
+        )
+    lines.append(f"  - {{kind: environment, {radiance_keys(white / np.pi * light.ambient)}}}")
+    return "\n".join(lines)
 
 
 def _seen_from(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, float, float, float, float, float]:
@@ -105,8 +135,10 @@ camera:  # about as the photos were taken
   azimuth: [{start}, {end}]
   accept: {{clearance: 0.1}}
   intrinsics: {{fov_x: {fov}}}
-lights:  # of a room; `mitsplat lights` makes those of yours
-  - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
-  - {{kind: environment, radiance: 0.4}}
+{lights}
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """
+_ROOM = """\
+lights:  # of a room; `mitsplat lights` makes those of yours
+  - {kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}
+  - {kind: environment, radiance: 0.4}"""

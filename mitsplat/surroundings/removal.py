@@ -10,27 +10,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, label
+from scipy.ndimage import binary_fill_holes, label
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from mitsplat.camera import Camera
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
-from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
-from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
-from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL
-from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views, render_sized
+from mitsplat.surroundings.coverage import OFF, TALL
+from mitsplat.surroundings.depth_views import SurfacePoints, depth_views
+from mitsplat.surroundings.ground import CELL, Grid, Ground
 from mitsplat.surroundings.supports import Support
 from mitsplat.surroundings.texture_fill import dilated, fill
 
-_CELL = 0.004
-"""Edge of the cells that a support is filled by, as a share of the typical depth."""
 _APART = 0.02
 """Edge of the voxels by which things lie apart, as a share of the typical depth."""
 _SPARSE = 0.05
@@ -45,16 +40,8 @@ _ON = 0.5
 """Voxels from another thing's surface from which a Gaussian over the footprint is none of its own."""
 _BESIDE = 4
 """Voxels around a thing in which Gaussians are its own if it is nearer to them than all else."""
-_FLAT = 0.25
-"""Height up to which what photos show is the bare support, as a share of that by which it is told from things."""
 _BLED = 2
 """Steps around what is hidden, each as high as what is told from the support, in which colours are the thing's, too."""
-_EDGE = 400
-"""Longest edge of the pictures that the support's colours are read from [px]."""
-_OPAQUE = 0.9
-_BORDER = cv2.BORDER_REPLICATE
-_DISC, _THICK = 0.7, 0.1
-"""Standard deviations of the sheet's Gaussians along it and across [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +92,11 @@ def remove_things(
     Raises:
         InputError: If there is no such photo, or nothing is seen there that stands on a support.
     """
-    places, grounds, removed = points.places, dict[int, _Ground](), list[RemovedThing]()
+    places, grounds, removed = points.places, dict[int, Ground](), list[RemovedThing]()
     for pick in picks:
         number, spot = _picked(splats, pick, capture, supports, scale)
         if number not in grounds:
-            grounds[number] = _Ground.of(supports[number], splats, capture, scale)
+            grounds[number] = Ground.of(supports[number], splats, capture, scale)
         splats, places, thing = _remove(splats, pick, number, spot, grounds[number], places, scale)
         removed.append(thing)
         if progress is not None:
@@ -117,31 +104,8 @@ def remove_things(
     return splats, removed
 
 
-@dataclass(eq=False)
-class _Ground:
-    """A support as photos see it, which changes as things are taken off.
-
-    Attributes:
-        support: Where.
-        grid: Its cells.
-        texture: Their display-encoded colours, (X, Y, 3).
-        seen: Those that enough photos show bare, or that are filled in, (X, Y).
-    """
-
-    support: Support
-    grid: _Grid
-    texture: Float64Array
-    seen: BoolArray
-
-    @classmethod
-    def of(cls, support: Support, splats: Splats, capture: Capture, scale: float) -> _Ground:
-        inverse, grid = np.linalg.inv(support.pose), _Grid.of(support, _CELL * scale)
-        cameras = [photo.camera.transformed(inverse) for photo in capture.training]
-        return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _FLAT * OFF * scale))
-
-
 def _remove(
-    splats: Splats, pick: str, number: int, spot: Float64Array, ground: _Ground, places: Float64Array, scale: float
+    splats: Splats, pick: str, number: int, spot: Float64Array, ground: Ground, places: Float64Array, scale: float
 ) -> tuple[Splats, Float64Array, RemovedThing]:
     """Splats and points (N, 3) without the thing at a place of a support, and what it was."""
     support, grid = ground.support, ground.grid
@@ -149,7 +113,7 @@ def _remove(
     thing, others = _apart(places @ inverse[:3, :3].T + inverse[:3, 3], spot, support, scale)
     if thing is None:
         raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
-    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / _CELL)
+    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / CELL)
     standing = grid.covered(others[(height > OFF * scale) & (height < top)])
     footprint = dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
     parts, _ = label(~ground.seen & ~standing)
@@ -235,7 +199,7 @@ def _of_thing(
     splats: Splats,
     thing: Float64Array,
     others: Float64Array,
-    grid: _Grid,
+    grid: Grid,
     footprint: BoolArray,
     hole: BoolArray,
     scale: float,
@@ -289,96 +253,3 @@ def _thinned(points: Float64Array, edge: float) -> Float64Array:
     """One of the points (N, 3) in each cube of an edge."""
     _, first = np.unique(np.floor(points / edge).astype(np.int64), axis=0, return_index=True)
     return points[first]
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Cells of a support in its frame, first axis x.
-
-    Attributes:
-        cell: Their edge.
-        middles: Where they are, (X, Y, 2).
-    """
-
-    cell: float
-    middles: Float64Array
-
-    @classmethod
-    def of(cls, support: Support, cell: float) -> _Grid:
-        sides = [(np.arange(max(1, int(edge / cell))) + 0.5) * cell for edge in support.size]
-        x, y = (side - side.mean() for side in sides)
-        return cls(cell, np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
-
-    def cells(self, flat: Float64Array) -> Int64Array:
-        """Indices of the cells at places (N, 2), (N, 2); -1 off the support."""
-        index = np.floor((flat - self.middles[0, 0]) / self.cell + 0.5).astype(np.int64)
-        outside = ((index < 0) | (index >= self.middles.shape[:2])).any(axis=1)
-        return np.where(outside[:, None], -1, index)
-
-    def covered(self, points: Float64Array) -> BoolArray:
-        """Cells that have points (N, 2 or 3) in or over them, gaps between samples closed."""
-        covered = np.zeros(self.middles.shape[:2], dtype=bool)
-        cells = self.cells(points[:, :2])
-        covered[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
-        closed = np.asarray(binary_closing(np.pad(covered, 4), np.ones((3, 3)), iterations=3))
-        return closed[4:-4, 4:-4]
-
-    def inside(self, points: Float64Array, footprint: BoolArray, depth: float) -> Float64Array:
-        """Places (M, 3) below points on a thing, that far from its sides, top and ground, in steps as long."""
-        top = np.zeros(footprint.shape)
-        cells = self.cells(points[:, :2])
-        own = (cells >= 0).all(axis=1)
-        np.maximum.at(top, tuple(cells[own].T), points[own, 2])
-        near = distance_transform_edt(top == 0, return_distances=False, return_indices=True)
-        deep = distance_transform_edt(np.pad(footprint, 1))[1:-1, 1:-1] * self.cell > depth
-        step = max(1, int(depth / self.cell))
-        x, y = np.nonzero(deep[::step, ::step])
-        columns = [
-            np.column_stack([np.tile(self.middles[i, j], (len(z), 1)), z])
-            for i, j in zip(step * x, step * y, strict=True)
-            if len(z := np.arange(depth, top[near[0, i, j], near[1, i, j]] - depth, depth))
-        ]
-        return np.concatenate([np.zeros((0, 3)), *columns])
-
-    def outline(self, points: Float64Array) -> BoolArray:
-        """The same of one thing, without holes."""
-        return np.asarray(binary_fill_holes(self.covered(points)))
-
-    def look(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
-        """Display-encoded colours (X, Y, 3) that cameras see of the bare support, and where enough of them do.
-
-        Cameras that look from near and steeply have more of a say.
-        """
-        shape = self.middles.shape[:2]
-        places = np.concatenate([self.middles, np.zeros((*shape, 1))], axis=2).reshape(-1, 3)
-        colours, weights, count = np.zeros((*shape, 3)), np.full(shape, 1e-12), np.zeros(shape, dtype=np.int64)
-        for camera in cameras:
-            view, shown = _seen_by(splats, camera)
-            depth, surface = view.look(places)
-            bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # NaN is not
-            towards = places - view.camera.centre
-            weight = np.where(bare, -towards[:, 2] / np.linalg.norm(towards, axis=1) ** 3, 0.0).reshape(shape)
-            x, y = np.nan_to_num(view.camera.project(places)[0] - 0.5).astype(np.float32).T.reshape(2, *shape)
-            colours += weight[..., None] * np.asarray(cv2.remap(shown, x, y, cv2.INTER_LINEAR, borderMode=_BORDER))
-            weights += weight
-            count += bare.reshape(shape)
-        return colours / weights[..., None], np.asarray(count >= ENOUGH)
-
-    def sheet(self, texture: Float64Array, cells: BoolArray) -> Splats:
-        """Flat Gaussians of a texture's display-encoded colours (X, Y, 3) in some cells."""
-        flat = self.middles[cells]
-        count = len(flat)
-        return Splats(
-            means=np.column_stack([flat, np.zeros(count)]).astype(np.float32),
-            quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (count, 1)),
-            scales=np.tile(np.array([_DISC, _DISC, _THICK], dtype=np.float32) * np.float32(self.cell), (count, 1)),
-            opacities=np.full(count, 0.95, dtype=np.float32),
-            sh=((texture[cells] - 0.5) / SH_C0)[:, None].astype(np.float32),
-        )
-
-
-def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
-    """Depth and display-encoded colours from a camera, the longest edge :data:`_EDGE` px at most."""
-    small, layers = render_sized(splats, camera, _EDGE)
-    shown = encode_srgb(layers.captured / np.maximum(layers.alpha, 1e-6)[..., None])
-    return DepthView.of(small, layers, _OPAQUE), np.asarray(shown, dtype=np.float32)

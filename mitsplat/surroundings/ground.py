@@ -1,0 +1,160 @@
+"""A support as photos show it: cells with the colours of its bare surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, grey_closing
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture
+from mitsplat.colour import encode_srgb
+from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.splats import Splats
+from mitsplat.surroundings.coverage import ENOUGH, OFF
+from mitsplat.surroundings.depth_views import DepthView, render_sized
+from mitsplat.surroundings.supports import Support
+
+CELL = 0.004
+"""Edge of the cells that a support is filled by, as a share of the typical depth."""
+_FLAT = 0.25
+"""Height up to which what photos show is the bare support, as a share of that by which it is told from things."""
+_GAP = 4
+"""Cells between points on a thing that are of it, too."""
+_EDGE = 400
+"""Longest edge of the pictures that the support's colours are read from [px]."""
+_OPAQUE = 0.9
+_BORDER = cv2.BORDER_REPLICATE
+_DISC, _THICK = 0.7, 0.1
+"""Standard deviations of the sheet's Gaussians along it and across [cells]."""
+
+
+@dataclass(eq=False)
+class Ground:
+    """A support as photos see it, which changes as things are taken off.
+
+    Attributes:
+        support: Where.
+        grid: Its cells.
+        texture: Their display-encoded colours, (X, Y, 3).
+        seen: Those that enough photos show bare, or that are filled in, (X, Y).
+    """
+
+    support: Support
+    grid: Grid
+    texture: Float64Array
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, support: Support, splats: Splats, capture: Capture, scale: float) -> Ground:
+        """What the training photos show of a support, ``scale`` their typical depth."""
+        inverse, grid = np.linalg.inv(support.pose), Grid.of(support, CELL * scale)
+        cameras = [photo.camera.transformed(inverse) for photo in capture.training]
+        return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _FLAT * OFF * scale))
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Cells of a support in its frame, first axis x.
+
+    Attributes:
+        cell: Their edge.
+        middles: Where they are, (X, Y, 2).
+    """
+
+    cell: float
+    middles: Float64Array
+
+    @classmethod
+    def of(cls, support: Support, cell: float) -> Grid:
+        """Cells of an edge that fill a support."""
+        sides = [(np.arange(max(1, int(edge / cell))) + 0.5) * cell for edge in support.size]
+        x, y = (side - side.mean() for side in sides)
+        return cls(cell, np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
+
+    def cells(self, flat: Float64Array) -> Int64Array:
+        """Indices of the cells at places (N, 2), (N, 2); -1 off the support."""
+        index = np.floor((flat - self.middles[0, 0]) / self.cell + 0.5).astype(np.int64)
+        outside = ((index < 0) | (index >= self.middles.shape[:2])).any(axis=1)
+        return np.where(outside[:, None], -1, index)
+
+    def covered(self, points: Float64Array) -> BoolArray:
+        """Cells that have points (N, 2 or 3) in or over them, gaps between samples closed."""
+        covered = np.zeros(self.middles.shape[:2], dtype=bool)
+        cells = self.cells(points[:, :2])
+        covered[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
+        closed = np.asarray(binary_closing(np.pad(covered, 4), np.ones((3, 3)), iterations=3))
+        return closed[4:-4, 4:-4]
+
+    def heights(self, points: Float64Array, floor: float) -> Float64Array:
+        """Of what stands in the cells (X, Y) by points (N, 3) on it that are above ``floor``, gaps closed; else 0."""
+        high = points[points[:, 2] > floor]
+        cells = self.cells(high[:, :2])
+        within = (cells >= 0).all(axis=1)
+        top = np.zeros(self.middles.shape[:2])
+        np.maximum.at(top, tuple(cells[within].T), high[within, 2])
+        return np.asarray(grey_closing(np.pad(top, _GAP), size=(2 * _GAP + 1,) * 2)[_GAP:-_GAP, _GAP:-_GAP])
+
+    def inside(self, points: Float64Array, footprint: BoolArray, depth: float) -> Float64Array:
+        """Places (M, 3) below points on a thing, that far from its sides, top and ground, in steps as long."""
+        top = np.zeros(footprint.shape)
+        cells = self.cells(points[:, :2])
+        own = (cells >= 0).all(axis=1)
+        np.maximum.at(top, tuple(cells[own].T), points[own, 2])
+        near = distance_transform_edt(top == 0, return_distances=False, return_indices=True)
+        deep = distance_transform_edt(np.pad(footprint, 1))[1:-1, 1:-1] * self.cell > depth
+        step = max(1, int(depth / self.cell))
+        x, y = np.nonzero(deep[::step, ::step])
+        columns = [
+            np.column_stack([np.tile(self.middles[i, j], (len(z), 1)), z])
+            for i, j in zip(step * x, step * y, strict=True)
+            if len(z := np.arange(depth, top[near[0, i, j], near[1, i, j]] - depth, depth))
+        ]
+        return np.concatenate([np.zeros((0, 3)), *columns])
+
+    def outline(self, points: Float64Array) -> BoolArray:
+        """The same of one thing, without holes."""
+        return np.asarray(binary_fill_holes(self.covered(points)))
+
+    def look(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
+        """Display-encoded colours (X, Y, 3) that cameras see of the bare support, and where enough of them do.
+
+        Cameras that look from near and steeply have more of a say.
+        """
+        shape = self.middles.shape[:2]
+        places = np.concatenate([self.middles, np.zeros((*shape, 1))], axis=2).reshape(-1, 3)
+        colours, weights, count = np.zeros((*shape, 3)), np.full(shape, 1e-12), np.zeros(shape, dtype=np.int64)
+        for camera in cameras:
+            view, shown = _seen_by(splats, camera)
+            depth, surface = view.look(places)
+            bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # NaN is not
+            towards = places - view.camera.centre
+            weight = np.where(bare, -towards[:, 2] / np.linalg.norm(towards, axis=1) ** 3, 0.0).reshape(shape)
+            x, y = np.nan_to_num(view.camera.project(places)[0] - 0.5).astype(np.float32).T.reshape(2, *shape)
+            colours += weight[..., None] * np.asarray(cv2.remap(shown, x, y, cv2.INTER_LINEAR, borderMode=_BORDER))
+            weights += weight
+            count += bare.reshape(shape)
+        return colours / weights[..., None], np.asarray(count >= ENOUGH)
+
+    def sheet(self, texture: Float64Array, cells: BoolArray) -> Splats:
+        """Flat Gaussians of a texture's display-encoded colours (X, Y, 3) in some cells."""
+        flat = self.middles[cells]
+        count = len(flat)
+        return Splats(
+            means=np.column_stack([flat, np.zeros(count)]).astype(np.float32),
+            quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (count, 1)),
+            scales=np.tile(np.array([_DISC, _DISC, _THICK], dtype=np.float32) * np.float32(self.cell), (count, 1)),
+            opacities=np.full(count, 0.95, dtype=np.float32),
+            sh=((texture[cells] - 0.5) / SH_C0)[:, None].astype(np.float32),
+        )
+
+
+def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
+    """Depth and display-encoded colours from a camera, the longest edge :data:`_EDGE` px at most."""
+    small, layers = render_sized(splats, camera, _EDGE)
+    shown = encode_srgb(layers.captured / np.maximum(layers.alpha, 1e-6)[..., None])
+    return DepthView.of(small, layers, _OPAQUE), np.asarray(shown, dtype=np.float32)

@@ -122,7 +122,11 @@ def light_of_shading(
             break
         lamps.append((place, size))
         columns.append(column)
-        left = now
+        for k in range(len(lamps) - 1):  # those before were told when this one was not known
+            others = columns[: k + 1] + columns[k + 2 :]
+            lamps[k] = surface.improved(others, *lamps[k])
+            columns[k + 1] = surface.lit(*lamps[k])
+        left, _ = surface.explain(columns)
     if not lamps:
         return None
     _, weights = surface.explain(columns)
@@ -235,9 +239,10 @@ class _Surface:
         flat = size * (qmc.Sobol(2, seed=1).random(_POINTS) - 0.5)
         return np.asarray(flat @ np.stack([across, along]))
 
-    def improved(self, columns: Sequence[Float64Array], place: Float64Array) -> tuple[Float64Array, float]:
-        """A place near one, and a size, at which a lamp explains most."""
-        size = _SIZES[1]
+    def improved(
+        self, columns: Sequence[Float64Array], place: Float64Array, size: float = _SIZES[1]
+    ) -> tuple[Float64Array, float]:
+        """A place near one, and a size, at which a lamp explains most beside what columns do."""
         best, _ = self.explain([*columns, self.lit(place, size)])
         for step in _STEPS:
             for _ in range(6):

@@ -92,19 +92,20 @@ class Grid:
 
     def heights(self, points: Float64Array, floor: float) -> Float64Array:
         """Of what stands in the cells (X, Y) by points (N, 3) on it that are above ``floor``, gaps closed; else 0."""
-        high = points[points[:, 2] > floor]
-        cells = self.cells(high[:, :2])
-        within = (cells >= 0).all(axis=1)
-        top = np.zeros(self.middles.shape[:2])
-        np.maximum.at(top, tuple(cells[within].T), high[within, 2])
+        top = self._tops(points[points[:, 2] > floor])
         return np.asarray(grey_closing(np.pad(top, _GAP), size=(2 * _GAP + 1,) * 2)[_GAP:-_GAP, _GAP:-_GAP])
+
+    def _tops(self, points: Float64Array) -> Float64Array:
+        """The highest of points (N, 3) in each cell (X, Y), 0 where there are none."""
+        top = np.zeros(self.middles.shape[:2])
+        cells = self.cells(points[:, :2])
+        within = (cells >= 0).all(axis=1)
+        np.maximum.at(top, tuple(cells[within].T), points[within, 2])
+        return top
 
     def inside(self, points: Float64Array, footprint: BoolArray, depth: float) -> Float64Array:
         """Places (M, 3) below points on a thing, that far from its sides, top and ground, in steps as long."""
-        top = np.zeros(footprint.shape)
-        cells = self.cells(points[:, :2])
-        own = (cells >= 0).all(axis=1)
-        np.maximum.at(top, tuple(cells[own].T), points[own, 2])
+        top = self._tops(points)
         near = distance_transform_edt(top == 0, return_distances=False, return_indices=True)
         deep = distance_transform_edt(np.pad(footprint, 1))[1:-1, 1:-1] * self.cell > depth
         step = max(1, int(depth / self.cell))

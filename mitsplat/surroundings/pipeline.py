@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -123,8 +123,7 @@ def reconstruct_surroundings(
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
     cameras = [photo.camera for photo in capture.training]
-    shades = _Shades.of(found[0], splats, capture, points, scale) if found else None
-    fitted, things = splats, list[RemovedThing]()
+    fitted, standing, things = splats, points, list[RemovedThing]()
     if job.remove:
         splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
         views = depth_views(splats, cameras)
@@ -173,7 +172,7 @@ def reconstruct_surroundings(
             {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
         ]
         if region is not None and made.asset.units == "metre":
-            light = None if shades is None else shades.light(factor)
+            light = _light(found[0], fitted, capture, standing, scale, factor)
             rows["Light"] = "not told by shadows" if light is None else _lit(light)
             seen = [photo.camera for photo in capture.transformed(larger).photos]
             record["scene"] = scene_text(job.name, "{folder}", supports, region, seen, light)
@@ -195,45 +194,26 @@ def reconstruct_surroundings(
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
 
 
-@dataclass(frozen=True, eq=False)
-class _Shades:
-    """What tells the light on a support: its bare colours, and what stands on it.
+def _light(
+    support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float, factor: float
+) -> ShadingLight | None:
+    """What light the shadows on a support tell, relative to its middle [m], ``factor`` metres to a unit."""
+    ground = Ground.of(support, splats, capture, scale)
+    places = points.transformed(np.asarray(np.linalg.inv(support.pose))).places
+    heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
+    linear, bare = decode_srgb(np.clip(ground.texture, 0, 1)), np.asarray(binary_erosion(ground.seen))
+    block = -(-max(heights.shape) // _ACROSS)
 
-    Attributes:
-        colours: Linear RGB, (X, Y, 3).
-        heights: Of what stands there, (X, Y) [units].
-        bare: Cells whose colour is the surface's, (X, Y).
-        cell: Edge of the cells [units].
-    """
+    def blocks(values: Float64Array | BoolArray) -> Any:
+        x, y = (count // block for count in values.shape[:2])
+        return values[: x * block, : y * block].reshape(x, block, y, block, *values.shape[2:])
 
-    colours: Float64Array
-    heights: Float64Array
-    bare: BoolArray
-    cell: float
-
-    @classmethod
-    def of(cls, support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float) -> _Shades:
-        ground, inverse = Ground.of(support, splats, capture, scale), np.linalg.inv(support.pose)
-        places = points.places @ inverse[:3, :3].T + inverse[:3, 3]
-        heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
-        linear = decode_srgb(np.clip(ground.texture, 0, 1))
-        block = -(-max(heights.shape) // _ACROSS)
-
-        def blocks(values: Float64Array | BoolArray) -> Any:
-            x, y = (count // block for count in values.shape[:2])
-            return values[: x * block, : y * block].reshape(x, block, y, block, *values.shape[2:])
-
-        bare = np.asarray(binary_erosion(ground.seen))
-        return cls(
-            blocks(linear).mean(axis=(1, 3)),
-            blocks(heights).max(axis=(1, 3)),
-            blocks(bare).all(axis=(1, 3)),
-            block * ground.grid.cell,
-        )
-
-    def light(self, factor: float) -> ShadingLight | None:
-        """What light they tell, ``factor`` metres to a unit."""
-        return light_of_shading(self.colours, factor * self.heights, self.bare, factor * self.cell)
+    return light_of_shading(
+        blocks(linear).mean(axis=(1, 3)),
+        factor * blocks(heights).max(axis=(1, 3)),
+        blocks(bare).all(axis=(1, 3)),
+        factor * block * ground.grid.cell,
+    )
 
 
 def _lit(light: ShadingLight) -> str:

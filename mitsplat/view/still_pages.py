@@ -113,7 +113,7 @@ class CapturePage(StillPage):
         through.on_click(lambda _: page.look_through(self._chosen.camera))
         page.on_click(self._clicked)
         page.on_point(self._pointed)
-        self._click.on_update(lambda _: self._show_picks())
+        self._click.on_update(lambda _: self._take(self._picks))
         back.on_click(lambda _: self._forget(all_of_them=back.value == "all"))
         page.look_around()
         self._show()
@@ -125,26 +125,28 @@ class CapturePage(StillPage):
                 return
             try:
                 pick = pick_along(self._capture, origin, direction)
-                self._chosen_parts([*self._picks, (option, pick)])
+                self._take([*self._picks, (option, pick)])
             except InputError as error:
                 self._page.alert(str(error))
                 return
-            self._picks.append((option, pick))
             name, _, _ = pick.rpartition(":")
             self._photo.value = [photo.name for photo in self._capture.photos].index(name)
-            self._show_picks()
 
     def _forget(self, *, all_of_them: bool) -> None:
         with self._turn:
-            del self._picks[0 if all_of_them else -1 :]
-            self._show_picks()
+            self._take([] if all_of_them else self._picks[:-1])
 
-    def _show_picks(self) -> None:
-        """Show what the picks choose, and what to give on a command line; no cameras while a click picks."""
+    def _take(self, picks: list[tuple[str, str]]) -> None:
+        """Show what picks choose, and what to give on a command line; no cameras while a click picks.
+
+        Raises:
+            InputError: If they choose nothing; those before stay.
+        """
+        chosen, self._picks = self._chosen_parts(picks), picks
         parts = list(capture_parts(self._capture))
         if _CLICKS.get(self._click.value) is not None:  # a click on a camera would say something, too
             parts = [part for part in parts if not isinstance(part.thing, Frustum)]
-        self._page.show([*parts, *self._chosen_parts(self._picks)])
+        self._page.show([*parts, *chosen])
         self._show()
         words = " ".join(f"{option} {shlex.quote(pick)}" for option, pick in self._picks)
         self._told.content = f"```\n{words}\n```" if words else ""

@@ -1,7 +1,7 @@
 """All arms and seeds of the experiment on detectors, side by side, as far as time allows.
 
     python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
-        [--minutes 20] [--plan workshop.yaml]
+        [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
 Datasets are rendered one after the other, and what learns from one starts when it is there. What was recorded is not
 done again; what was interrupted goes on.
@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
 
-from benchmarks.detector.experiment import PLAN, read_arms, result_of, scenes_of, write_scene
+from benchmarks.detector.experiment import PLAN, VIEWS, read_arms, result_of, scenes_of, write_scene
 from benchmarks.record import RESULTS
 
 
@@ -35,8 +35,10 @@ def main() -> None:
     parser.add_argument("--render-device", default="auto")
     parser.add_argument("--minutes", type=float, default=1e9, help="after which nothing is begun")
     parser.add_argument("--weights", type=Path)
+    parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"), help="where scans are")
     options = parser.parse_args()
-    arms = read_arms(options.plan)["arms"]
+    said = read_arms(options.plan)
+    arms = said["arms"]
     chosen = options.arms or list(arms)
     ends = time.monotonic() + 60 * options.minutes
     logs = options.work / "logs"
@@ -78,8 +80,16 @@ def main() -> None:
                     continue
                 rendered.add(scene)
                 words = ["mitsplat", "render", str(write_scene(options.work, scene, options.plan))]
-                words += ["-o", str(options.work / "data" / scene), "--resume", "--device", options.render_device]
-                command(f"render-{scene}", [*words, "--workers", str(options.render_workers)])
+                words += ["-o", str(options.work / "data" / scene), "--resume"]
+                words += ["--workers", str(options.render_workers)]
+                learning = [arms[name] for name in chosen if scene in scenes_of(arms[name])]
+                if all("first" in one for one in learning):
+                    count = max(one["first"] * VIEWS // one.get("views", VIEWS) for one in learning)
+                    words += ["--frames", str(count)]
+                if module := said.get("rendered_by", {}).get(arms[arm].get("change")):
+                    words = [sys.executable, "-m", f"benchmarks.detector.{module}", str(options.work), scene]
+                    words += ["--hope", str(options.hope)] if module == "meshes" else []
+                command(f"render-{scene}", [*words, "--device", options.render_device])
             for seed in options.seeds:
                 pool.submit(train, arm, seed)
 

@@ -57,14 +57,15 @@ def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
     scene = YAML(typ="safe").load((HERE / said["scene"]).read_text())
     rows = [row for change in name.split("+") for row in said["changes"][change].items()]
     # What is later in a list goes first, so that places in it stay those of groceries.yaml.
-    gone = sorted((row for row in rows if row[1] is None), reverse=True)
+    gone = sorted({row for row in rows if row[1] is None}, reverse=True)
     for key, value in [row for row in rows if row[1] is not None] + gone:
         *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
         place = scene
         for step in way:
             place = place.setdefault(step, {}) if isinstance(place, dict) else place[step]
         if value is None:
-            del place[last]
+            if not isinstance(place, list) or last < len(place):
+                del place[last]
         elif isinstance(place, list) and last == len(place):
             place.append(deepcopy(value))
         else:

@@ -85,17 +85,33 @@ class Wanted:
     seed: int = 0
     brand: bool = False
 
+    def mesh(self) -> tuple[Path | trimesh.Trimesh, Literal["y", "z"]]:
+        """Textured, and which of its axes points up."""
+        if self.scan is None:
+            return make_package(self.seed), "z"
+        up = UP.get(self.scan.stem, "y")
+        if not self.brand:
+            return self.scan, up
+        scan = trimesh.load(self.scan, force="mesh")
+        return relabel(scan, self.seed, "xyz".index(up), own_colours=self.seed % 2 == 0), up
+
     def bake(self, gaussians: int, device: str) -> float:
         """Its PSNR [dB]."""
         use_device(device)
-        if self.scan is None:
-            return bake(make_package(self.seed), self.out, "package", PACKAGE, "z")
-        up = UP.get(self.scan.stem, "y")
-        if not self.brand:
-            return bake(self.scan, self.out, self.scan.stem, BakeSettings(gaussians=gaussians), up)
-        scan = trimesh.load(self.scan, force="mesh")
-        mesh = relabel(scan, self.seed, "xyz".index(up), own_colours=self.seed % 2 == 0)
+        mesh, up = self.mesh()
+        if isinstance(mesh, Path):
+            return bake(mesh, self.out, mesh.stem, BakeSettings(gaussians=gaussians), up)
         return bake(mesh, self.out, "package", PACKAGE, up)
+
+
+def wanted_assets(hope: Path, work: Path, packages: int) -> list[Wanted]:
+    """All of the experiment's."""
+    wanted = []
+    for number, path in enumerate(sorted((hope / "meshes").glob("*.glb"))):
+        wanted.append(Wanted(work / "groceries" / path.stem, path))
+        count = BRANDS[shape_of(trimesh.load(path, force="mesh"))]
+        wanted += [Wanted(work / "brands" / f"{path.stem}_{k}", path, 1000 * number + k, True) for k in range(count)]
+    return wanted + [Wanted(work / "packages" / f"package_{seed:02d}", seed=seed) for seed in range(packages)]
 
 
 def make(options: argparse.Namespace) -> None:
@@ -104,14 +120,7 @@ def make(options: argparse.Namespace) -> None:
     if not photos.exists():
         shutil.copytree(options.hope / "photos", photos)
         shutil.copy(options.hope / "labels.json", photos / "labels.json")
-    wanted = []
-    for number, path in enumerate(sorted((options.hope / "meshes").glob("*.glb"))):
-        wanted.append(Wanted(options.work / "groceries" / path.stem, path))
-        brands = options.work / "brands"
-        count = BRANDS[shape_of(trimesh.load(path, force="mesh"))]
-        wanted += [Wanted(brands / f"{path.stem}_{k}", path, 1000 * number + k, brand=True) for k in range(count)]
-    packages = options.work / "packages"
-    wanted += [Wanted(packages / f"package_{seed:02d}", seed=seed) for seed in range(options.packages)]
+    wanted = wanted_assets(options.hope, options.work, options.packages)
     wanted = [one for one in wanted if not (one.out / "asset.yaml").exists()]
     # Not an executor of concurrent.futures: with processes of so many tasks it waits for ever once all have ended.
     with get_context("spawn").Pool(options.jobs, maxtasksperchild=8) as pool:

@@ -13,7 +13,7 @@ REFERENCE = "synthetic"
 """The arm that others are compared with."""
 FIRST = "traced_shadow"
 """The arm that those are compared with which learn from as few images as it does."""
-OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*")
+OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*|scattered|floating|meshes")
 EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000"})
 """Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
 REDRAWS = 50

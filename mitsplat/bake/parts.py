@@ -229,8 +229,13 @@ def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool =
     Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
     """
     ensure_variant()
-    shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE if clay else _bsdf(part)) for k, part in enumerate(parts)}
+    shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE) if clay else part_shape(part) for k, part in enumerate(parts)}
     return ray_scene({**shapes, **lights})
+
+
+def part_shape(part: Part) -> mi.Mesh:
+    """Mitsuba's shape of a part in its own material."""
+    return _mitsuba_mesh(part, _bsdf(part))
 
 
 def _bsdf(part: Part) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from ultralytics.data.build import InfiniteDataLoader, seed_worker
 from ultralytics.models.yolo.detect.train import DetectionTrainer
 from ultralytics.models.yolo.segment.train import SegmentationTrainer
 from ultralytics.nn.tasks import torch_safe_load
+from ultralytics.utils.ops import resample_segments
 from ultralytics.utils.torch_utils import strip_optimizer
 
 from mitsplat.arrays import Int64Array
@@ -37,6 +38,8 @@ _WARM_UP = 100
 """Most steps until the learning rate is whole; a tenth of shorter trainings."""
 _MANY = 10_000
 """Steps beyond which Ultralytics takes MuSGD, and AdamW up to it; it counts them by images, here they are known."""
+_OUTLINE = 1000
+"""Points that Ultralytics gives every outline that has no more."""
 
 LAST = "weights/last.pt"
 """The checkpoint that a training goes on from, below the folder of its run."""
@@ -203,6 +206,9 @@ class _FixedSteps:
         images = self.job.images.read_text().splitlines()
         if dataset.im_files != images:
             raise InputError(f"{self.job.images}: Ultralytics read {len(dataset.im_files)} of {len(images)} images")
+        for label in dataset.labels:  # once, not anew in every mosaic: a fifth of all augmentation
+            if max(map(len, label["segments"]), default=_OUTLINE) <= _OUTLINE:
+                resample_segments(label["segments"], n=_OUTLINE)
         if dataset.cache == "ram":
             _mix_mosaics(dataset.transforms, self.job.plan.ravel().tolist())
         generator = torch.Generator()

@@ -1,0 +1,153 @@
+"""The same frames path-traced from the textured meshes that the splats were baked of: the dear way, as the ceiling.
+
+    python -m benchmarks.detector.meshes WORK SCENE [--hope ../shared/data/hope] [--frames 128] [--samples 64]
+        [--device cuda]
+
+SCENE is one of ``arms.yaml`` with the change ``meshes``. Layouts, looks, lamps, cameras and their response are those of
+the scene, and labels are those of its splats. Objects and what they lie on are path-traced; the walls behind them are
+as the splat renderer shows them, as both take their light for a constant sky. A picture is as bright and as balanced as
+that one where no object is. WORK/data/SCENE gets the images and their labels; the seconds of each are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+# isort: off
+import mitsplat as ms  # which must come before Dr.Jit
+
+import numpy as np
+from scipy.spatial import KDTree
+
+# isort: on
+from benchmarks.detector.experiment import VIEWS, write_scene
+from benchmarks.detector.material import wanted_assets
+from mitsplat.asset import Asset
+from mitsplat.bake.parts import Part, part_shape, read_parts
+from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.frames.camera_response import develop
+from mitsplat.frames.frame import Frame
+from mitsplat.plugins.device import ray_scene
+from mitsplat.render.emitters import emitter_dict
+from mitsplat.render.path_tracing import render_mesh
+from mitsplat.scene.appearance import Appearance, draw_appearances
+from mitsplat.scene.layout import Instance, Layout
+from mitsplat.scene.scene import Scene, layout_of
+from mitsplat.spec.lights import EnvironmentLight, LightSpec
+from mitsplat.spec.spec import BACKDROP
+from mitsplat.spherical_harmonics import SH_C0
+
+PACKAGES = 90
+LEAST = 500
+"""Pixels where no object is by which a picture's brightness is told."""
+CEILING = 2.05
+"""Height of that of ``groceries.yaml`` [m]."""
+
+
+def main() -> None:
+    """Render."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("scene")
+    parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"))
+    parser.add_argument("--frames", type=int, default=128)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--device", default="auto")
+    options = parser.parse_args()
+    ms.use_device(options.device)
+    scene = ms.load_scene(write_scene(options.work, options.scene))
+    meshes = {one.out.name: one.mesh() for one in wanted_assets(options.hope, options.work, PACKAGES)}
+    parts = {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
+    traced = frames(scene, parts, options.frames, options.samples)
+    print(ms.write_frames(scene, options.work / "data" / options.scene, traced, overwrite=True))
+
+
+def frames(scene: Scene, parts: Mapping[str, tuple[Part, ...]], count: int, samples: int) -> Iterator[Frame]:
+    """The first frames of a scene with path-traced pictures."""
+    with ms.Renderer(scene) as renderer:
+        layout, objects = None, dict[str, Any]()
+        for index in range(count):
+            if index % VIEWS == 0:
+                layout = ms.settle_layout(scene, layout_of(scene, index))
+                objects = object_shapes(scene, layout, parts)
+            frame, start = renderer.render(index, layout=layout), time.perf_counter()
+            described = renderer.describe(layout, frame.plan.lights)
+            room = {name: described[name] for name in described if _stands(scene, name)}
+            room |= {f"light_{k}": emitter_dict(light) for k, light in enumerate(frame.plan.lights) if _shines(light)}
+            radiance, cover = render_mesh(
+                ray_scene({**room, **objects}), frame.camera, samples=samples, bounces=6, seed=index
+            )
+            image = developed(frame, radiance, cover, scene)
+            print(f"{index} {time.perf_counter() - start:.2f} s", flush=True)
+            yield replace(frame, image=image)
+
+
+def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scene) -> np.ndarray:
+    """The picture of a frame's camera."""
+    empty = (frame.instance == 0) & (cover == 1)
+    if empty.sum() < LEAST:
+        empty = cover == 1
+    gain = np.median(frame.rgb[empty], axis=0) / np.maximum(np.median(radiance[empty], axis=0), 1e-6)
+    composite = scene.spec.composite
+    return develop(
+        (gain * radiance + frame.rgb * (1 - cover[..., None])).astype(np.float32),
+        frame.draws,
+        tone=composite.tone,
+        sensor=composite.sensor,
+        seed=frame.plan.seed,
+        metered=composite.exposure == "auto",
+    )
+
+
+def _shines(light: LightSpec) -> bool:
+    """Whether a light is below the ceiling, which hides others from the splat renderer."""
+    return isinstance(light, EnvironmentLight) or light.position[2] < CEILING
+
+
+def _stands(scene: Scene, name: str) -> bool:
+    """Whether a shape of Mitsuba's description is what objects lie on."""
+    if not name.startswith("shape_"):
+        return False
+    shape = scene.spec.shapes[int(name.removeprefix("shape_"))]
+    return shape.visible and not shape.name.startswith(BACKDROP)
+
+
+def object_shapes(scene: Scene, layout: Layout, parts: Mapping[str, tuple[Part, ...]]) -> dict[str, Any]:
+    """Mitsuba's shapes of all objects of a layout, as they look there."""
+    looks = draw_appearances(scene, layout)
+    shapes = {}
+    for one in layout.instances:
+        asset = scene.assets[one.asset]
+        for number, part in enumerate(parts.get(asset.name) or (primitive(asset),)):
+            shapes[f"object_{one.id}_{number}"] = part_shape(_placed(part, one, looks.get(one.id)))
+    return shapes
+
+
+def primitive(asset: Asset) -> Part:
+    """A solid that no file holds, in the colour of the nearest of its splats."""
+    mesh = asset.mesh.subdivide_to_size(0.004)
+    _, nearest = KDTree(asset.splats.means).query(mesh.vertices)
+    colours = decode_srgb(np.clip(asset.splats.sh[nearest, 0] * SH_C0 + 0.5, 0, 1))
+    return Part(asset.name, mesh, colours[mesh.faces], None, None, 0.0, asset.roughness, True, asset.specular)
+
+
+def _placed(part: Part, instance: Instance, look: Appearance | None) -> Part:
+    mesh = part.mesh.copy()
+    mesh.apply_transform(instance.world_from_object)
+    if look is None:
+        return replace(part, mesh=mesh)
+    matrix = np.array(look.properties().get("colours", "1 0 0 0 1 0 0 0 1").split(), dtype=float).reshape(3, 3)
+    part = replace(part, mesh=mesh, roughness=look.roughness, reflectance=look.specular, shiny=look.specular > 0)
+    if part.texture is None:
+        return replace(part, colours=np.clip(part.colours @ matrix.T, 0, 1))
+    texture = encode_srgb(np.clip(decode_srgb(part.texture / 255.0) @ matrix.T, 0, 1))
+    return replace(part, texture=np.rint(255 * texture).astype(np.uint8))
+
+
+if __name__ == "__main__":
+    main()

@@ -10,7 +10,7 @@ Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` sta
 * ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
 * ``caption RESULT ...``: command, machine, load and revision of results;
 * ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
-* ``detectors`` or ``detectors PLAN``: a table of what the arms of ``benchmarks.detector`` came to.
+* ``detectors PLAN ARM ...``: a table of what arms of ``benchmarks.detector`` came to; ``detectors PLAN``, of all.
 
 What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
 """
@@ -162,8 +162,8 @@ def filled(text: str, results: Results) -> str:
             match words:
                 case ["runs"]:
                     return runs((result for result in results.values() if "command" in result), newest)
-                case ["detectors", *plan] if len(plan) < 2:
-                    return experiment_table(results, *plan)
+                case ["detectors", *plan_and_arms]:
+                    return experiment_table(results, *plan_and_arms)
                 case ["caption" | "runs" as what, *names] if names:
                     if missing := [name for name in names if "command" not in results.get(name, {})]:
                         raise FigureError(f"no result {missing[0]}")
@@ -179,7 +179,7 @@ def filled(text: str, results: Results) -> str:
                     return formatted(value_of(results, result, name), spec)
                 case [result, name]:
                     return formatted(value_of(results, result, name), "")
-        except FigureError as error:
+        except (FigureError, KeyError) as error:
             raise FigureError(f"{{{{ {match[1].strip()} }}}}: {error}") from None
         raise FigureError(f"{{{{ {match[1].strip()} }}}} is no figure")
 

@@ -6,7 +6,7 @@
 SCENE is one of ``arms.yaml`` with the change ``meshes``. Layouts, looks, lamps, cameras and their response are those of
 the scene, and labels are those of its splats. Objects and what they lie on are path-traced; the walls behind them are
 as the splat renderer shows them, as both take their light for a constant sky. A picture is as bright and as balanced as
-that one where no object is. WORK/data/SCENE gets the images and their labels; the seconds of each are printed.
+that one where no object is. WORK/data/SCENE gets the images and their labels.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 # isort: on
-from benchmarks.detector.experiment import VIEWS, write_scene
+from benchmarks.detector.experiment import write_scene
 from benchmarks.detector.material import wanted_assets
 from mitsplat.asset import Asset
 from mitsplat.bake.parts import Part, part_shape, read_parts
@@ -61,21 +61,25 @@ def main() -> None:
     options = parser.parse_args()
     ms.use_device(options.device)
     scene = ms.load_scene(write_scene(options.work, options.scene))
-    meshes = {one.out.name: one.mesh() for one in wanted_assets(options.hope, options.work, PACKAGES)}
-    parts = {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
-    traced = frames(scene, parts, options.frames, options.samples)
+    traced = frames(scene, textured(options.hope, options.work), range(options.frames), options.samples)
     print(ms.write_frames(scene, options.work / "data" / options.scene, traced, overwrite=True))
 
 
-def frames(scene: Scene, parts: Mapping[str, tuple[Part, ...]], count: int, samples: int) -> Iterator[Frame]:
-    """The first frames of a scene with path-traced pictures."""
+def textured(hope: Path, work: Path) -> dict[str, tuple[Part, ...]]:
+    """What all assets were baked of, by their names."""
+    meshes = {one.out.name: one.mesh() for one in wanted_assets(hope, work, PACKAGES)}
+    return {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
+
+
+def frames(scene: Scene, parts: Mapping[str, tuple[Part, ...]], indices: range, samples: int) -> Iterator[Frame]:
+    """Frames of a scene with path-traced pictures, which take processor seconds ``seconds["path"]`` each."""
     with ms.Renderer(scene) as renderer:
         layout, objects = None, dict[str, Any]()
-        for index in range(count):
-            if index % VIEWS == 0:
+        for index in indices:
+            if layout is None or layout.index != layout_of(scene, index):
                 layout = ms.settle_layout(scene, layout_of(scene, index))
                 objects = object_shapes(scene, layout, parts)
-            frame, start = renderer.render(index, layout=layout), time.perf_counter()
+            frame, start = renderer.render(index, layout=layout), time.process_time()
             described = renderer.describe(layout, frame.plan.lights)
             room = {name: described[name] for name in described if _stands(scene, name)}
             room |= {f"light_{k}": emitter_dict(light) for k, light in enumerate(frame.plan.lights) if _shines(light)}
@@ -83,8 +87,7 @@ def frames(scene: Scene, parts: Mapping[str, tuple[Part, ...]], count: int, samp
                 ray_scene({**room, **objects}), frame.camera, samples=samples, bounces=6, seed=index
             )
             image = developed(frame, radiance, cover, scene)
-            print(f"{index} {time.perf_counter() - start:.2f} s", flush=True)
-            yield replace(frame, image=image)
+            yield replace(frame, image=image, seconds={**frame.seconds, "path": time.process_time() - start})
 
 
 def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scene) -> np.ndarray:

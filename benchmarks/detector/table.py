@@ -20,27 +20,30 @@ REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 
 
-def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "") -> str:
-    """Precision of every arm of a plan that was recorded, ``arms.yaml`` if none is named, with intervals of 95 %.
+def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms", *arms: str) -> str:
+    """Precision of the arms of a plan that were recorded, or of some of them in their order, with intervals of 95 %.
 
     Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
     drawn apart for each arm. An arm of one seed has only that of scenes.
     """
     seeds: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for name in sorted(results):
-        if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{plan and f'-plan_{plan}'}", name):
+        if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{'' if plan == 'arms' else f'-plan_{plan}'}", name):
             seeds[found[1]].append(results[name]["figures"])
+    if missing := [arm for arm in arms if arm not in seeds]:
+        raise KeyError(f"no result of {missing[0]} in {plan}.yaml")
     rng = np.random.default_rng(0)
     draws = {arm: _redrawn(np.array([one["samples"][0] for one in found]), rng) for arm, found in seeds.items()}
     lines = [
         "| learnt from | seeds | mAP50-95 | 95 % | mAP50 | compared with | less by, 95 % |",
         "| --- | ---: | ---: | --- | ---: | --- | --- |",
     ]
-    for arm, found in seeds.items():
+    for arm in arms or seeds:
+        found = seeds[arm]
         strict, loose = (np.mean([one[key][0] for one in found]) for key in ("map50_95", "map50"))
         reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else REFERENCE
         compared = "– | –"
-        if arm != reference and reference in draws and not (arm in EARLIER and not plan):
+        if arm != reference and reference in draws and not (arm in EARLIER and plan == "arms"):
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"
         lines.append(f"| `{arm}` | {len(found)} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")
     return "\n".join(lines)

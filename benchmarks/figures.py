@@ -10,7 +10,8 @@ Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` sta
 * ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
 * ``caption RESULT ...``: command, machine, load and revision of results;
 * ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
-* ``detectors PLAN ARM ...``: a table of what arms of ``benchmarks.detector`` came to; ``detectors PLAN``, of all.
+* ``detectors PLAN ARM ...``: a table of what arms of ``benchmarks.detector`` came to; ``detectors PLAN``, of all;
+* ``detector PLAN ARM``: the mean precision of an arm.
 
 What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
 """
@@ -27,7 +28,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.detector.table import experiment_table
+from benchmarks.detector.table import experiment_table, mean_precision
 from benchmarks.record import MEASURED, RESULTS, ROOT
 from benchmarks.scale.projection import project
 
@@ -164,6 +165,8 @@ def filled(text: str, results: Results) -> str:
                     return runs((result for result in results.values() if "command" in result), newest)
                 case ["detectors", *plan_and_arms]:
                     return experiment_table(results, *plan_and_arms)
+                case ["detector", plan, arm]:
+                    return f"{mean_precision(results, plan, arm):.3f}"
                 case ["caption" | "runs" as what, *names] if names:
                     if missing := [name for name in names if "command" not in results.get(name, {})]:
                         raise FigureError(f"no result {missing[0]}")

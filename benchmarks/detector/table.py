@@ -26,27 +26,45 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
     drawn apart for each arm. An arm of one seed has only that of scenes.
     """
-    seeds: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
-    for name in sorted(results):
-        if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{'' if plan == 'arms' else f'-plan_{plan}'}", name):
-            seeds[found[1]].append(results[name]["figures"])
-    if missing := [arm for arm in arms if arm not in seeds]:
-        raise KeyError(f"no result of {missing[0]} in {plan}.yaml")
-    rng = np.random.default_rng(0)
-    draws = {arm: _redrawn(np.array([one["samples"][0] for one in found]), rng) for arm, found in seeds.items()}
+    seeds = _by_arm(results, plan)
+    # Each arm draws its own, so that none changes with what else was recorded.
+    draws = {
+        arm: _redrawn(np.array([one["samples"][0] for one in found]), np.random.default_rng(list(arm.encode())))
+        for arm, found in seeds.items()
+    }
     lines = [
         "| learnt from | seeds | mAP50-95 | 95 % | mAP50 | compared with | less by, 95 % |",
         "| --- | ---: | ---: | --- | ---: | --- | --- |",
     ]
     for arm in arms or seeds:
-        found = seeds[arm]
-        strict, loose = (np.mean([one[key][0] for one in found]) for key in ("map50_95", "map50"))
+        strict, loose = (mean_precision(results, plan, arm, key) for key in ("map50_95", "map50"))
         reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else REFERENCE
         compared = "– | –"
         if arm != reference and reference in draws and not (arm in EARLIER and plan == "arms"):
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"
-        lines.append(f"| `{arm}` | {len(found)} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")
+        count = len(seeds[arm])
+        lines.append(f"| `{arm}` | {count} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")
     return "\n".join(lines)
+
+
+def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str, key: str = "map50_95") -> float:
+    """Mean over the seeds of an arm.
+
+    Raises:
+        KeyError: If there is none.
+    """
+    if arm not in (seeds := _by_arm(results, plan)):
+        raise KeyError(f"no result of {arm} in {plan}.yaml")
+    return float(np.mean([one[key][0] for one in seeds[arm]]))
+
+
+def _by_arm(results: Mapping[str, Mapping[str, Any]], plan: str) -> dict[str, list[Mapping[str, Any]]]:
+    """Figures of every seed of the arms of a plan."""
+    seeds: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+    for name in sorted(results):
+        if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{'' if plan == 'arms' else f'-plan_{plan}'}", name):
+            seeds[found[1]].append(results[name]["figures"])
+    return dict(seeds)
 
 
 def _redrawn(samples: np.ndarray, rng: np.random.Generator) -> np.ndarray:

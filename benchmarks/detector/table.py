@@ -26,12 +26,7 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
     drawn apart for each arm. An arm of one seed has only that of scenes.
     """
-    seeds = _by_arm(results, plan)
-    # Each arm draws its own, so that none changes with what else was recorded.
-    draws = {
-        arm: _redrawn(np.array([one["samples"][0] for one in found]), np.random.default_rng(list(arm.encode())))
-        for arm, found in seeds.items()
-    }
+    seeds, draws = _by_arm(results, plan), precision_draws(results, plan)
     lines = [
         "| learnt from | seeds | mAP50-95 | 95 % | mAP50 | compared with | less by, 95 % |",
         "| --- | ---: | ---: | --- | ---: | --- | --- |",
@@ -45,6 +40,17 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
         count = len(seeds[arm])
         lines.append(f"| `{arm}` | {count} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")
     return "\n".join(lines)
+
+
+def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms") -> dict[str, np.ndarray]:
+    """Precision of each arm of a plan over draws of its seeds and of scenes: shape (REDRAWS, draws).
+
+    Each arm draws its own seeds, so that none changes with what else was recorded.
+    """
+    return {
+        arm: _redrawn(np.array([one["samples"][0] for one in found]), np.random.default_rng(list(arm.encode())))
+        for arm, found in _by_arm(results, plan).items()
+    }
 
 
 def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str, key: str = "map50_95") -> float:

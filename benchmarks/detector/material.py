@@ -32,11 +32,16 @@ PACKAGE = BakeSettings(
 UP: dict[str, Literal["y", "z"]] = {"bbq_sauce": "z"}
 """Axes of scans that stand along another than y: this one lies on its label."""
 
-BRANDS = {"box": 4, "bottle": 5, "can": 8}
+BRANDS = {"box": 4, "bottle": 10, "can": 8}
 """How many other brands of each scan there are, by its shape: most goods in cans and bottles come in these.
 
 Every second one has the scan's colours: on photographs what shares a class's colours was taken for it, whatever was
 printed on it."""
+PRINTED = 5
+"""Bottles of each scan that are printed all around; others have a label and a cap of any colour."""
+
+PACKAGES = 130
+"""Of which 90 are boxes, cans and bottles, and the rest what was taken for a class beside them."""
 
 DENSITY = 600.0
 """Of packed food with air around it [kg/m^3]."""
@@ -68,7 +73,7 @@ def main() -> None:
     parser.add_argument("hope", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--gaussians", type=int, default=50000, help="of each scan")
-    parser.add_argument("--packages", type=int, default=90)
+    parser.add_argument("--packages", type=int, default=PACKAGES)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--jobs", type=int, default=1, help="assets that are baked at once")
     options = parser.parse_args()
@@ -93,7 +98,8 @@ class Wanted:
         if not self.brand:
             return self.scan, up
         scan = trimesh.load(self.scan, force="mesh")
-        return relabel(scan, self.seed, "xyz".index(up), own_colours=self.seed % 2 == 0), up
+        own, plain = self.seed % 2 == 0, self.seed % 1000 >= PRINTED and shape_of(scan) == "bottle"
+        return relabel(scan, self.seed, "xyz".index(up), own_colours=own, plain=plain), up
 
     def bake(self, gaussians: int, device: str) -> float:
         """Its PSNR [dB]."""

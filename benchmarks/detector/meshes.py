@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 # isort: on
 from benchmarks.detector.experiment import write_scene
-from benchmarks.detector.material import wanted_assets
+from benchmarks.detector.material import PACKAGES, wanted_assets
 from mitsplat.asset import Asset
 from mitsplat.bake.parts import Part, part_shape, read_parts
 from mitsplat.colour import decode_srgb, encode_srgb
@@ -42,7 +42,6 @@ from mitsplat.spec.lights import EnvironmentLight, LightSpec
 from mitsplat.spec.spec import BACKDROP
 from mitsplat.spherical_harmonics import SH_C0
 
-PACKAGES = 90
 LEAST = 500
 """Pixels where no object is by which a picture's brightness is told."""
 CEILING = 2.05

@@ -1,4 +1,4 @@
-"""Packages that no class is: boxes, cans and bottles with printed labels, as textured meshes to be baked.
+"""Packages that no class is: boxes, cans, bottles, tubs and bags, most of them printed, as textured meshes to be baked.
 
 A detector that has never seen another box with words on it takes every box with words for one that it knows. These are
 drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib. Nor
@@ -27,14 +27,18 @@ WORDS = re.split(
 )
 FONTS = sorted(Path(matplotlib.get_data_path(), "fonts/ttf").glob("DejaVu*Bold*.ttf"))
 Colours: TypeAlias = list[tuple[int, int, int]]
+FIRST_KINDS = 90
+"""Packages that are boxes, cans and bottles; what photographs showed to be taken for classes beside them follows."""
 _PIXELS_PER_METRE = 3000.0
 
 
 def make_package(seed: int) -> trimesh.Trimesh:
     """A closed mesh [m], z up, with a texture."""
     rng = np.random.default_rng(seed)
-    kind: Callable[[np.random.Generator], trimesh.Trimesh] = (_box, _can, _bottle)[seed % 3]
-    return kind(rng)
+    kinds: Sequence[Callable[[np.random.Generator], trimesh.Trimesh]] = (_box, _can, _bottle)
+    if seed >= FIRST_KINDS:
+        kinds = (_tub, _long_box, _squeezed, _bag)
+    return kinds[seed % len(kinds)](rng)
 
 
 def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
@@ -45,7 +49,9 @@ def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
     return "bottle" if extents[2] > 1.8 * extents[1] else "can"
 
 
-def relabel(scan: trimesh.Trimesh, seed: int, up: int, *, own_colours: bool = False) -> trimesh.Trimesh:
+def relabel(
+    scan: trimesh.Trimesh, seed: int, up: int, *, own_colours: bool = False, plain: bool = False
+) -> trimesh.Trimesh:
     """A scan with another brand's print on it: all sides of a box, all around a bottle below its cap, or a can.
 
     Args:
@@ -53,6 +59,7 @@ def relabel(scan: trimesh.Trimesh, seed: int, up: int, *, own_colours: bool = Fa
         seed: Decides all that is printed.
         up: Axis along which print stands upright.
         own_colours: Whether it is printed in colours of the scan, so that they do not tell one from the other.
+        plain: Whether a bottle is of one colour but for its cap, of any, and a label on its front and back.
     """
     rng = np.random.default_rng(seed)
     shape = shape_of(scan)
@@ -85,13 +92,13 @@ def relabel(scan: trimesh.Trimesh, seed: int, up: int, *, own_colours: bool = Fa
         around = np.pi * (size[across] + size[along]) / 2
         u = np.arctan2(corners[..., along], corners[..., across]) / (2 * np.pi) + 0.5
         u = np.where((u < 0.25) & (np.ptp(u, axis=1, keepdims=True) > 0.5), u + 1, u)
-        front = _label(around / 2, size[up], rng, colours)
+        front = (_plain_label if plain else _label)(around / 2, size[up], rng, colours)
         sheet = Image.new("RGB", (round(2.1 * front.width), front.height))
         for place in range(3):  # front and back, and the beginning again where triangles reach over the seam
             sheet.paste(front, (place * front.width, 0))
         if shape == "bottle":
             cap = (0, 0, sheet.width, round(rng.uniform(0.1, 0.25) * sheet.height))
-            ImageDraw.Draw(sheet).rectangle(cap, fill=_any_colour(rng) if not own_colours else colours[1])
+            ImageDraw.Draw(sheet).rectangle(cap, fill=colours[1] if own_colours and not plain else _any_colour(rng))
         printed = np.full(len(corners), True)
         if shape == "can":
             printed = np.abs(scan.face_normals[:, up]) < 0.7
@@ -170,6 +177,27 @@ def _label(width: float, height: float, rng: np.random.Generator, colours: Colou
     return image
 
 
+def _plain_label(width: float, height: float, rng: np.random.Generator, colours: Colours) -> Image.Image:
+    """A side of one colour, half of them white, with a label in its middle: an ellipse, or a rounded rectangle."""
+    size = max(round(width * _PIXELS_PER_METRE), 8), max(round(height * _PIXELS_PER_METRE), 8)
+    image = Image.new("RGB", size, _white(rng) if rng.random() < 0.5 else colours[0])
+    share = rng.uniform([0.5, 0.35], [0.8, 0.65])
+    label = _label(width * share[0], height * share[1], rng, _colours(rng))
+    mask = Image.new("L", label.size)
+    if rng.random() < 0.4:
+        ImageDraw.Draw(mask).ellipse((0, 0, *label.size), fill=255)
+    else:
+        ImageDraw.Draw(mask).rounded_rectangle((0, 0, *label.size), radius=0.15 * min(label.size), fill=255)
+    left, top = (size[0] - label.width) // 2, round(rng.uniform(0.4, 0.8) * (size[1] - label.height))
+    image.paste(label, (left, top), mask)
+    return image
+
+
+def _white(rng: np.random.Generator) -> tuple[int, ...]:
+    """A white of paper or plastic."""
+    return tuple(round(value) for value in rng.uniform(225, 255) - rng.uniform(0, [4, 8, 30]))
+
+
 def _any_colour(rng: np.random.Generator) -> tuple[int, ...]:
     rgb = matplotlib.colors.hsv_to_rgb([rng.random(), rng.uniform(0, 1) ** 0.5, rng.uniform(0.15, 1)])
     return tuple(round(255 * v) for v in rgb)
@@ -232,7 +260,15 @@ def _textured(
 
 
 def _box(rng: np.random.Generator) -> trimesh.Trimesh:
-    extents = np.sort(rng.uniform([0.02, 0.05, 0.08], [0.06, 0.13, 0.24]))
+    return _boxed(np.sort(rng.uniform([0.02, 0.05, 0.08], [0.06, 0.13, 0.24])), rng)
+
+
+def _long_box(rng: np.random.Generator) -> trimesh.Trimesh:
+    """As of spaghetti."""
+    return _boxed(rng.uniform([0.02, 0.045, 0.2], [0.04, 0.08, 0.28]), rng)
+
+
+def _boxed(extents: np.ndarray, rng: np.random.Generator) -> trimesh.Trimesh:
     colours = _colours(rng)
     # Six sides in a column of the atlas: the large ones printed alike, front and back.
     sides = [(0, 1, 2), (0, 1, 2), (2, 0, 1), (2, 0, 1), (1, 2, 0), (1, 2, 0)]
@@ -284,13 +320,14 @@ def _round_label(
     rng: np.random.Generator,
     plain: tuple[int, ...],
     painted: Sequence[tuple[int, int, tuple[int, ...]]] = (),
+    label: Callable[[float, float, np.random.Generator, Colours], Image.Image] = _label,
 ) -> Image.Image:
     """The texture of a turned solid: a label between two points of the profile, plain elsewhere, or painted."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     around = 2 * np.pi * profile[:, 0].max()
     colours = _colours(rng)
-    sides = [_label(around / 2, length[printed[1]] - length[printed[0]], rng, colours)] * 2
-    if rng.random() < 0.5:
+    sides = [label(around / 2, length[printed[1]] - length[printed[0]], rng, colours)] * 2
+    if rng.random() < 0.5 and label is _label:
         sides[1] = _label(around / 2, length[printed[1]] - length[printed[0]], rng, colours)
     width, height = 2 * sides[0].width, max(round(length[-1] * _PIXELS_PER_METRE), sides[0].height)
     image = Image.new("RGB", (width, height), plain)
@@ -327,3 +364,48 @@ def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
     mesh = _turned(profile, texture, rng.uniform(0.25, 0.6))
     mesh.apply_scale([1, rng.uniform(0.6, 1), 1])
     return mesh
+
+
+def _tub(rng: np.random.Generator) -> trimesh.Trimesh:
+    """A cup that widens, as of yogurt, with a lid that stands out."""
+    foot, height = rng.uniform(0.025, 0.042), rng.uniform(0.05, 0.11)
+    top = foot * rng.uniform(1.1, 1.4)
+    lid, sunk = 1.04 * top, 0.92 * top
+    profile = np.array([
+        [0, 0], [foot, 0], [top, height - 0.006], [lid, height - 0.006], [lid, height], [sunk, height],
+        [sunk, height - 0.002], [0, height - 0.002],
+    ])  # fmt: skip
+    cover = _white(rng) if rng.random() < 0.6 else _any_colour(rng)
+    return _turned(profile, _round_label(profile, (1, 2), rng, _white(rng), [(2, 7, cover)]), rng.uniform(0.3, 0.6))
+
+
+def _squeezed(rng: np.random.Generator) -> trimesh.Trimesh:
+    """A flat bottle of one colour with a label in front, and a cap or a nozzle, as of mustard."""
+    radius, height = rng.uniform(0.026, 0.038), rng.uniform(0.11, 0.18)
+    waist, neck = rng.uniform(0.75, 1) * radius, rng.uniform(0.5, 0.8) * radius
+    tip = neck * (0.9 if rng.random() < 0.6 else 0.2)
+    profile = np.array([
+        [0, 0], [0.9 * radius, 0], [radius, 0.08 * height], [waist, 0.45 * height], [radius, 0.62 * height],
+        [neck, 0.78 * height], [1.1 * neck, 0.78 * height], [tip, height], [0, height],
+    ])  # fmt: skip
+    texture = _round_label(profile, (1, 5), rng, _any_colour(rng), [(5, 8, _any_colour(rng))], _plain_label)
+    mesh = _turned(profile, texture, rng.uniform(0.25, 0.6))
+    mesh.apply_scale([1, rng.uniform(0.55, 0.85), 1])
+    return mesh
+
+
+def _bag(rng: np.random.Generator) -> trimesh.Trimesh:
+    """A crumpled carrier bag: a flat lump with ridges, brown, white or grey, darker in its creases."""
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    creases = np.zeros(len(ball.vertices))
+    for wave in (1.5, 3.0, 6.0):
+        along = rng.normal(size=(2, 3))
+        phase = wave * ball.vertices @ along.T + rng.uniform(0, 2 * np.pi, 2)
+        creases += np.abs(np.sin(phase)).mean(axis=1) / wave**0.6
+    creases = (creases - creases.min()) / np.ptp(creases)
+    vertices = ball.vertices * (0.6 + 0.4 * creases)[:, None] * rng.uniform([0.07, 0.05, 0.02], [0.13, 0.1, 0.06])
+    tint = [(0.62, 0.42, 0.28), (0.9, 0.9, 0.88), (0.6, 0.6, 0.62)][rng.choice(3, p=[0.5, 0.35, 0.15])]
+    shades = np.outer(0.55 + 0.45 * np.linspace(0, 1, 64), tint)
+    image = Image.fromarray(np.rint(255 * shades)[None].repeat(4, axis=0).astype(np.uint8))
+    uv = np.column_stack([0.01 + 0.98 * creases, np.full(len(vertices), 0.5)])
+    return _textured(vertices, ball.faces, uv, image, rng.uniform(0.25, 0.45))

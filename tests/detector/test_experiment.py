@@ -132,11 +132,11 @@ def test_a_brand_is_printed_in_the_colours_of_its_scan():
     assert shared[0] > shared[1] + 0.1
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [*range(6), *range(90, 98)])
 def test_packages_are_closed_and_printed(seed):
     package = make_package(seed)
     assert np.ptp(np.asarray(package.visual.material.baseColorTexture).reshape(-1, 3), axis=0).max() > 60
-    assert (package.extents > 0.015).all() and (package.extents < 0.26).all()
+    assert (package.extents > 0.015).all() and (package.extents < 0.29).all()
     package.merge_vertices(merge_tex=True, merge_norm=True)
     assert package.is_watertight and package.volume > 0
     assert package.visual.uv.min() >= 0 and package.visual.uv.max() <= 1

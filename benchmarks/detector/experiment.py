@@ -27,6 +27,7 @@ from ruamel.yaml import YAML
 
 from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
+from mitsplat.detector.losses import gains
 
 HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")
@@ -195,6 +196,8 @@ def measure(options: argparse.Namespace) -> None:
     figure(whole.map50, "", "map50")
     for name, (strict, _) in whole.classes.items():
         figure(strict, "", "class", name)
+    for name, gain in gains(truth, detections).items():
+        figure(gain, "", "gain", name)
     by_scene: dict[int, list[int]] = {}
     for image in truth["images"]:
         by_scene.setdefault(scene_of(image["file_name"]), []).append(image["id"])

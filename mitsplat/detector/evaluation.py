@@ -2,7 +2,8 @@
 
 The folder of an evaluation::
 
-    results.json      average precision of boxes and masks, by class; the confusion matrix; what they were made of
+    results.json      average precision of boxes and masks, by class, and what each kind of error costs; the confusion
+                      matrix; what they were made of
     detections.json   everything that was found, in COCO's results format
     truth.json        what is labelled, as a COCO dataset with the ids of detections.json
     report.html       the page
@@ -23,6 +24,7 @@ import numpy as np
 
 from mitsplat.content_hash import file_hash
 from mitsplat.detector.libraries import check_device, check_torchvision, load_libraries, torch_device, versions
+from mitsplat.detector.losses import gains
 from mitsplat.detector.report import make_report
 from mitsplat.detector.scores import (
     CONFIDENCE,
@@ -225,6 +227,7 @@ def write_evaluation(
             "confusion": {"least_score": CONFIDENCE, "iou": IOU},
         },
         **{kind: _described(score) for kind, score in scores.items()},
+        "gains": {kind: round(gain, 5) for kind, gain in gains(truth, detections).items()},
         "confusion": {"classes": [*found.class_names, "nothing"], "matrix": confusion.matrix.tolist()},
     }
     with storage_errors(out):

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from pycocotools import mask as coco_mask
 
+from mitsplat.detector.losses import KINDS
 from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePrecision, Confusion, Detection
 from mitsplat.detector.sets import LabelledSet, Sample
 from mitsplat.html import inline_image, make_page, mask_path
@@ -38,6 +39,7 @@ def make_report(
         _summary(found, scores, confusion, results),
         _classes(scores, results),
         _charts(scores),
+        _gains(results["gains"]),
         _confusion(confusion, found.class_names),
         _worst(found, truth, detections, confusion),
     ]
@@ -102,6 +104,12 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
         )
         means.append(bars(f"AP50-95 of {_WORDS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()}))
     return _section("charts", "Charts", f'<div class="charts">{"".join(charts + means)}</div>')
+
+
+def _gains(found: Mapping[str, float]) -> str:
+    text = "How much mAP50-95 of boxes would rise if one kind of error were mended; gains do not add up."
+    chart = bars(text, {KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=230)
+    return _section("gains", "What errors cost", f'<div class="charts">{chart}</div>')
 
 
 def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:

@@ -1,0 +1,75 @@
+"""What mending each kind of error is worth, against cases that are counted by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mitsplat.detector.losses import KINDS, gains
+
+A, B = [0.0, 0.0, 10.0, 10.0], [50.0, 50.0, 20.0, 20.0]
+
+
+def truth(*labels: tuple[int, int, list[float]], crowd: int = 0) -> dict[str, Any]:
+    """Labels of (image, class, box) in two images, of two classes."""
+    return {
+        "images": [{"id": image, "width": 100, "height": 100, "file_name": f"{image}.png"} for image in (1, 2)],
+        "annotations": [
+            {"id": number, "image_id": image, "category_id": kind, "bbox": box, "area": box[2] * box[3],
+             "iscrowd": crowd}
+            for number, (image, kind, box) in enumerate(labels, 1)
+        ],
+        "categories": [{"id": 1, "name": "a"}, {"id": 2, "name": "b"}],
+    }  # fmt: skip
+
+
+def found(image: int, kind: int, box: list[float], score: float = 0.9) -> dict[str, Any]:
+    return {"image_id": image, "category_id": kind, "bbox": box, "score": score}
+
+
+TWO = truth((1, 1, A), (1, 2, B))
+
+
+@pytest.mark.parametrize(
+    ("detections", "kind", "gain"),
+    [
+        ([found(1, 1, A), found(1, 1, B)], "another_class", 0.5),
+        ([found(1, 1, A), found(1, 2, B), found(2, 2, A, 0.95)], "nothing", 0.25),
+        ([found(1, 1, A), found(1, 2, B), found(1, 2, A, 0.5), found(2, 2, B, 0.95)], "nothing", 0.25),
+        ([found(1, 1, A), found(1, 2, [50, 50, 20, 12])], "place", 0.35),  # IoU 0.6: right at 0.5, 0.55 and 0.6
+        ([found(1, 1, A), found(1, 2, [50, 50, 20, 8])], "place", 0.5),
+    ],
+)
+def test_a_single_error_is_worth_what_it_costs(detections: list[dict[str, Any]], kind: str, gain: float) -> None:
+    worth = gains(TWO, detections)
+    assert worth.keys() == KINDS.keys()
+    assert worth[kind] == pytest.approx(gain, abs=1e-6)
+    assert all(value == pytest.approx(0, abs=1e-6) for other, value in worth.items() if other not in (kind, "missed"))
+
+
+def test_what_is_missed_counts_alone() -> None:
+    """Of two of a class one is found: precision 1 up to recall 0.5, which 51 of 101 recalls are."""
+    worth = gains(truth((1, 1, A), (2, 1, B)), [found(1, 1, A)])
+    assert worth["missed"] == pytest.approx(50 / 101, abs=1e-6)
+    assert worth["another_class"] == worth["nothing"] == worth["place"] == 0
+
+
+def test_all_right_leaves_nothing_to_gain() -> None:
+    assert gains(TWO, [found(1, 1, A), found(1, 2, B)]) == dict.fromkeys(KINDS, 0.0)
+
+
+def test_one_label_is_found_once() -> None:
+    """Of two detections that are taken for another class one becomes right; a second one of a box stays wrong."""
+    worth = gains(truth((1, 2, B)), [found(1, 1, B, 0.9), found(1, 1, B, 0.8)])
+    assert worth["another_class"] == pytest.approx(1.0)
+
+
+def test_a_crowd_is_no_label_to_find() -> None:
+    worth = gains(truth((1, 1, A), crowd=1), [found(1, 1, A)])
+    assert worth == {}
+
+
+def test_nothing_found_and_nothing_labelled() -> None:
+    assert gains(truth(), [found(1, 1, A)]) == {}
+    assert gains(TWO, [])["missed"] == pytest.approx(1.0)

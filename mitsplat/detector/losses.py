@@ -20,7 +20,7 @@ NEAR = 0.1
 
 KINDS = {
     "another_class": "taken for another class",
-    "nothing": "found where nothing of it is labelled",
+    "nothing": "found where it is not",
     "place": "boxes that do not fit",
     "missed": "missed",
 }

@@ -108,7 +108,7 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
 
 def _gains(found: Mapping[str, float]) -> str:
     text = "How much mAP50-95 of boxes would rise if one kind of error were mended; gains do not add up."
-    chart = bars(text, {KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=230)
+    chart = bars(text, {KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=170)
     return _section("gains", "What errors cost", f'<div class="charts">{chart}</div>')
 
 

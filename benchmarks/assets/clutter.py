@@ -31,7 +31,7 @@ from benchmarks.assets.photographing import by_name, paint, photograph, show_whe
 from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import Capture
+from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.reconstruct.evaluation import iou, show_asset
@@ -248,6 +248,13 @@ def linear(path: Path) -> np.ndarray:
     return np.asarray((np.array(Image.open(path).convert("RGB")) / 255) ** 2.2)
 
 
+def overlap(photo: Photo, truth: np.ndarray) -> float:
+    """IoU of a photo's mask with the truth, where it does not say that another thing may hide the solid."""
+    hidden = photo.hidden()
+    known = np.ones(truth.shape, dtype=bool) if hidden is None else hidden == 0
+    return iou((photo.alpha() >= 0.5) & known, truth & known)
+
+
 def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out: Path) -> dict[str, float]:
     """What an asset and its capture are off, the asset put where the cameras' similarity says.
 
@@ -274,7 +281,7 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out
     errors = [
         ((one ** (1 / 2.2) - np.clip(gain * other + rest, 0, 1) ** (1 / 2.2)) ** 2).mean() for one, other, rest in parts
     ]
-    shares = [iou(photo.alpha() >= 0.5, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in moved.photos]
+    shares = [overlap(photo, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in moved.photos]
     distances = np.linalg.norm([truth[photo.name].centre for photo in moved.photos], axis=1)
     return {
         "photos kept, %": 100 * len(moved.photos) / len(truth),

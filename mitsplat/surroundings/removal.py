@@ -2,7 +2,7 @@
 
 What goes is told by points: those that stand on the support fall into things that lie apart, and each Gaussian is of
 what the nearest point is of; so does what reaches into its volume. No photo shows what was below, nor what it hid of a
-wall close behind it. Both are made of pieces of the same surface (:mod:`.texture_fill`), and laid down as sheets of flat
+wall close behind it. Both are made of pieces of the same surface (:mod:`.texture_fill`), laid down as sheets of flat
 Gaussians.
 """
 
@@ -309,7 +309,11 @@ def _of_thing(
 
 def _guesses(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolArray:
     """Which Gaussians (N,) are in the hole of a surface, or below it and reach out of it, in the surface's frame."""
-    floor, height, cells = OFF * scale, splats.means[:, 2].astype(np.float64), grid.cells(splats.means[:, :2])
+    floor, height, cells = (
+        OFF * scale,
+        splats.means[:, 2].astype(np.float64),
+        grid.cells(splats.means[:, :2].astype(np.float64)),
+    )
     near = (cells >= 0).all(axis=1) & (height <= floor) & (height > -TALL * scale)
     rows = np.flatnonzero(near)
     rows = rows[hole[tuple(cells[rows].T)]]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 import trimesh
+from scipy.ndimage import binary_erosion
 
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
@@ -116,7 +117,7 @@ class Verdict:
         photos: Number of photos that found their camera.
         rejected: Number that did not, or were refused.
         psnr: Of held-out photos, as the fit reports it [dB].
-        psnr_object: Of the object's pixels in held-out photos, after isolation [dB].
+        psnr_object: Of the object's pixels in held-out photos, after isolation, without those of its outline [dB].
         splat_iou: Mean IoU of the splats' alpha with held-out masks.
         mesh_iou: The same of the mesh's silhouette.
         offset: Shift between mesh and the splats' surface, as a share of the mesh's diagonal.
@@ -259,7 +260,7 @@ def judge(
 ) -> Verdict:
     """Figures from held-out views of splats and mesh."""
     masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
-    errors = [float(((view.render - view.photo)[mask] ** 2).mean()) for view, mask in masked]
+    errors = [float(((view.render - view.photo)[_inside(mask)] ** 2).mean()) for view, mask in masked]
     offset = None
     if mesh is not None and views:
         offset = measure_offset(mesh, surface_points(splats, [view.camera for view in views]))
@@ -295,6 +296,12 @@ def iou(one: BoolArray, other: BoolArray) -> float:
     """Intersection over union; 1 where both are empty."""
     union = int((one | other).sum())
     return int((one & other).sum()) / union if union else 1.0
+
+
+def _inside(mask: BoolArray) -> BoolArray:
+    """A mask without the pixels of its outline, which show what is behind as well; the mask if that is all of it."""
+    inner = np.asarray(binary_erosion(mask))
+    return inner if inner.any() else mask
 
 
 def _mean(values: Sequence[float]) -> float | None:

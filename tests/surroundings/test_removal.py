@@ -150,7 +150,7 @@ def test_a_wall_close_behind_is_filled_too(gap: float, tmp_path: Path) -> None:
     for camera in (cameras()[4], cameras()[12], from_near):
         (shown,), (whole,) = (show_asset(one, None, [camera]) for one in (left, Splats.concatenate([bare, true])))
         off = np.abs(shown.picture - whole.picture)
-        assert off.mean() < 1e-3 and (off > 0.05).mean() < 2e-3
+        assert off.mean() < 2e-3 and (off > 0.05).mean() < 2e-3
         assert np.abs(shown.alpha - whole.alpha).max() < 0.05
 
 

@@ -31,6 +31,7 @@ from benchmarks.assets.photographing import by_name, paint, photograph, show_whe
 from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
+from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.reconstruct.evaluation import iou, show_asset
@@ -242,11 +243,24 @@ def exposures(count: int, seed: int = 2) -> np.ndarray:
     return np.exp(drift[:, None] + np.outer(0.03 * np.sin(np.linspace(1, 7, count)), [1, 0, -1]))
 
 
+def linear(path: Path) -> np.ndarray:
+    """The light that a photo shows, (H, W, 3)."""
+    return np.asarray((np.array(Image.open(path).convert("RGB")) / 255) ** 2.2)
+
+
+def overlap(photo: Photo, truth: np.ndarray) -> float:
+    """IoU of a photo's mask with the truth, where it does not say that another thing may hide the solid."""
+    hidden = photo.hidden()
+    known = np.ones(truth.shape, dtype=bool) if hidden is None else hidden == 0
+    return iou((photo.alpha() >= 0.5) & known, truth & known)
+
+
 def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out: Path) -> dict[str, float]:
     """What an asset and its capture are off, the asset put where the cameras' similarity says.
 
-    Splats are compared with photos that were held out, seen by the true cameras, where the true solid is seen; the
-    photos' true exposures are taken back, and each channel of the splats has one gain for all photos.
+    Splats are compared with photos that were held out, where the true solid is seen: before the room without it, which
+    ``out/behind`` holds, because a pixel of its outline shows both. The photos' true exposures are taken back, and each
+    channel of the splats has one gain for all photos.
     """
     made = Asset.load(asset)
     moved, truth_from_asset, residuals = on_truth(asset, truth)
@@ -254,16 +268,20 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out
     surface = trimesh.load_mesh(asset / "mesh.ply")
     surface.apply_transform(truth_from_asset)
     gains = dict(zip(truth, exposures(len(truth)), strict=True))
-    held_out = {photo.name: photo.camera for photo in moved.held_out}
-    pairs = []
-    for name, view in zip(held_out, show_asset(made.splats, None, list(held_out.values())), strict=True):
-        shown = np.array(Image.open(out / "truth" / name)) > 0
-        photo = np.array(Image.open(out / "photos" / name).convert("RGB")) / 255
-        pairs.append((photo[shown] ** 2.2 / gains[name], np.clip(view.render[shown], 0, 1) ** 2.2))
-    wanted, seen = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    gain = (wanted * seen).sum(axis=0) / (seen**2).sum(axis=0)
-    errors = [((one ** (1 / 2.2) - np.clip(other * gain, 0, 1) ** (1 / 2.2)) ** 2).mean() for one, other in pairs]
-    shares = [iou(photo.alpha() >= 0.5, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in moved.photos]
+    parts = []
+    views = show_asset(made.splats, None, [photo.camera for photo in moved.held_out])
+    for photo, view, empty in zip(moved.held_out, views, sorted((out / "behind").iterdir()), strict=True):
+        shown = np.array(Image.open(out / "truth" / photo.name)) > 0
+        seen, behind = (linear(path)[shown] for path in (out / "photos" / photo.name, empty))
+        cover = view.alpha[shown][:, None]
+        own = cover * np.clip(view.render[shown] / np.maximum(cover, 1e-6), 0, 1) ** 2.2
+        parts.append((seen / gains[photo.name], own, (1 - cover) * behind))
+    seen, own, through = (np.concatenate(part) for part in zip(*parts, strict=True))
+    gain = ((seen - through) * own).sum(axis=0) / (own**2).sum(axis=0)
+    errors = [
+        ((one ** (1 / 2.2) - np.clip(gain * other + rest, 0, 1) ** (1 / 2.2)) ** 2).mean() for one, other, rest in parts
+    ]
+    shares = [overlap(photo, np.array(Image.open(out / "truth" / photo.name)) > 0) for photo in moved.photos]
     distances = np.linalg.norm([truth[photo.name].centre for photo in moved.photos], axis=1)
     return {
         "photos kept, %": 100 * len(moved.photos) / len(truth),
@@ -281,7 +299,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--samples", type=int, default=40)
+    parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--edge", type=int, default=800)
@@ -331,6 +349,10 @@ def measure(args: argparse.Namespace) -> int:
     )
     for sentence in done.verdict.misses():
         print(f"  verdict: {sentence}", file=sys.stderr)
+    behind = args.out / "behind"
+    shutil.rmtree(behind, ignore_errors=True)
+    held_out = [named[photo.name] for photo in Capture.load(args.out / "asset" / "capture").held_out]
+    photograph(room(args.beside, args.ground), held_out, behind, samples=args.samples, noise=0.0)
     return tell_wanted(compare(args.out / "asset", named, mesh, args.out), WANTED, LEAST)
 
 

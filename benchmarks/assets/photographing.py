@@ -26,7 +26,10 @@ class Sensors:
         if key not in self._made:
             film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
             angle = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
-            self._made[key] = mi.load_dict({"type": "perspective", "fov": angle, "film": film})
+            # Stratified: of as many paths, less noise that no camera would have.
+            self._made[key] = mi.load_dict(
+                {"type": "perspective", "fov": angle, "film": film, "sampler": {"type": "multijitter"}}
+            )
         parameters = mi.traverse(self._made[key])
         parameters["to_world"] = mi.Transform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0]))
         parameters.update()

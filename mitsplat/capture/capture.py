@@ -92,7 +92,7 @@ class Photo:
         name: File name as the user knows it.
         file: The image, upright as the camera has it.
         camera: From where and through which lens; its frame is the capture's.
-        mask: 8-bit image of the same size, 255 = object.
+        mask: 8-bit image of the same size, 255 = object; transparent where another thing may hide the object.
         seen: Indices of the capture's points that this photo observes, shape (K,).
         gain: What its linear red, green and blue are multiplied by to look as the capture's other photos; None: they
             are as they are.
@@ -131,10 +131,17 @@ class Photo:
         """The mask of :meth:`picture` alone, for which the photo need not be read."""
         return None if self.mask is None else self._read(self.mask, "L", scale, window)
 
-    def _read(self, path: Path, mode: Literal["RGB", "L"], scale: float, window: Window | None) -> Float32Array:
+    def hidden(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
+        """Where in :meth:`picture` another thing may hide the object, (H, W) in [0, 1]; None where nothing does."""
+        if self.mask is None:
+            return None
+        values = self._read(self.mask, None, scale, window)
+        return np.asarray(1 - values[..., 1]) if values.ndim == 3 and values.shape[2] == 2 else None
+
+    def _read(self, path: Path, mode: Literal["RGB", "L"] | None, scale: float, window: Window | None) -> Float32Array:
         try:
             with Image.open(path) as image:
-                pixels = image.convert(mode)
+                pixels = image.copy() if mode is None else image.convert(mode)
         except FileNotFoundError:
             raise InputError(f"{path}: no such file") from None
         except IMAGE_ERRORS as error:

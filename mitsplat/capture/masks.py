@@ -28,6 +28,10 @@ ByteImage = npt.NDArray[np.uint8]
 MaskMaker = Callable[[Photo], BoolArray]
 """Makes the mask of a photo, shape (H, W)."""
 
+Hidden = Mapping[str, BoolArray]
+"""Pixels (H, W) of a photo in which another thing may hide the object, by its name; photos without such are absent."""
+_NOTHING: Hidden = {}
+
 Bare = Callable[[Camera, npt.NDArray[np.uint8]], BoolArray]
 """Pixels (H, W) of a grey image (H, W) by a camera that are surely not the object."""
 
@@ -71,6 +75,7 @@ def add_masks(
     *,
     progress: Progress | None = None,
     points: Float64Array | None = None,
+    hidden: Hidden = _NOTHING,
 ) -> Capture:
     """The capture with a mask for each photo; photos whose mask is unusable are rejected.
 
@@ -80,14 +85,16 @@ def add_masks(
         folder: Where the masks are written.
         progress: Told the photos done.
         points: Points known to be of the object, shape (N, 3), that masks must cover.
+        hidden: Where other things may hide the object.
     """
     photos, rejected = [], dict(capture.rejected)
     for done, photo in enumerate(capture.photos, start=1):
-        mask = make(photo)
-        reason = _fault(mask, photo.camera, points)
+        mask, unknown = make(photo), hidden.get(photo.name)
+        mask = mask if unknown is None else mask & ~unknown
+        reason = _fault(mask, photo.camera, points, unknown)
         if reason is None:
             file = folder / mask_name(photo.name)
-            write_file(file, partial(_save, mask))
+            write_file(file, partial(_save, mask, unknown))
             photos.append(replace(photo, mask=file))
         else:
             rejected[photo.name] = reason
@@ -103,6 +110,7 @@ def object_masks(
     folder: Path,
     *,
     bare: Bare | None = None,
+    hidden: Hidden = _NOTHING,
     progress: Progress | None = None,
 ) -> Capture:
     """The capture with masks of an object that some of its points are on, cut out of each photo and then of all.
@@ -113,13 +121,15 @@ def object_masks(
         above: Of the object alone, which masks must cover, shape (M, 3).
         folder: Where the masks are written.
         bare: Finds what is surely not the object.
+        hidden: Where other things may hide the object: there masks show nothing, and are transparent.
         progress: Told the photos done.
     """
-    masked = add_masks(capture, geometric_masks(points, bare), folder, progress=progress, points=above)
+    add = partial(add_masks, capture, folder=folder, progress=progress, points=above, hidden=hidden)
+    masked = add(geometric_masks(points, bare, hidden))
     if len(masked.photos) < _FEWEST:
         return masked
     # What a photo was rejected for may be what the others set right.
-    return add_masks(capture, agreed_masks(masked, points, bare), folder, progress=progress, points=above)
+    return add(agreed_masks(masked, points, bare, hidden))
 
 
 def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
@@ -185,25 +195,29 @@ def model_masks(model: Path) -> MaskMaker:
     return make
 
 
-def geometric_masks(points: Float64Array, bare: Bare | None = None) -> MaskMaker:
+def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidden = _NOTHING) -> MaskMaker:
     """Masks by GrabCut (Rother et al. 2004), begun from the hull of points on the object.
 
     Args:
         points: Of the object, in the capture's frame, shape (N, 3); see :func:`object_points`.
         bare: Finds what is surely not the object.
+        hidden: Where other things may hide the object.
     """
 
     def make(photo: Photo) -> BoolArray:
         camera, bgr, _ = _reduced(photo)
+        unknown = _shrunk(hidden.get(photo.name), camera)
         pixels, _ = camera.project(points)
         # A point that all but lies in the camera's plane may be at any number of pixels, more than an integer holds.
         near = (np.abs(pixels) < _FAR_OFF * max(camera.width, camera.height)).all(axis=1)
-        return _enlarged(_grab(bgr, pixels[near], _free(bare, camera, bgr)), photo.camera)
+        return _enlarged(_grab(bgr, pixels[near], _free(bare, camera, bgr), unknown), photo.camera)
 
     return make
 
 
-def agreed_masks(masked: Capture, points: Float64Array, bare: Bare | None = None) -> MaskMaker:
+def agreed_masks(
+    masked: Capture, points: Float64Array, bare: Bare | None = None, hidden: Hidden = _NOTHING
+) -> MaskMaker:
     """Masks by GrabCut within a band around the outline that the masks of all photos agree on.
 
     What one photo cannot tell from its object, such as a dark corner behind it, others see beside it: the visual hull
@@ -213,20 +227,23 @@ def agreed_masks(masked: Capture, points: Float64Array, bare: Bare | None = None
         masked: The capture with first masks.
         points: Of the object, in the capture's frame, shape (N, 3); the hull is looked for around them.
         bare: Finds what is surely not the object.
+        hidden: Where other things may hide the object.
     """
     small = {photo.name: _reduced(photo) for photo in masked.photos}
-    hull, cell = _agreed_hull([(camera, mask) for camera, _, mask in small.values()], points)
+    shown = [(camera, mask | _shrunk(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]
+    hull, cell = _agreed_hull(shown, points)
 
     def make(photo: Photo) -> BoolArray:
         rough = small[photo.name][2] if photo.name in small else None
         camera, bgr, mask = _reduced(photo, 1 if rough is None else _share(rough))
+        unknown = _shrunk(hidden.get(photo.name), camera)
         silhouette = _silhouette(hull, cell, camera)
         size = float(np.sqrt(np.count_nonzero(silhouette)))
         if size > 0:
             near = _grown(silhouette, _DOUBT * size)
             core = ~_grown(~silhouette, _DOUBT * size)
             free = _free(bare, camera, bgr)
-            mask = _cut(bgr, near, silhouette & (mask | core), core, free, _DOUBT * size)
+            mask = _cut(bgr, near, silhouette & (mask | core), core, free, unknown, _DOUBT * size)
         return _enlarged(mask, photo.camera)
 
     return make
@@ -272,7 +289,16 @@ def _free(bare: Bare | None, camera: Camera, bgr: ByteImage) -> BoolArray:
     return bare(camera, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
 
 
-def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray) -> BoolArray:
+def _shrunk(hidden: BoolArray | None, camera: Camera) -> BoolArray:
+    """What may be hidden, in the size of a camera's picture; nothing if None."""
+    if hidden is None:
+        return np.zeros((camera.height, camera.width), dtype=bool)
+    return np.asarray(
+        cv2.resize(hidden.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
+    )
+
+
+def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: BoolArray) -> BoolArray:
     """GrabCut of a BGR image (H, W, 3) from where points of the object are in it, shape (N, 2), and where it is not.
 
     Sides without points lie outside of the hull. So the region in question begins at it and follows what was found.
@@ -293,21 +319,30 @@ def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray) -> BoolArray:
     inside = filled > 0
     for _ in range(_EXTENSIONS):
         near = _grown(inside | (filled > 0), _RING * size)
-        before, inside = inside, _cut(image, near, inside, core, free, _RING * size)
+        before, inside = inside, _cut(image, near, inside, core, free, unknown, _RING * size)
         if np.count_nonzero(inside & ~before) < 0.01 * np.count_nonzero(inside):
             break
     return inside
 
 
 def _cut(
-    image: ByteImage, near: BoolArray, inside: BoolArray, core: BoolArray, free: BoolArray, ring: float
+    image: ByteImage,
+    near: BoolArray,
+    inside: BoolArray,
+    core: BoolArray,
+    free: BoolArray,
+    unknown: BoolArray,
+    ring: float,
 ) -> BoolArray:
-    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably, surely and not ``inside``."""
+    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably, surely and not ``inside``.
+
+    Nothing is found where it is ``unknown`` whether a thing hides the object, but parts may be joined by that.
+    """
     trimap = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
     trimap[near] = cv2.GC_PR_BGD
     trimap[inside] = cv2.GC_PR_FGD
     trimap[core] = cv2.GC_FGD
-    trimap[free] = cv2.GC_BGD
+    trimap[free | unknown] = cv2.GC_BGD
     # The background that is learnt from is what surrounds the object, and the cost is that of its box.
     edge = round(ring) + 4
     y, x = np.nonzero(near)
@@ -320,7 +355,7 @@ def _cut(
         cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
         found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
     cut = np.zeros_like(near)
-    cut[box] = _largest_part(found)
+    cut[box] = _largest_part(found | unknown[box]) & found
     return cut
 
 
@@ -397,7 +432,7 @@ def _largest_part(mask: BoolArray) -> BoolArray:
     return parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask
 
 
-def _fault(mask: BoolArray, camera: Camera, points: Float64Array | None) -> str | None:
+def _fault(mask: BoolArray, camera: Camera, points: Float64Array | None, hidden: BoolArray | None) -> str | None:
     share = float(mask.mean())
     if share < MIN_SHARE:
         return f"its mask covers only {share:.1%} of it"
@@ -407,11 +442,16 @@ def _fault(mask: BoolArray, camera: Camera, points: Float64Array | None) -> str 
         pixels, _ = camera.project(points)
         pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
         x, y = pixels.astype(np.intp).T
+        if hidden is not None:
+            x, y = x[~hidden[y, x]], y[~hidden[y, x]]
         agreement = float(mask[y, x].mean()) if len(x) else 0.0
         if agreement < MIN_AGREEMENT:
             return f"its mask covers only {agreement:.0%} of the object's points"
     return None
 
 
-def _save(mask: BoolArray, part: Path) -> None:
-    Image.fromarray(np.uint8(255) * mask.astype(np.uint8)).save(part, "PNG")
+def _save(mask: BoolArray, hidden: BoolArray | None, part: Path) -> None:
+    picture = Image.fromarray(np.uint8(255) * mask.astype(np.uint8))
+    if hidden is not None:
+        picture.putalpha(Image.fromarray(np.uint8(255) * (~hidden).astype(np.uint8)))
+    picture.save(part, "PNG")

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from mitsplat.arrays import BoolArray
 from mitsplat.boards.board_mask import bare_squares
 from mitsplat.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
@@ -26,7 +27,7 @@ from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SU
 from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_file, write_text
-from mitsplat.isolation import ChosenObject, hidden_share
+from mitsplat.isolation import ChosenObject, hidden_part
 from mitsplat.progress import Progress
 from mitsplat.video import ChosenFrames, choose_frames
 
@@ -37,8 +38,10 @@ MIN_REGISTERED = 0.75
 FEW_POINTS = 3 * MIN_POINTS
 """A camera that observes fewer points is worth a warning."""
 
-_MOST_HIDDEN = 0.03
-"""Share of the object that other things may hide in a photo; masks take in what hides more."""
+_HIDDEN = 0.03
+"""Share of the object from which what other things hide of it in a photo is unknown there."""
+_MOST_HIDDEN = 0.5
+"""Share of the object that is unknown in a photo up to which the rest of it is of use."""
 
 _INPUTS = "inputs.json"
 _RECORDED = ("source", "reprojection_error", "doubtful")
@@ -403,6 +406,7 @@ def _masked(
             "no table was found under the object to cut it out by: pick it (--pick), give masks (--masks or "
             "--mask-model), put it on something with texture, or capture it as an environment (--kind environment)"
         )
+    hidden: dict[str, BoolArray] = {}
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
     if frame.board is not None and not settings.hinted:
         points = object_points(capture)
@@ -410,17 +414,22 @@ def _masked(
     else:
         chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
         points, above = chosen.points, chosen.above
-        capture = _without_hidden(capture, chosen)
-    return object_masks(capture, points, above, mask_folder, bare=bare, progress=progress)
+        capture, hidden = _hidden_parts(capture, chosen)
+    return object_masks(capture, points, above, mask_folder, bare=bare, hidden=hidden, progress=progress)
 
 
-def _without_hidden(capture: Capture, chosen: ChosenObject) -> Capture:
-    """The capture without photos in which another thing stands before the object: masks would take it in."""
-    photos, rejected = [], dict(capture.rejected)
+def _hidden_parts(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:
+    """The capture without photos in which other things hide much of the object, and what they may hide in others.
+
+    The pixels (H, W) are by the names of the photos.
+    """
+    photos, rejected, hidden = [], dict(capture.rejected), dict[str, BoolArray]()
     for photo in capture.photos:
-        share = hidden_share(photo.camera, chosen.above, chosen.others)
-        if share > _MOST_HIDDEN:
-            rejected[photo.name] = f"another thing stands before the object and hides {share:.0%} of it"
-        else:
-            photos.append(photo)
-    return replace(capture, photos=tuple(photos), rejected=rejected)
+        hides, may_hide, pixels = hidden_part(photo.camera, chosen.above, chosen.others)
+        if hides > _HIDDEN and may_hide > _MOST_HIDDEN:
+            rejected[photo.name] = f"another thing stands before the object and may hide {may_hide:.0%} of it"
+            continue
+        photos.append(photo)
+        if hides > _HIDDEN:
+            hidden[photo.name] = pixels
+    return replace(capture, photos=tuple(photos), rejected=rejected), hidden

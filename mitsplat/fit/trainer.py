@@ -349,7 +349,9 @@ class _Fit:
             else None
         )
         depth = (seen.moment, _depth_image(sight.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
-        gradient, error = _gradients(seen.rgb, seen.alpha, depth, sight.packed, correction, numbers, recipe)
+        gradient, error = _gradients(
+            seen.rgb, seen.alpha, depth, (sight.packed, sight.hidden), correction, numbers, recipe
+        )
         records = [seen.gradient(gradient["rgb"], gradient["alpha"])]
         if isinstance(seen, DepthRendering):
             records.append(seen.gradient_of_moment(gradient["moment"]))
@@ -430,7 +432,7 @@ def _gradients(
     rgb: list[Any],
     alpha: Any,
     depth: tuple[Any, Any] | None,
-    packed: Any,
+    photo: tuple[Any, Any | None],
     correction: tuple[Any, Any] | None,
     numbers: Any,
     recipe: _Recipe,
@@ -441,7 +443,7 @@ def _gradients(
         rgb: What the splats show, three flat row-major arrays.
         alpha: Their opacity.
         depth: Moment of depth, and inverse depths that are known, see :func:`_depth_image`.
-        packed: Pixels of the photo.
+        photo: Its pixels, and where it does not show whether there is the object, if so anywhere.
         correction: The table of colour corrections, and which one is the photo's.
         numbers: What is behind the splats, red, green and blue; weight of depth; inverse number of known depths.
         recipe: What else there is to the loss.
@@ -458,7 +460,7 @@ def _gradients(
     rgb, alpha, loss = inputs["rgb"], inputs["alpha"], mi.Float(0)
     if depth is not None:
         loss += number(numbers, 3) * number(numbers, 4) * _depth_error(alpha, inputs["moment"], depth[1])
-    target, mask = unpacked(packed)
+    target, mask = unpacked(photo[0])
     if correction is not None:
         table = inputs["exposure"]
         rgb = _exposed(rgb, alpha, table, correction[1], dr.width(table) // 12)
@@ -468,6 +470,9 @@ def _gradients(
         behind = [number(numbers, channel) for channel in range(3)]
         rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
         target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
+    if photo[1] is not None:  # what is there is right
+        target = [dr.select(photo[1], dr.detach(c), t) for c, t in zip(rgb, target, strict=True)]
+        mask = dr.select(photo[1], dr.detach(alpha), mask)
     loss += photometric_loss(rgb, target, recipe.width, recipe.height, recipe.ssim_share)
     if recipe.alpha_weight is not None:
         loss += recipe.alpha_weight * dr.mean(dr.abs(alpha - mask))

@@ -81,6 +81,8 @@ class TrainingView:
         pixels = np.rint(np.concatenate([rgb, cover[..., None]], axis=2) * 255).astype(np.uint8)
         self._pixels: npt.NDArray[np.uint8] | None = pixels
         self._photo, self._scale, self._mask_used, self._window = photo, scale, masked, window
+        hidden = photo.hidden(scale, window) if self.masked else None
+        self._hidden = None if hidden is None else np.asarray(hidden > 0)
         self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
         self._depths: tuple[Any, Any] | None = None
         self._half: TrainingView | None = None
@@ -112,6 +114,11 @@ class TrainingView:
         pixels = self._bytes
         self._pixels = None
         return wrapped(mi.UInt32, pixels.view(np.uint32))
+
+    @cached_property
+    def hidden(self) -> Any:
+        """On the device, flat, where another thing may hide the object; None where nothing does."""
+        return None if self._hidden is None else wrapped(mi.Bool, self._hidden.ravel())
 
     @property
     def mask(self) -> Float32Array:
@@ -161,8 +168,10 @@ class TrainingView:
     def compare(self, seen: Float32Array, folder: Path | None) -> HeldOut:
         """A render (H, W, 3) against the photo; writes them and their difference, 4 times as bright, side by side."""
         cover = self.mask
-        seen = np.clip(seen, 0, 1)
         truth = self.picture
+        seen = np.clip(seen, 0, 1)
+        if self._hidden is not None:
+            seen = np.where(self._hidden[..., None], truth, seen)  # nobody knows
         shown = cover > 0.5 if (cover > 0.5).any() else np.ones_like(cover, dtype=bool)
         design = np.column_stack([seen[shown], np.ones(shown.sum())])
         corrected = np.clip(design @ np.linalg.lstsq(design, truth[shown], rcond=None)[0], 0, 1)

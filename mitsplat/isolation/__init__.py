@@ -8,6 +8,6 @@ captures.
 from __future__ import annotations
 
 from mitsplat.isolation.object_choice import ChosenObject, Pick, View, choose_object
-from mitsplat.isolation.occlusion import hidden_share
+from mitsplat.isolation.occlusion import hidden_part
 
-__all__ = ["ChosenObject", "Pick", "View", "choose_object", "hidden_share"]
+__all__ = ["ChosenObject", "Pick", "View", "choose_object", "hidden_part"]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 import trimesh
+from scipy.ndimage import binary_erosion
 
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
@@ -99,11 +100,13 @@ class HeldOutView(AssetView):
         name: Of the photo.
         photo: Display-encoded, (H, W, 3).
         mask: Share of the pixel that is object, (H, W), or None.
+        known: Where nothing that may hide the object stands before it, (H, W).
     """
 
     name: str
     photo: Float32Array
     mask: Float32Array | None
+    known: BoolArray
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class Verdict:
         photos: Number of photos that found their camera.
         rejected: Number that did not, or were refused.
         psnr: Of held-out photos, as the fit reports it [dB].
-        psnr_object: Of the object's pixels in held-out photos, after isolation [dB].
+        psnr_object: Of the object's pixels in held-out photos, after isolation, without those of its outline [dB].
         splat_iou: Mean IoU of the splats' alpha with held-out masks.
         mesh_iou: The same of the mesh's silhouette.
         offset: Shift between mesh and the splats' surface, as a share of the mesh's diagonal.
@@ -205,10 +208,12 @@ def show_held_out(
     """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
     sized = [sized_photo(photo, size) for photo in photos]
     shown = show_asset(splats, mesh, [camera for camera, _, _ in sized])
-    return [
-        HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask)
-        for photo, (_, rgb, mask), view in zip(photos, sized, shown, strict=True)
-    ]
+    views = []
+    for photo, (_, rgb, mask), view in zip(photos, sized, shown, strict=True):
+        hidden = photo.hidden(scale_to(photo, size))
+        known = np.ones(view.mesh.shape, dtype=bool) if hidden is None else hidden == 0
+        views.append(HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask, known=known))
+    return views
 
 
 def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[Camera]) -> list[AssetView]:
@@ -233,9 +238,13 @@ def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[C
 
 def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None]:
     """Camera, colours and mask of a photo, its longest edge at most ``size`` px."""
-    scale = min(1.0, size / max(photo.camera.width, photo.camera.height))
-    rgb, mask = photo.picture(scale)
+    rgb, mask = photo.picture(scale_to(photo, size))
     return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask
+
+
+def scale_to(photo: Photo, size: int) -> float:
+    """Scale at which the longest edge of a photo is at most ``size`` px."""
+    return min(1.0, size / max(photo.camera.width, photo.camera.height))
 
 
 def judge(
@@ -251,7 +260,7 @@ def judge(
 ) -> Verdict:
     """Figures from held-out views of splats and mesh."""
     masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
-    errors = [float(((view.render - view.photo)[mask] ** 2).mean()) for view, mask in masked]
+    errors = [float(((view.render - view.photo)[_inside(mask)] ** 2).mean()) for view, mask in masked]
     offset = None
     if mesh is not None and views:
         offset = measure_offset(mesh, surface_points(splats, [view.camera for view in views]))
@@ -260,8 +269,8 @@ def judge(
         rejected=len(capture.rejected),
         psnr=psnr,
         psnr_object=_mean([psnr_of(error) for error in errors]),
-        splat_iou=_mean([iou(view.alpha >= 0.5, mask) for view, mask in masked]),
-        mesh_iou=None if mesh is None else _mean([iou(view.mesh, mask) for view, mask in masked]),
+        splat_iou=_mean([iou((view.alpha >= 0.5) & view.known, mask) for view, mask in masked]),
+        mesh_iou=None if mesh is None else _mean([iou(view.mesh & view.known, mask) for view, mask in masked]),
         offset=None if offset is None else offset.shift,
         spread=None if offset is None else offset.spread,
         lost=None if isolation is None else isolation.lost,
@@ -287,6 +296,12 @@ def iou(one: BoolArray, other: BoolArray) -> float:
     """Intersection over union; 1 where both are empty."""
     union = int((one | other).sum())
     return int((one & other).sum()) / union if union else 1.0
+
+
+def _inside(mask: BoolArray) -> BoolArray:
+    """A mask without the pixels of its outline, which show what is behind as well; the mask if that is all of it."""
+    inner = np.asarray(binary_erosion(mask))
+    return inner if inner.any() else mask
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -17,7 +17,7 @@ from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.causes import find_causes
-from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
+from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, scale_to, show_held_out, sized_photo
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
@@ -122,7 +122,11 @@ def reconstruct_asset(
     check_refinable(settings, kind, imported)
     pictures = [sized_photo(photo, settings.view_size) for photo in capture.training]
     isolation = None
-    views: Sequence[MaskedView] = [MaskedView(camera, mask) for camera, _, mask in pictures if mask is not None]
+    views: Sequence[MaskedView] = [
+        MaskedView(camera, mask, photo.hidden(scale_to(photo, settings.view_size)))
+        for photo, (camera, _, mask) in zip(capture.training, pictures, strict=True)
+        if mask is not None
+    ]
     if kind == "object":
         if len(views) < 3:
             raise InputError(f"an object needs photos with masks from at least 3 sides (got {len(views)})")

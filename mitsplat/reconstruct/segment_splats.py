@@ -63,10 +63,22 @@ class MaskedView:
     Attributes:
         camera: From where.
         mask: Share of each pixel that is the object, (H, W) in [0, 1].
+        hidden: Where another thing may hide the object, (H, W) in [0, 1]; None: nowhere.
     """
 
     camera: Camera
     mask: Float32Array
+    hidden: Float32Array | None = None
+
+    @property
+    def possible(self) -> Float32Array:
+        """Share of each pixel in which the object may be, (H, W)."""
+        return self.mask if self.hidden is None else np.maximum(self.mask, (self.hidden > 0).astype(np.float32))
+
+    @property
+    def known(self) -> BoolArray:
+        """Where the mask says whether there is the object, (H, W)."""
+        return np.ones(self.mask.shape, dtype=bool) if self.hidden is None else np.asarray(self.hidden == 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +105,7 @@ class Isolation:
 
 
 def visible_weights(splats: Splats, view: MaskedView) -> Float64Array:
-    """Blended weight of each Gaussian inside and outside the mask, shape (N, 2) [px].
+    """Blended weight of each Gaussian inside and outside the mask, where that is known, shape (N, 2) [px].
 
     The picture is linear in the colours: the derivative of ``sum of mask * red`` with respect to the red of a Gaussian
     is its weight ``T a`` summed over the mask, and green serves for what is outside.
@@ -166,8 +178,9 @@ class _Weigher:
         dr.enable_grad(colours)
         cloud = pack_cloud(*self._inputs, colours, 1)
         rgb, _ = render_differentiable(cloud, view_of(make_sensor(view.camera)), _QUALITY)
-        mask = mi.Float(np.ravel(view.mask).astype(np.float32))
-        dr.backward(dr.sum(rgb[0] * mask) + dr.sum(rgb[1] * (1 - mask)))
+        inside, outside = np.where(view.known, view.mask, 0), np.where(view.known, 1 - view.mask, 0)
+        own, other = (mi.Float(np.ravel(part).astype(np.float32)) for part in (inside, outside))
+        dr.backward(dr.sum(rgb[0] * own) + dr.sum(rgb[1] * other))
         constant = float(sh_basis((0.0, 0.0, 1.0), 0).ravel()[0])
         return np.array(dr.grad(colours), dtype=np.float64).reshape(-1, 3)[:, :2] / constant
 
@@ -185,7 +198,7 @@ def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
     tips = np.concatenate([splats.means[needle] + reach, splats.means[needle] - reach])
     outside: Int64Array = np.zeros(len(tips), dtype=np.int64)
     for view in views:
-        away = cv2.distanceTransform((view.mask < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        away = cv2.distanceTransform((view.possible < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         outside += sample_nearest(away, view.camera, tips, missing=0.0) > TIP_MARGIN
     result[needle] = (outside.reshape(2, -1) > 1).any(axis=0)
     return result

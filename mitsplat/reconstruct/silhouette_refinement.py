@@ -205,7 +205,11 @@ class Outline:
         pixels = np.nan_to_num(given.project(given.centre + distance * ahead)[0], nan=-9.0) - 0.5
         known = ((pixels > -0.5) & (pixels < np.array([given.width, given.height]) - 0.5)).all(axis=1)
         x, y = pixels.T.astype(np.float32).reshape(2, size, size)
-        mask = cv2.remap(view.mask, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        mask, told = (
+            cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for part in (view.mask, view.known.astype(np.float32))
+        )
+        known &= told.ravel() == 1
         self.mask, self.known = (wrapped(mi.Float, v.ravel().astype(np.float32)) for v in (mask, known))
         pose = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
         pose[:3, 3] = (given.centre - middle) / radius

@@ -72,7 +72,7 @@ def find_sound_surface(
     Raises:
         InputError: If the splats span no volume.
     """
-    cameras, masks = [view.camera for view in views], [view.mask for view in views]
+    cameras, masks = [view.camera for view in views], [view.possible for view in views]
 
     def fused(depth: bool) -> trimesh.Trimesh:
         return reconstruct_surface(splats, cameras, masks, settings, floor=floor, depth=depth, progress=progress)
@@ -107,7 +107,9 @@ def _compare(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView])
     if not (is_closed(mesh) and mesh.volume > 0):
         return 0.0, "is open"
     shown = show_asset(splats, mesh, [view.camera for view in views])
-    overlap = float(np.mean([iou(one.mesh, view.mask >= 0.5) for one, view in zip(shown, views, strict=True)]))
+    overlap = float(
+        np.mean([iou(one.mesh & view.known, view.mask >= 0.5) for one, view in zip(shown, views, strict=True)])
+    )
     if overlap < LEAST_OVERLAP:
         return overlap, f"meets the masks with an IoU of only {overlap:.2f}"
     spread = measure_offset(mesh, surface_points(splats, [view.camera for view in views])).spread

@@ -164,7 +164,13 @@ def reconstruct_surroundings(
         if things:
             rows["Removed things"] = "; ".join(_missing(thing, factor, unit) for thing in things)
             record["removed_things"] = [
-                {"pick": t.pick, "gaussians": t.gaussians, "filled": factor**2 * t.area, "copied": t.copied}
+                {
+                    "pick": t.pick,
+                    "gaussians": t.gaussians,
+                    "filled": factor**2 * t.area,
+                    "behind": factor**2 * t.behind,
+                    "copied": t.copied,
+                }
                 for t in things
             ]
         sections.append(_map(coverage, filled))
@@ -306,9 +312,10 @@ def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
     size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
     x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
     copied = "copies of what is around" if thing.copied > 0.99 else f"copies of what is around ({thing.copied:.0%})"
+    behind = f" and {factor**2 * thing.behind:.2g} {unit}² of a wall behind it" if thing.behind else ""
     return (
         f"{size} {unit} around x {x:.2f}, y {y:.2f} of surface {thing.support} ({thing.pick}), {thing.gaussians} "
-        f"Gaussians; {factor**2 * thing.area:.2g} {unit}² that it hid are invented, of {copied}"
+        f"Gaussians; {factor**2 * thing.area:.2g} {unit}²{behind} that it hid are invented, of {copied}"
     )
 
 

@@ -1,14 +1,15 @@
 """Take a thing away that stands on a support, and fill what it hid with what lies around.
 
 What goes is told by points: those that stand on the support fall into things that lie apart, and each Gaussian is of
-what the nearest point is of; so does what reaches into its volume. No photo shows what was below. It is made of pieces
-of the support (:mod:`.texture_fill`), and laid down as a sheet of flat Gaussians.
+what the nearest point is of; so does what reaches into its volume. No photo shows what was below, nor what it hid of a
+wall close behind it. Both are made of pieces of the same surface (:mod:`.texture_fill`), laid down as sheets of flat
+Gaussians.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_fill_holes, label
@@ -23,7 +24,7 @@ from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import OFF, TALL
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views
 from mitsplat.surroundings.ground import CELL, Grid, Ground
-from mitsplat.surroundings.supports import Support
+from mitsplat.surroundings.supports import Support, find_walls
 from mitsplat.surroundings.texture_fill import dilated, fill
 
 _APART = 0.02
@@ -42,6 +43,10 @@ _BESIDE = 4
 """Voxels around a thing in which Gaussians are its own if it is nearer to them than all else."""
 _BLED = 2
 """Steps around what is hidden, each as high as what is told from the support, in which colours are the thing's, too."""
+_FEET = 0.4
+"""Half the span of heights at which a thing's feet are, around the middle of those that count as the support's."""
+_STRAY = 0.02
+"""Share of a thing's points that do not say how near to a wall it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +61,8 @@ class RemovedThing:
         high: Largest.
         filled: Middles of the cells that were filled in, (N, 2).
         area: Of these.
-        copied: Share of them that repeats other parts of the support; the rest has a plain colour.
+        behind: Area that was filled in on walls behind it.
+        copied: Share of all these that repeats other parts of the same surface; the rest has a plain colour.
     """
 
     pick: str
@@ -66,7 +72,13 @@ class RemovedThing:
     high: Float64Array
     filled: Float64Array
     area: float
+    behind: float
     copied: float
+
+    @property
+    def whole(self) -> float:
+        """Area of all that was filled in."""
+        return self.area + self.behind
 
 
 def remove_things(
@@ -92,12 +104,24 @@ def remove_things(
     Raises:
         InputError: If there is no such photo, or nothing is seen there that stands on a support.
     """
-    places, grounds, removed = points.places, dict[int, Ground](), list[RemovedThing]()
+    walls = find_walls(points, scale)
+    surfaces = [*supports, *walls]
+    fitted, places, grounds, removed = splats, points.places, dict[int, Ground](), list[RemovedThing]()
+
+    def ground(number: int) -> Ground:
+        """A surface as photos show it, and as it was filled in since."""
+        if number not in grounds:
+            grounds[number] = Ground.of(surfaces[number], fitted, capture, scale)
+        return grounds[number]
+
     for pick in picks:
         number, spot = _picked(splats, pick, capture, supports, scale)
-        if number not in grounds:
-            grounds[number] = Ground.of(supports[number], splats, capture, scale)
-        splats, places, thing = _remove(splats, pick, number, spot, grounds[number], places, scale)
+        splats, own, places, thing = _remove(splats, pick, number, spot, ground(number), walls, places, scale)
+        for place, wall in enumerate(walls, len(supports)):
+            if _stands_close(own, wall, scale):
+                splats, area, copied = _fill_behind(splats, own, places, ground(place), scale)
+                share = (thing.copied * thing.whole + copied * area) / (thing.whole + area)
+                thing = replace(thing, behind=thing.behind + area, copied=share)
         removed.append(thing)
         if progress is not None:
             progress(len(removed), len(picks), "removing things")
@@ -105,26 +129,26 @@ def remove_things(
 
 
 def _remove(
-    splats: Splats, pick: str, number: int, spot: Float64Array, ground: Ground, places: Float64Array, scale: float
-) -> tuple[Splats, Float64Array, RemovedThing]:
-    """Splats and points (N, 3) without the thing at a place of a support, and what it was."""
+    splats: Splats,
+    pick: str,
+    number: int,
+    spot: Float64Array,
+    ground: Ground,
+    walls: Sequence[Support],
+    places: Float64Array,
+    scale: float,
+) -> tuple[Splats, Float64Array, Float64Array, RemovedThing]:
+    """Splats without the thing at a place of a support, its points (M, 3), the others (N, 3), and what it was."""
     support, grid = ground.support, ground.grid
     inverse = np.asarray(np.linalg.inv(support.pose))
-    thing, others = _apart(places @ inverse[:3, :3].T + inverse[:3, 3], spot, support, scale)
+    # A thing that touches a wall ends there.
+    loose = ~np.any([np.zeros(len(places), dtype=bool), *(w.holds(places, OFF * scale) for w in walls)], axis=0)
+    thing, others = _apart(support.local(places), loose, spot, support, scale)
     if thing is None:
         raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
-    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / CELL)
-    standing = grid.covered(others[(height > OFF * scale) & (height < top)])
-    footprint = dilated(grid.outline(thing), margin) & ~standing  # points keep off edges
-    parts, _ = label(~ground.seen & ~standing)
-    hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
-    core = binary_fill_holes(hidden & dilated(footprint, 4 * margin))
-    hole = dilated(np.asarray(core), _BLED * margin) & ~standing
+    standing, footprint, hole = _hidden(ground, thing, others, scale)
     gone = _of_thing(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
-    ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
-    ground.seen = ground.seen | hole
-    # Around the hole, too, where what went was reaching to.
-    sheet = grid.sheet(ground.texture, ground.seen & dilated(hole, margin)).transformed(support.pose)
+    sheet, copied = _filled(ground, standing, hole)
     removed = RemovedThing(
         pick=pick,
         support=number,
@@ -133,10 +157,67 @@ def _remove(
         high=thing.max(axis=0),
         filled=grid.middles[hole],
         area=float(hole.sum()) * grid.cell**2,
+        behind=0.0,
         copied=copied,
     )
-    left = others @ support.pose[:3, :3].T + support.pose[:3, 3]
-    return Splats.concatenate([splats.select(~gone), sheet]), left, removed
+    left = Splats.concatenate([splats.select(~gone), sheet])
+    cells = grid.cells(others[:, :2])
+    feet = (cells >= 0).all(axis=1) & footprint[tuple(cells.T)] & (np.abs(others[:, 2] / (OFF * scale) - 0.5) < _FEET)
+    parts = np.concatenate([thing, others[feet]]), others[~feet]
+    own, rest = (part @ support.pose[:3, :3].T + support.pose[:3, 3] for part in parts)
+    return left, own, rest, removed
+
+
+def _stands_close(thing: Float64Array, wall: Support, scale: float) -> bool:
+    """Whether points (N, 3) on a thing are before a wall and nearer to it than they are wide.
+
+    Farther away it hides nothing that cameras all around it do not see past it.
+    """
+    local = wall.local(thing)
+    before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2).all(axis=1)
+    if not before.any() or np.median(local[:, 2]) < OFF * scale:
+        return False
+    return bool(-OFF * scale < np.quantile(local[:, 2], _STRAY) < np.ptp(local[:, :2], axis=0).max())
+
+
+def _fill_behind(
+    splats: Splats, thing: Float64Array, others: Float64Array, ground: Ground, scale: float
+) -> tuple[Splats, float, float]:
+    """Splats with what a thing that was taken away hid of a wall, the area of that, and the share that is copied."""
+    wall = ground.support
+    standing, _, hole = _hidden(ground, wall.local(thing), wall.local(others), scale)
+    if not hole.any():
+        return splats, 0.0, 1.0
+    guessed = _guesses(splats.transformed(np.linalg.inv(wall.pose)), ground.grid, hole, scale)
+    sheet, copied = _filled(ground, standing, hole)
+    area = float(hole.sum()) * ground.grid.cell**2
+    return Splats.concatenate([splats.select(~guessed), sheet]), area, copied
+
+
+def _hidden(
+    ground: Ground, thing: Float64Array, others: Float64Array, scale: float
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Cells of a surface that other points stand on, that a thing is over, and that it hid, (X, Y) each.
+
+    Points are in the surface's frame, shape (N, 3).
+    """
+    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / CELL)
+    standing = ground.grid.covered(others[(height > OFF * scale) & (height < top)])
+    footprint = dilated(ground.grid.outline(thing), margin) & ~standing  # points keep off edges
+    parts, _ = label(~ground.seen & ~standing)
+    hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
+    core = binary_fill_holes(hidden & dilated(footprint, 4 * margin))
+    return standing, footprint, dilated(np.asarray(core), _BLED * margin) & ~standing
+
+
+def _filled(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splats, float]:
+    """A sheet for a hole of a surface, which then counts as seen, and the share of it that is copied."""
+    margin = round(OFF / CELL)
+    ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
+    ground.seen = ground.seen | hole
+    # Around the hole, too, where what went was reaching to.
+    sheet = ground.grid.sheet(ground.texture, ground.seen & dilated(hole, margin))
+    return sheet.transformed(ground.support.pose), copied
 
 
 def _picked(
@@ -152,25 +233,24 @@ def _picked(
     spot = camera.centre + (depth if np.isfinite(depth) else np.nan) * ray  # what is NaN stands on nothing
     found, lowest = -1, np.inf
     for number, support in enumerate(supports):
-        local = (spot - support.pose[:3, 3]) @ support.pose[:3, :3]
+        local = support.local(spot)
         above = OFF * scale < local[2] < min(lowest, TALL * scale)
         if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
             found, lowest = number, float(local[2])
     if found < 0:
         raise InputError(f"{pick}: what is to be removed must stand on a level surface that was found")
-    support = supports[found]
-    return found, np.asarray((spot - support.pose[:3, 3]) @ support.pose[:3, :3])
+    return found, supports[found].local(spot)
 
 
 def _apart(
-    points: Float64Array, spot: Float64Array, support: Support, scale: float
+    points: Float64Array, loose: BoolArray, spot: Float64Array, support: Support, scale: float
 ) -> tuple[Float64Array | None, Float64Array]:
     """Points of the thing at a place, None if there are none, and others without stray ones, in the support's frame.
 
-    What sticks out beyond the support by some voxels goes along.
+    Only ``loose`` ones (N,) can be of a thing. What sticks out beyond the support by some voxels goes along.
     """
     over = (np.abs(points[:, :2]) <= np.array(support.size) / 2).all(axis=1)
-    high = (points[:, 2] > OFF * scale) & (points[:, 2] < TALL * scale)
+    high = loose & (points[:, 2] > OFF * scale) & (points[:, 2] < TALL * scale)
     standing = np.flatnonzero(over & high)
     if not len(standing):
         return None, points
@@ -220,14 +300,28 @@ def _of_thing(
     floor, top = OFF * scale, float(thing[:, 2].max()) + 0.5 * reach
     inside = np.asarray((cells >= 0).all(axis=1))
     cells = np.where(inside[:, None], cells, 0)
-    over, in_hole = (inside & part[tuple(cells.T)] for part in (footprint, hole))
+    over = inside & footprint[tuple(cells.T)]
     goes = (own | (over & (bare | (away > _ON * reach)) & (height < top))) & (height > floor)
-    axes = Rotation.from_quat(splats.quats[rows]).as_matrix()[:, 2]
-    tip = height + _REACH * np.sqrt(((axes * splats.scales[rows]) ** 2).sum(axis=1))
-    goes |= in_hole & (height <= floor) & ((height >= -floor) | (tip > floor))
-    gone = _reaching(splats, grid.inside(thing, footprint, reach))
+    gone = _reaching(splats, grid.inside(thing, footprint, reach)) | _guesses(splats, grid, hole, scale)
     gone[rows[goes]] = True
     return gone
+
+
+def _guesses(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolArray:
+    """Which Gaussians (N,) are in the hole of a surface, or below it and reach out of it, in the surface's frame."""
+    floor, height, cells = (
+        OFF * scale,
+        splats.means[:, 2].astype(np.float64),
+        grid.cells(splats.means[:, :2].astype(np.float64)),
+    )
+    near = (cells >= 0).all(axis=1) & (height <= floor) & (height > -TALL * scale)
+    rows = np.flatnonzero(near)
+    rows = rows[hole[tuple(cells[rows].T)]]
+    axes = Rotation.from_quat(splats.quats[rows]).as_matrix()[:, 2]
+    tip = height[rows] + _REACH * np.sqrt(((axes * splats.scales[rows]) ** 2).sum(axis=1))
+    guessed = np.zeros(len(splats), dtype=bool)
+    guessed[rows[(height[rows] >= -floor) | (tip > floor)]] = True
+    return guessed
 
 
 def _reaching(splats: Splats, places: Float64Array) -> BoolArray:

@@ -1,4 +1,4 @@
-"""Flat, level surfaces of a place that things can stand on: a table, a shelf, the floor.
+"""Flat, level surfaces of a place that things can stand on, a table, a shelf, the floor; and the walls behind them.
 
 Planes are found by random samples among the points that photos see of upward surfaces (Fischler and Bolles 1981), the
 largest first, and fitted by least squares in which points count by Cauchy's weights. What lies in a plane falls into
@@ -16,6 +16,7 @@ import trimesh
 from scipy.ndimage import binary_closing, binary_opening, label
 
 from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.camera import direction
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 
@@ -35,6 +36,12 @@ _RIM = 0.5
 """Cells in a row of a rectangle, as a share of its median row's, from which the row is no spur."""
 _TRIMS = 6
 
+_SIDES = 6
+"""Directions that walls are looked for in."""
+_LEANING = 10.0
+"""Angle to the vertical up to which a surface is a wall [degrees]."""
+_BEHIND = 0.05
+"""Points behind a wall, as a share of those in it, from which it is none."""
 _FILLED = 0.5
 """Share of its rectangle that a support must fill at least."""
 _LEAST_AREA = 0.02
@@ -70,6 +77,14 @@ class Support:
     def angle(self) -> float:
         """Turn of its longer side about z [degrees]."""
         return float(np.degrees(np.arctan2(self.pose[1, 0], self.pose[0, 0])))
+
+    def local(self, points: Float64Array) -> Float64Array:
+        """Points (N, 3) of the place in the support's frame."""
+        return np.asarray((points - self.pose[:3, 3]) @ self.pose[:3, :3])
+
+    def holds(self, points: Float64Array, margin: float) -> BoolArray:
+        """Which points (N, 3) of the place lie in the rectangle, up to a ``margin``."""
+        return np.asarray((np.abs(self.local(points)) <= (*(np.array(self.size) / 2 + margin), margin)).all(axis=1))
 
     def transformed(self, motion: Float64Array) -> Support:
         """The support after a similarity (4, 4)."""
@@ -117,6 +132,38 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
             found += _parts(places[inside], weights[inside], normal, height, spread, up, scale)
     found = [support for support in found if support.filled >= _FILLED]
     return sorted(found, key=lambda support: -support.looked_at)
+
+
+def find_walls(points: SurfacePoints, scale: float) -> list[Support]:
+    """Upright surfaces with nothing behind them, as :func:`find_supports` finds level ones; sides of things have a top.
+
+    Args:
+        points: What photos see, z up.
+        scale: The photos' typical depth.
+    """
+    found = list[Support]()
+    for turn in range(_SIDES):
+        towards = direction(2 * np.pi * turn / _SIDES, 0.0)
+        for wall in find_supports(points, towards, scale, within=180 / _SIDES):
+            upright = abs(wall.pose[2, 2]) < np.sin(np.radians(_LEANING))
+            if upright and _bounds(wall, points, scale) and not any(_coincide(wall, other, scale) for other in found):
+                found.append(wall)
+    return found
+
+
+def _bounds(wall: Support, points: SurfacePoints, scale: float) -> bool:
+    """Whether photos see next to nothing behind a surface, as far as it is wide or high."""
+    local = wall.local(points.places)
+    before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2 + _CELL * scale).all(axis=1)
+    depth = local[before, 2]
+    behind = (depth < -2 * _TOLERANCE * scale) & (depth > -min(wall.size))
+    return bool(behind.sum() < _BEHIND * (np.abs(depth) < 2 * _TOLERANCE * scale).sum())
+
+
+def _coincide(one: Support, other: Support, scale: float) -> bool:
+    """Whether the middle of one surface lies in another that faces as it does."""
+    inside = other.holds(one.pose[None, :3, 3], _TOLERANCE * scale)[0]
+    return bool(inside and one.pose[:3, 2] @ other.pose[:3, 2] > np.cos(np.radians(_SAME)))
 
 
 def fit_plane(
@@ -206,8 +253,7 @@ def flattened(mesh: trimesh.Trimesh, supports: Sequence[Support], margin: float)
     """A mesh whose vertices lie in supports where they are within ``margin`` of these, as splats' depth is rough."""
     vertices = np.array(mesh.vertices, dtype=np.float64)
     for support in supports:
-        local = (vertices - support.pose[:3, 3]) @ support.pose[:3, :3]
-        inside = (np.abs(local) <= (*(np.array(support.size) / 2 + margin), margin)).all(axis=1)
+        local, inside = support.local(vertices), support.holds(vertices, margin)
         local[inside, 2] = 0
         vertices[inside] = local[inside] @ support.pose[:3, :3].T + support.pose[:3, 3]
     return trimesh.Trimesh(vertices, mesh.faces, process=False)

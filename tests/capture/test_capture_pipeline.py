@@ -26,13 +26,14 @@ from mitsplat.capture import pipeline as take
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.masks import agreed_masks, geometric_masks, object_points
+from mitsplat.capture.masks import agreed_masks, geometric_masks, object_masks, object_points
 from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
 from mitsplat.capture.photos import Prepared, prepare_photos
-from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, _without_hidden, capture_photos
+from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, _hidden_parts, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.isolation import ChosenObject
+from mitsplat.reconstruct.evaluation import iou
 from tests import rendered
 from tests.cli.typed import run
 
@@ -282,10 +283,41 @@ def test_photos_in_which_another_thing_stands_before_the_object_are_left_out() -
         for eye in [(0.4 * np.cos(np.radians(turn)), 0.4 * np.sin(np.radians(turn)), 0.1)]
     )
     capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3)), rejected={"blurred.jpg": "it is blurred"})
-    found = _without_hidden(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
+    found, hidden = _hidden_parts(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
     assert [photo.name for photo in found.photos] == [f"{turn:03}.jpg" for turn in range(45, 360, 45)]
-    assert found.rejected.keys() == {"blurred.jpg", "000.jpg"}
-    assert re.fullmatch(r"another thing stands before the object and hides \d+% of it", found.rejected["000.jpg"])
+    assert not hidden and found.rejected.keys() == {"blurred.jpg", "000.jpg"}
+    assert re.fullmatch(r"another thing stands before the object and may hide \d+% of it", found.rejected["000.jpg"])
+    aside = 0.75 * ball + np.array([0.12, 0.05, 0.03])
+    found, hidden = _hidden_parts(capture, ChosenObject(ball, ball, (aside,)))
+    assert len(found.photos) == 8 and hidden.keys() == {"000.jpg", "045.jpg"}
+    pixels, _ = photos[0].camera.project(aside)
+    x, y = pixels[np.linalg.norm(pixels - (160, 120), axis=1) < 40].astype(int).T  # before the object
+    assert len(x) > 20 and hidden["000.jpg"][y, x].all() and hidden["000.jpg"].mean() < 0.2
+
+
+def test_masks_are_transparent_where_the_object_may_be_hidden(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path
+) -> None:
+    capture = captured[2].capture
+    whole = capture.photos[1].alpha()
+    assert whole is not None and capture.photos[1].hidden() is None
+    veil = np.zeros(whole.shape, dtype=bool)
+    column = int(np.median(np.nonzero(whole)[1]))
+    veil[:, column - 5 : column + 15] = True  # across the middle: both sides stay
+    points = object_points(capture)
+    name = capture.photos[1].name
+    found = object_masks(capture, points, points[points[:, 2] > 0], tmp_path, hidden={name: veil})
+    saved = Capture.load(found.save(tmp_path / "saved") and tmp_path / "saved")
+    assert len(saved.photos) == len(capture.photos)
+    assert [photo.name for photo in saved.photos if photo.hidden() is not None] == [name]
+    photo = next(photo for photo in saved.photos if photo.name == name)
+    mask, hidden = photo.alpha(), photo.hidden()
+    assert mask is not None and hidden is not None
+    np.testing.assert_array_equal(hidden, veil)
+    assert not mask[veil].any()
+    assert iou((mask >= 0.5) & ~veil, (whole >= 0.5) & ~veil) > 0.95
+    half = photo.hidden(0.5, (column - 40, 0, 80, 80))
+    assert half is not None and half.shape == (40, 40) and half[:, 20:25].all() and not half[:, :16].any()
 
 
 def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> None:

@@ -24,6 +24,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit import strategy_classic as densify_classic
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.depth_priors import DepthMaps, align_maps
+from mitsplat.fit.folder import FitResult
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.fit.training_view import TrainingView
@@ -297,6 +298,37 @@ def seeing(capture: Capture) -> Capture:
     ]
     photos = tuple(replace(p, seen=own.astype(np.int32)) for p, own in zip(capture.photos, facing, strict=True))
     return replace(capture, photos=photos)
+
+
+def test_what_is_hidden_takes_no_part(capture: Capture, tmp_path: Path) -> None:
+    """Splats are the same whatever stands before the object, and nothing is missing behind it."""
+    veil = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    veil[:, 24:34] = True
+
+    def veiled(number: int, shade: int) -> Photo:
+        photo = capture.photos[number]
+        picture, mask = (np.array(Image.open(file)) for file in (photo.file, photo.mask) if file is not None)
+        picture[veil], mask[veil] = shade, 0
+        folder = tmp_path / str(shade)
+        folder.mkdir(exist_ok=True)
+        Image.fromarray(picture).save(folder / f"{number}.png")
+        cut = Image.fromarray(mask)
+        cut.putalpha(Image.fromarray(np.uint8(255) * (~veil).astype(np.uint8)))
+        cut.save(folder / f"{number}_mask.png")
+        return replace(photo, file=folder / f"{number}.png", mask=folder / f"{number}_mask.png")
+
+    def fit_of(shade: int) -> FitResult:
+        photos = tuple(veiled(number, shade) for number in range(VIEWS))
+        settings = replace(SMALL, iterations=120)
+        return fit_capture(replace(capture, photos=photos), tmp_path / f"fit{shade}", settings)
+
+    dark, bright = fit_of(10), fit_of(250)
+    np.testing.assert_array_equal(dark.splats.means, bright.splats.means)
+    np.testing.assert_array_equal(dark.splats.sh, bright.splats.sh)
+    assert dark.psnr == bright.psnr
+    layers, truth = (render_splats(splats, capture.photos[3].camera) for splats in (dark.splats, ball()))
+    behind = veil & (truth.alpha > 0.99)
+    assert layers.alpha[behind].mean() > 0.9
 
 
 def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:

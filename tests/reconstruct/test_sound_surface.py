@@ -10,7 +10,7 @@ import pytest
 from benchmarks.assets.known import chamfer
 from mitsplat.errors import InputError
 from mitsplat.reconstruct.evaluation import sized_photo
-from mitsplat.reconstruct.segment_splats import MaskedView
+from mitsplat.reconstruct.segment_splats import MaskedView, isolate_object
 from mitsplat.reconstruct.sound_surface import CONVEX, FINEST, HULL, find_sound_surface
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.splats import Splats
@@ -65,6 +65,24 @@ def test_the_hull_of_splats_ends_at_the_floor(known_object: KnownObject) -> None
     found = find_sound_surface(known_object.splats, views, SETTINGS, floor=-0.03)
     assert found.source == CONVEX
     assert found.mesh.bounds[0, 2] == pytest.approx(-0.03)
+
+
+def test_masks_do_not_cut_what_another_thing_may_hide(known_object: KnownObject) -> None:
+    """A third of each picture is hidden: as background it would cut the object, the hull of masks alone as well."""
+    veil = np.zeros(views_of(known_object)[0].mask.shape, dtype=np.float32)
+    veil[:, : veil.shape[1] // 2] = 1
+    given = views_of(known_object)
+    views = [MaskedView(v.camera, v.mask * (1 - veil), veil if k % 3 == 0 else None) for k, v in enumerate(given)]
+    views = [view if view.hidden is not None else given[k] for k, view in enumerate(views)]
+    found = find_sound_surface(known_object.splats, views, SETTINGS)
+    assert (found.source, found.faults) == (FINEST, ())
+    assert chamfer(found.mesh, known_object.mesh) < 0.005
+    kept = isolate_object(known_object.splats, views)
+    assert kept.kept.mean() > 0.97 * isolate_object(known_object.splats, given).kept.mean()
+    blind = [replace(view, hidden=None) for view in views]
+    assert isolate_object(known_object.splats, blind).lost < 0.2
+    cut = find_sound_surface(known_object.splats, blind, SETTINGS)
+    assert cut.source != FINEST or chamfer(cut.mesh, known_object.mesh) > 0.02
 
 
 def test_splats_without_volume_are_refused(known_object: KnownObject) -> None:

@@ -25,7 +25,7 @@ from mitsplat.splats import Splats
 from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.removal import remove_things
-from mitsplat.surroundings.supports import find_supports
+from mitsplat.surroundings.supports import find_supports, find_walls
 from mitsplat.surroundings.texture_fill import fill
 from tests.surroundings.test_surroundings import (
     BOX,
@@ -122,6 +122,42 @@ def test_all_things_go(captured: Capture) -> None:
         inside = true.alpha > 0.99
         assert np.abs(shown.picture - true.picture)[inside].max() < 0.05
         assert shown.alpha[inside].min() > 0.9
+
+
+def wall(y: float) -> tuple[Splats, Splats]:
+    """A wall across the table at ``y``, in even slopes of colour, and without what the cube before it hides."""
+    whole = placed(sheet((0.6, 1.2), 0.02, 31), (0, y, HEIGHT + 0.3), 1)
+    colour = np.column_stack([0.5 + 0.3 * whole.means[:, 0], 0.3 + 0.4 * whole.means[:, 2], np.full(len(whole), 0.6)])
+    whole = replace(whole, sh=((colour - 0.5) / SH_C0)[:, None].astype(np.float32))
+    hidden = (np.abs(whole.means[:, 0] - BESIDE[0]) < 0.4 * CUBE) & (whole.means[:, 2] < HEIGHT + 0.85 * CUBE)
+    return whole, whole.select(~hidden)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.03])
+def test_a_wall_close_behind_is_filled_too(gap: float, tmp_path: Path) -> None:
+    """The thing may touch it; the wall stays, and what was not seen of it is filled."""
+    bare, _ = table_and_box()
+    y = BESIDE[1] + CUBE / 2 + gap
+    true, seen = wall(y)
+    capture = photographed(Splats.concatenate([bare, true, cube()]), tmp_path)
+    fitted = Splats.concatenate([bare, seen, cube()])
+    points = surface_points(depth_views(fitted, [photo.camera for photo in capture.training]))
+    supports, what = find_supports(points, UP, DEPTH, within=5), pick(12, (*BESIDE, HEIGHT + CUBE))
+    left, (thing,) = remove_things(fitted, (what,), capture, supports, points, DEPTH)
+    assert 0.5 * CUBE**2 < thing.behind < 2 * CUBE**2 and thing.copied == 1
+    assert not above(left, (BESIDE[0] - 0.1, BESIDE[1] - 0.1), (BESIDE[0] + 0.1, y - 0.015)).any()
+    from_near = Camera.look_at((-0.2, -0.4, 0.3), (BESIDE[0], y, HEIGHT + 0.05), width=160, height=120, fov_x=40)
+    for camera in (cameras()[4], cameras()[12], from_near):
+        (shown,), (whole,) = (show_asset(one, None, [camera]) for one in (left, Splats.concatenate([bare, true])))
+        off = np.abs(shown.picture - whole.picture)
+        assert off.mean() < 2e-3 and (off > 0.05).mean() < 2e-3
+        assert np.abs(shown.alpha - whole.alpha).max() < 0.05
+
+
+def test_sides_of_things_are_no_walls(captured: Capture) -> None:
+    splats = Splats.concatenate([place(), cube()])
+    points = surface_points(depth_views(splats, [photo.camera for photo in captured.training]))
+    assert find_walls(points, DEPTH) == []
 
 
 def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:

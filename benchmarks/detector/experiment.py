@@ -196,7 +196,7 @@ def measure(options: argparse.Namespace) -> None:
     figure(whole.map50, "", "map50")
     for name, (strict, _) in whole.classes.items():
         figure(strict, "", "class", name)
-    for name, gain in gains(truth, detections).items():
+    for name, gain in gains(truth, detections, whole).items():
         figure(gain, "", "gain", name)
     by_scene: dict[int, list[int]] = {}
     for image in truth["images"]:

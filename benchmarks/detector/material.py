@@ -98,7 +98,7 @@ class Wanted:
         if not self.brand:
             return self.scan, up
         scan = trimesh.load(self.scan, force="mesh")
-        own, plain = self.seed % 2 == 0, self.seed % 1000 >= PRINTED and shape_of(scan) == "bottle"
+        own, plain = self.seed % 2 == 0, self.seed % 1000 >= PRINTED
         return relabel(scan, self.seed, "xyz".index(up), own_colours=own, plain=plain), up
 
     def bake(self, gaussians: int, device: str) -> float:

@@ -59,7 +59,7 @@ def relabel(
         seed: Decides all that is printed.
         up: Axis along which print stands upright.
         own_colours: Whether it is printed in colours of the scan, so that they do not tell one from the other.
-        plain: Whether a bottle is of one colour but for its cap, of any, and a label on its front and back.
+        plain: Whether it is, if a bottle, of one colour but for its cap, of any, and a label on its front and back.
     """
     rng = np.random.default_rng(seed)
     shape = shape_of(scan)
@@ -92,6 +92,7 @@ def relabel(
         around = np.pi * (size[across] + size[along]) / 2
         u = np.arctan2(corners[..., along], corners[..., across]) / (2 * np.pi) + 0.5
         u = np.where((u < 0.25) & (np.ptp(u, axis=1, keepdims=True) > 0.5), u + 1, u)
+        plain = plain and shape == "bottle"
         front = (_plain_label if plain else _label)(around / 2, size[up], rng, colours)
         sheet = Image.new("RGB", (round(2.1 * front.width), front.height))
         for place in range(3):  # front and back, and the beginning again where triangles reach over the seam

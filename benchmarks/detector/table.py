@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,13 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
     drawn apart for each arm. An arm of one seed has only that of scenes.
     """
-    seeds, draws = _by_arm(results, plan), precision_draws(results, plan)
+    seeds, draws = _by_arm(results, plan, *arms), precision_draws(results, plan)
     lines = [
         "| learnt from | seeds | mAP50-95 | 95 % | mAP50 | compared with | less by, 95 % |",
         "| --- | ---: | ---: | --- | ---: | --- | --- |",
     ]
     for arm in arms or seeds:
-        strict, loose = (mean_precision(results, plan, arm, key) for key in ("map50_95", "map50"))
+        strict, loose = (_mean(seeds[arm], key) for key in ("map50_95", "map50"))
         reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else REFERENCE
         compared = "– | –"
         if arm != reference and reference in draws and not (arm in EARLIER and plan == "arms"):
@@ -53,23 +53,27 @@ def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms"
     }
 
 
-def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str, key: str = "map50_95") -> float:
+def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str) -> float:
     """Mean over the seeds of an arm.
 
     Raises:
         KeyError: If there is none.
     """
-    if arm not in (seeds := _by_arm(results, plan)):
-        raise KeyError(f"no result of {arm} in {plan}.yaml")
-    return float(np.mean([one[key][0] for one in seeds[arm]]))
+    return _mean(_by_arm(results, plan, arm)[arm], "map50_95")
 
 
-def _by_arm(results: Mapping[str, Mapping[str, Any]], plan: str) -> dict[str, list[Mapping[str, Any]]]:
-    """Figures of every seed of the arms of a plan."""
+def _mean(seeds: Sequence[Mapping[str, Any]], key: str) -> float:
+    return float(np.mean([one[key][0] for one in seeds]))
+
+
+def _by_arm(results: Mapping[str, Mapping[str, Any]], plan: str, *wanted: str) -> dict[str, list[Mapping[str, Any]]]:
+    """Figures of every seed of the arms of a plan, among which must be those that are wanted."""
     seeds: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for name in sorted(results):
         if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{'' if plan == 'arms' else f'-plan_{plan}'}", name):
             seeds[found[1]].append(results[name]["figures"])
+    if missing := [arm for arm in wanted if arm not in seeds]:
+        raise KeyError(f"no result of {missing[0]} in {plan}.yaml")
     return dict(seeds)
 
 

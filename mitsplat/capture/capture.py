@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -135,17 +136,14 @@ class Photo:
         """Where in :meth:`picture` another thing may hide the object, (H, W) in [0, 1]; None where nothing does."""
         if self.mask is None:
             return None
-        values = self._read(self.mask, None, scale, window)
-        return np.asarray(1 - values[..., 1]) if values.ndim == 3 and values.shape[2] == 2 else None
+        with _opened(self.mask) as image:  # most masks have no transparency, and need not be read again to tell
+            if image.mode != "LA":
+                return None
+        return np.asarray(1 - self._read(self.mask, "LA", scale, window)[..., 1])
 
-    def _read(self, path: Path, mode: Literal["RGB", "L"] | None, scale: float, window: Window | None) -> Float32Array:
-        try:
-            with Image.open(path) as image:
-                pixels = image.copy() if mode is None else image.convert(mode)
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except IMAGE_ERRORS as error:
-            raise InputError(f"{path}: not a readable image ({error})") from error
+    def _read(self, path: Path, mode: Literal["RGB", "L", "LA"], scale: float, window: Window | None) -> Float32Array:
+        with _opened(path) as image:
+            pixels = image.convert(mode)
         size = (self.camera.width, self.camera.height)
         if pixels.size != size:
             raise InputError(
@@ -157,6 +155,18 @@ class Photo:
         values = np.asarray(pixels, dtype=np.float32) / np.float32(255)
         target = (max(1, round(size[0] * scale)), max(1, round(size[1] * scale)))
         return values if target == size else np.asarray(cv2.resize(values, target, interpolation=cv2.INTER_AREA))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image file; what is wrong with it is one sentence."""
+    try:
+        with Image.open(path) as image:
+            yield image
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except IMAGE_ERRORS as error:
+        raise InputError(f"{path}: not a readable image ({error})") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -227,7 +227,7 @@ def write_evaluation(
             "confusion": {"least_score": CONFIDENCE, "iou": IOU},
         },
         **{kind: _described(score) for kind, score in scores.items()},
-        "gains": {kind: round(gain, 5) for kind, gain in gains(truth, detections).items()},
+        "gains": {kind: round(gain, 5) for kind, gain in gains(truth, detections, scores["box"]).items()},
         "confusion": {"classes": [*found.class_names, "nothing"], "matrix": confusion.matrix.tolist()},
     }
     with storage_errors(out):

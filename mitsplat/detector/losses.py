@@ -11,9 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pycocotools import mask as coco_mask
 
-from mitsplat.detector.scores import IOU, Detection, DetectionMatches
+from mitsplat.detector.scores import IOU, AveragePrecision, Detection, DetectionMatches, overlaps
 
 NEAR = 0.1
 """Overlap of boxes from which a detection is one of a label of its class that fits badly."""
@@ -27,17 +26,17 @@ KINDS = {
 """Of errors, and in words."""
 
 
-def gains(truth: Mapping[str, Any], detections: Sequence[Detection]) -> dict[str, float]:
+def gains(truth: Mapping[str, Any], detections: Sequence[Detection], before: AveragePrecision) -> dict[str, float]:
     """How much the average precision of boxes (mAP50-95) would rise if one kind of error (:data:`KINDS`) were mended.
 
     Args:
         truth: What is labelled.
         detections: What was found.
+        before: Their average precision.
 
     Returns:
         Gains by kind; none if nothing is labelled.
     """
-    before = DetectionMatches(truth, detections).average_precision()
     if not before.classes:
         return {}
     found: dict[str, list[Detection]] = {kind: [] for kind in KINDS}
@@ -70,19 +69,17 @@ def _judge(seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: 
     gets the label's box.
     """
     mended: dict[str, list[Detection]] = {kind: [] for kind in KINDS if kind != "missed"}
-    overlap = np.zeros((len(seen), len(labels)))
-    if seen and labels:
-        boxes = (np.array([one["bbox"] for one in ones], dtype=np.float64) for ones in (seen, labels))
-        overlap = np.asarray(coco_mask.iou(*boxes, [int(one.get("iscrowd", 0)) for one in labels]))
+    crowds = [bool(one.get("iscrowd")) for one in labels]
+    overlap = overlaps([one["bbox"] for one in seen], [one["bbox"] for one in labels], crowds)
     classes = np.array([one["category_id"] for one in labels])
     taken: set[int] = set()
     for detection, row in zip(seen, overlap, strict=True):
-        own = np.where(classes == detection["category_id"], row, 0.0) if labels else row
+        own = np.where(classes == detection["category_id"], row, 0.0)
         free = np.where(np.isin(np.arange(len(labels)), list(taken)), 0.0, own)
         kept = dict.fromkeys(mended, detection)
         if free.max(initial=0.0) >= IOU:
             label = int(free.argmax())
-            if not labels[label].get("iscrowd"):
+            if not crowds[label]:
                 taken.add(label)
                 hit.add(int(labels[label]["id"]))
                 kept["place"] = {**detection, "bbox": labels[label]["bbox"]}
@@ -90,7 +87,7 @@ def _judge(seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: 
             pass  # another one of it, which may fit better than the first
         elif row.max(initial=0.0) >= IOU:
             label = int(row.argmax())
-            if label in taken or labels[label].get("iscrowd"):
+            if label in taken or crowds[label]:
                 del kept["another_class"]
             else:
                 kept["another_class"] = {**detection, "category_id": labels[label]["category_id"]}

@@ -172,16 +172,23 @@ def confuse(truth: Mapping[str, Any], detections: Sequence[Detection]) -> Confus
 def match_boxes(found: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]]) -> dict[int, int]:
     """Positions of boxes that were found, in their order, to those of the free labelled box that each overlaps most."""
     pairs: dict[int, int] = {}
-    if not found or not labelled:
+    if not labelled:
         return pairs
-    overlap = np.asarray(
-        coco_mask.iou(np.array(found, dtype=np.float64), np.array(labelled, dtype=np.float64), [0] * len(labelled))
-    )
-    for d, row in enumerate(overlap):
+    for d, row in enumerate(overlaps(found, labelled)):
         best = int(np.where(np.isin(np.arange(len(labelled)), list(pairs.values())), -1, row).argmax())
         if row[best] >= IOU and best not in pairs.values():
             pairs[d] = best
     return pairs
+
+
+def overlaps(
+    found: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]], crowds: Sequence[bool] | None = None
+) -> Float64Array:
+    """IoU of boxes that were found (rows) with labelled ones (columns), none of which are crowds by default."""
+    if not found or not labelled:
+        return np.zeros((len(found), len(labelled)))
+    boxes = (np.array(those, dtype=np.float64) for those in (found, labelled))
+    return np.asarray(coco_mask.iou(*boxes, [int(crowd) for crowd in crowds or [False] * len(labelled)]))
 
 
 def _coco(content: Mapping[str, Any]) -> COCO:

@@ -112,7 +112,7 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
         # Height over the support of what the ray to a cell ends at.
         above = height * (1 - surface / depth)
         photos += (np.abs(above) < OFF * scale).reshape(shape)
-    local = (points.places - support.pose[:3, 3]) @ support.pose[:3, :3]
+    local = support.local(points.places)
     standing = (local[:, 2] > OFF * scale) & (local[:, 2] < TALL * scale)
     covered = empty.holding(local[standing, :2])
     return Coverage(

@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
-from mitsplat.detector.losses import KINDS, gains
+from mitsplat.detector import average_precision
+from mitsplat.detector.losses import KINDS
+from mitsplat.detector.losses import gains as gains_over
 
 A, B = [0.0, 0.0, 10.0, 10.0], [50.0, 50.0, 20.0, 20.0]
 
@@ -26,6 +28,10 @@ def truth(*labels: tuple[int, int, list[float]], crowd: int = 0) -> dict[str, An
 
 def found(image: int, kind: int, box: list[float], score: float = 0.9) -> dict[str, Any]:
     return {"image_id": image, "category_id": kind, "bbox": box, "score": score}
+
+
+def gains(labelled: dict[str, Any], detections: list[dict[str, Any]]) -> dict[str, float]:
+    return gains_over(labelled, detections, average_precision(labelled, detections))
 
 
 TWO = truth((1, 1, A), (1, 2, B))

@@ -1,24 +1,31 @@
 """All arms and seeds of the experiment on detectors, side by side, as far as time allows.
 
     python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
-        [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
+        [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
-Datasets are rendered one after the other, and what learns from one starts when it is there. What was recorded is not
-done again; what was interrupted goes on.
+Datasets are rendered on all devices, a changed scene after the one that shows the same layouts unchanged. Arms are
+trained when what they learn from is there, in the order in which they are named, all of the first seed before the
+second, and folds of one side by side. What was recorded is not done again; what was interrupted goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from pathlib import Path
-from queue import Queue
+from typing import Any
 
-from benchmarks.detector.experiment import PLAN, VIEWS, read_arms, result_of, scenes_of, write_scene
+from benchmarks.detector.experiment import PLAN, VIEWS, folds_of, read_arms, result_of, scenes_of, write_scene
 from benchmarks.record import RESULTS
+
+IMAGES = 32
+"""For which it pays to start a process: reading the assets takes it as long as rendering some of them."""
 
 
 def main() -> None:
@@ -31,67 +38,127 @@ def main() -> None:
     parser.add_argument("--devices", nargs="+", default=["cuda:0"])
     parser.add_argument("--jobs", type=int, default=4, help="trainings at once on each device")
     parser.add_argument("--workers", type=int, default=4, help="processes of each training that read images")
-    parser.add_argument("--render-workers", type=int, default=8)
-    parser.add_argument("--render-device", default="auto")
-    parser.add_argument("--minutes", type=float, default=1e9, help="after which nothing is begun")
+    parser.add_argument("--renders", type=int, default=1, help="datasets that are rendered at once on each device")
+    parser.add_argument("--render-workers", type=int, default=8, help="processes of each, the most")
+    parser.add_argument("--minutes", type=float, default=1e9, help="after which nothing is begun and all is stopped")
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"), help="where scans are")
     options = parser.parse_args()
-    said = read_arms(options.plan)
-    arms = said["arms"]
-    chosen = options.arms or list(arms)
-    ends = time.monotonic() + 60 * options.minutes
+    plan = read_arms(options.plan)
+    arms = options.arms or list(plan["arms"])
+    todo = [
+        (arm, seed)
+        for seed in options.seeds
+        for arm in arms
+        if not (RESULTS / f"{result_of(arm, seed, options.plan)}.json").exists()
+    ]
+    free = {"render": options.devices * options.renders, "train": options.devices * options.jobs}
+    run_jobs([*renders(todo, plan, options), *trainings(todo, plan, options)], free, options)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command.
+
+    Attributes:
+        name: Of its log.
+        kind: Of which so many run on each device at once.
+        words: The command, but for the device.
+        after: Names of jobs that must have ended well.
+        hides: Whether it sees no other GPU than its own, rather than being told the number.
+        everywhere: Whether it takes all GPUs.
+    """
+
+    name: str
+    kind: str
+    words: Sequence[str]
+    after: Sequence[str] = ()
+    hides: bool = False
+    everywhere: bool = False
+
+
+def renders(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> Iterator[Job]:
+    """Datasets that some arms learn from, unchanged scenes first; whole ones on all GPUs."""
+    wanted: dict[str, list[Mapping[str, Any]]] = {}
+    for arm, _ in todo:
+        for scene in scenes_of(plan["arms"][arm]):
+            wanted.setdefault(scene, []).append(plan["arms"][arm])
+    for scene in sorted(wanted, key=lambda scene: "+" in scene):
+        unchanged, _, change = scene.partition("+")
+        frames = None
+        if all("first" in one for one in wanted[scene]):
+            frames = max(one["first"] * VIEWS // one.get("views", VIEWS) for one in wanted[scene])
+        everywhere = False
+        if module := plan.get("rendered_by", {}).get(change):
+            words = [sys.executable, "-m", f"benchmarks.detector.{module}", str(options.work), scene]
+            words += ["--hope", str(options.hope)] if module == "meshes" else []
+        else:
+            workers = options.render_workers if frames is None else max(1, frames // IMAGES)
+            words = ["mitsplat", "render", str(write_scene(options.work, scene, options.plan)), "--resume"]
+            words += ["-o", str(options.work / "data" / scene)]
+            words += ["--workers", str(min(options.render_workers, workers))]
+            words += [] if frames is None else ["--frames", str(frames)]
+            everywhere = frames is None and len(options.devices) > 1
+        after = [f"render-{unchanged}"] if change and unchanged in wanted else []
+        yield Job(f"render-{scene}", "render", words, after, hides=not everywhere, everywhere=everywhere)
+
+
+def trainings(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> Iterator[Job]:
+    """Trainings of arms for each of their folds, and what judges all of them."""
+    for arm, seed in todo:
+        words = [sys.executable, "-m", "benchmarks.detector.experiment", str(options.work), arm, str(seed)]
+        words += ["--plan", str(options.plan), "--workers", str(options.workers)]
+        words += ["--weights", str(options.weights)] if options.weights else []
+        after = [f"render-{scene}" for scene in scenes_of(plan["arms"][arm])]
+        folds = [
+            Job(f"{arm}-{seed}-{fold}", "train", [*words, "--fold", str(fold)], after)
+            for fold in range(len(folds_of(plan, arm)))
+        ]
+        yield from folds
+        yield Job(f"{arm}-{seed}", "train", words, [job.name for job in folds])
+
+
+def run_jobs(jobs: Sequence[Job], free: Mapping[str, list[str]], options: argparse.Namespace) -> None:
+    """Run what may run, in order, on devices that are free for its kind, until all is done or time is up."""
+    begun = time.monotonic()
+    ends = begun + 60 * options.minutes
     logs = options.work / "logs"
     logs.mkdir(parents=True, exist_ok=True)
-    free: Queue[str] = Queue()
-    for device in options.devices * options.jobs:
-        free.put(device)
 
-    def say(text: str) -> None:
-        print(f"{(time.monotonic() - ends) / 60 + options.minutes:5.1f} min  {text}", flush=True)
-
-    def command(name: str, words: list[str]) -> bool:
-        with (logs / f"{name}.log").open("w") as log:
+    def run(job: Job, device: str) -> tuple[Job, str, bool]:
+        kind, _, number = device.partition(":")
+        environment = os.environ | ({"CUDA_VISIBLE_DEVICES": number} if number and job.hides else {})
+        words = [*job.words, "--device", "cuda:all" if job.everywhere else kind if job.hides else device]
+        log = logs / f"{job.name}.log"
+        with log.open("w") as file:
             limit = max(ends - time.monotonic(), 1)
             try:
-                status = subprocess.run(words, stdout=log, stderr=log, timeout=limit).returncode
+                status = subprocess.run(words, stdout=file, stderr=file, timeout=limit, env=environment).returncode
             except subprocess.TimeoutExpired:
                 status = -1
-        last = (logs / f"{name}.log").read_text().strip().splitlines()[-1:] or [""]
-        say(f"{name}: {last[0] if status == 0 else f'status {status}: {last[0]}'}")
-        return status == 0
+        last = (log.read_text().strip().splitlines() or [""])[-1]
+        print(
+            f"{(time.monotonic() - begun) / 60:5.1f} min  {job.name}: {f'status {status}: ' if status else ''}{last}",
+            flush=True,
+        )
+        return job, device, status == 0
 
-    def train(arm: str, seed: int) -> None:
-        if (RESULTS / f"{result_of(arm, seed, options.plan)}.json").exists() or time.monotonic() > ends:
-            return
-        device = free.get()
-        try:
-            words = [sys.executable, "-m", "benchmarks.detector.experiment", str(options.work), arm, str(seed)]
-            words += ["--plan", str(options.plan), "--device", device, "--workers", str(options.workers)]
-            command(f"{arm}-{seed}", words + (["--weights", str(options.weights)] if options.weights else []))
-        finally:
-            free.put(device)
-
-    rendered: set[str] = set()
-    with ThreadPoolExecutor(len(options.devices) * options.jobs) as pool:
-        for arm in sorted(chosen, key=lambda arm: "scenes" in arms[arm]):
-            for scene in scenes_of(arms[arm]):
-                if scene in rendered or time.monotonic() > ends:
-                    continue
-                rendered.add(scene)
-                words = ["mitsplat", "render", str(write_scene(options.work, scene, options.plan))]
-                words += ["-o", str(options.work / "data" / scene), "--resume"]
-                words += ["--workers", str(options.render_workers)]
-                learning = [arms[name] for name in chosen if scene in scenes_of(arms[name])]
-                if all("first" in one for one in learning):
-                    count = max(one["first"] * VIEWS // one.get("views", VIEWS) for one in learning)
-                    words += ["--frames", str(count)]
-                if module := said.get("rendered_by", {}).get(arms[arm].get("change")):
-                    words = [sys.executable, "-m", f"benchmarks.detector.{module}", str(options.work), scene]
-                    words += ["--hope", str(options.hope)] if module == "meshes" else []
-                command(f"render-{scene}", [*words, "--device", options.render_device])
-            for seed in options.seeds:
-                pool.submit(train, arm, seed)
+    left, running, done = list(jobs), set[Future[tuple[Job, str, bool]]](), set[str]()
+    with ThreadPoolExecutor(sum(map(len, free.values())) or 1) as pool:
+        while running or left:
+            for job in list(left):
+                if time.monotonic() < ends and free[job.kind] and done.issuperset(job.after):
+                    left.remove(job)
+                    running.add(pool.submit(run, job, free[job.kind].pop(0)))
+            if not running:
+                names = ", ".join(job.name for job in left)
+                print(f"not done, as time is up or what they need is not there: {names}", flush=True)
+                break
+            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            for job, device, well in (future.result() for future in ended):
+                free[job.kind].append(device)
+                if well:
+                    done.add(job.name)
 
 
 main()

@@ -1,6 +1,7 @@
 """One arm of the experiment on detectors, with one seed: rendered, trained, and judged on photographs.
 
     python -m benchmarks.detector.experiment WORK ARM SEED [--plan workshop.yaml] [--device cuda:0] [--weights FILE.pt]
+        [--fold 0]
     python -m benchmarks.detector WORK                  # all arms and seeds, side by side
 
 WORK is what ``benchmarks.detector.material`` made, and arms stand in ``arms.yaml``; or, with ``--plan workshop.yaml``,
@@ -28,6 +29,7 @@ from ruamel.yaml import YAML
 from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
 from mitsplat.detector.losses import gains
+from mitsplat.detector.training import Run
 
 HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")
@@ -77,6 +79,12 @@ def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
     return path
 
 
+def folds_of(plan: Mapping[str, Any], arm: str) -> list[set[int]]:
+    """Scenes of photographs that each training of an arm is judged on: all, if it learns from none."""
+    folds = [set(fold) for fold in plan["folds"]]
+    return folds if plan["arms"][arm].get("real") else [set().union(*folds)]
+
+
 def scene_of(image: str) -> int:
     """The scene that a photograph shows, by its name."""
     found = re.search(r"scene_(\d+)_", image)
@@ -99,7 +107,9 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
         for image in labels["images"]:
             if not (folder / image["file_name"]).exists():
                 shutil.copy(work / "photos" / image["file_name"], folder)
-        (folder / "labels.json").write_text(json.dumps(labels))
+        # Another training may be reading them.
+        (folder / ".labels.json").write_text(json.dumps(labels))
+        (folder / ".labels.json").replace(folder / "labels.json")
     return folder
 
 
@@ -149,20 +159,24 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="to start from; random ones if absent")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--workers", type=int, default=4)
+    parser.add_argument("--fold", type=int, help="only train for this one, so that they can be trained side by side")
     options = parser.parse_args()
-    with recording("detector.experiment", parser, options, ignore=("work", "device", "workers", "weights"), gpu=True):
+    if options.fold is not None:
+        trained = train_fold(options, read_arms(options.plan), options.fold)
+        print(f"{options.arm} {options.seed}: fold {options.fold} in {trained.record['finished']['seconds']:.0f} s")
+        return
+    ignore = ("work", "device", "workers", "weights", "fold")
+    with recording("detector.experiment", parser, options, ignore=ignore, gpu=True):
         measure(options)
 
 
-def measure(options: argparse.Namespace) -> None:
-    """Train what the arm says, and judge it."""
-    plan = read_arms(options.plan)
+def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int) -> Run:
+    """Train an arm on what it renders, and on photographs of other folds."""
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
     if some := {key: arm[key] for key in ("images", "first", "views") if key in arm}:
         rendered = [listed(rendered, work / "listed" / f"{options.arm}-{options.seed}", **some)]
-    learns_photographs = arm.get("real", False)
     settings = TrainSettings(
         **(plan["train"] | arm.get("train", {})),
         weights=options.weights,
@@ -170,18 +184,26 @@ def measure(options: argparse.Namespace) -> None:
         device=options.device,
         workers=options.workers,
     )
-    folds = [set(fold) for fold in plan["folds"]]
+    real = None
+    if arm.get("real"):
+        folds = folds_of(plan, options.arm)
+        real = photographs(work, set().union(*folds) - folds[number], f"without_fold_{number}")
+    run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
+    # Without rendered images photographs are what is learnt, not what is mixed in.
+    return train_detector(rendered or [real], run, settings, real=real if rendered else None)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Train what the arm says for all folds, and judge it."""
+    plan, work = read_arms(options.plan), options.work
+    folds = folds_of(plan, options.arm)
     everything = photographs(work, set().union(*folds), "all_photos")
+    size = plan["arms"][options.arm].get("test_size", plan["test_size"])
     detections, truth = [], {}
-    for number, fold in enumerate(folds if learns_photographs else [set().union(*folds)]):
-        real = photographs(work, set().union(*folds) - fold, f"without_fold_{number}") if learns_photographs else None
-        run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
-        # Without rendered images photographs are what is learnt, not what is mixed in.
-        trained = train_detector(rendered or [real], run, settings, real=real if rendered else None)
+    for number, fold in enumerate(folds):
+        trained = train_fold(options, plan, number)
         figure(trained.record["finished"]["seconds"], "s", "training", number)
-        found = evaluate_detector(
-            run, everything, split="all", size=arm.get("test_size", plan["test_size"]), device=options.device
-        )
+        found = evaluate_detector(trained.path, everything, split="all", size=size, device=options.device)
         truth = json.loads((found.path / "truth.json").read_text())
         judged = {image["id"] for image in truth["images"] if scene_of(image["file_name"]) in fold}
         detections += [

@@ -10,14 +10,20 @@ assets, and ``photos/``, a COCO folder. What is there already is kept, so that i
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
+# isort: off
+import mitsplat  # noqa: F401  # which must come before Dr.Jit
+
+import drjit as dr
 import trimesh
 
+# isort: on
 from benchmarks.detector.packages import make_package, relabel, shape_of
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
@@ -59,6 +65,11 @@ def bake(
     notes = "".join(f"; {warning}" for warning in result.warnings)
     print(f"{out.name}: {len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB{notes}", flush=True)
     return result.psnr
+
+
+def share_cores(processes: int) -> None:
+    """Leave Dr.Jit, which has a thread for every core, those of one of so many processes."""
+    dr.set_thread_count(max(1, (os.cpu_count() or 1) // processes))
 
 
 def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.Trimesh:
@@ -129,7 +140,7 @@ def make(options: argparse.Namespace) -> None:
     wanted = wanted_assets(options.hope, options.work, options.packages)
     wanted = [one for one in wanted if not (one.out / "asset.yaml").exists()]
     # Not an executor of concurrent.futures: with processes of so many tasks it waits for ever once all have ended.
-    with get_context("spawn").Pool(options.jobs, maxtasksperchild=8) as pool:
+    with get_context("spawn").Pool(options.jobs, share_cores, (options.jobs,), maxtasksperchild=8) as pool:
         baked = [pool.apply_async(one.bake, (options.gaussians, options.device)) for one in wanted]
         for one, psnr in zip(wanted, baked, strict=True):
             figure(psnr.get(), "dB", one.out.name)

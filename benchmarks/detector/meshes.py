@@ -38,14 +38,11 @@ from mitsplat.render.path_tracing import render_mesh
 from mitsplat.scene.appearance import Appearance, draw_appearances
 from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.scene import Scene, layout_of
-from mitsplat.spec.lights import EnvironmentLight, LightSpec
 from mitsplat.spec.spec import BACKDROP
 from mitsplat.spherical_harmonics import SH_C0
 
 LEAST = 500
 """Pixels where no object is by which a picture's brightness is told."""
-CEILING = 2.05
-"""Height of that of ``groceries.yaml`` [m]."""
 
 
 def main() -> None:
@@ -81,7 +78,7 @@ def frames(scene: Scene, parts: Mapping[str, tuple[Part, ...]], indices: range, 
             frame, start = renderer.render(index, layout=layout), time.process_time()
             described = renderer.describe(layout, frame.plan.lights)
             room = {name: described[name] for name in described if _stands(scene, name)}
-            room |= {f"light_{k}": emitter_dict(light) for k, light in enumerate(frame.plan.lights) if _shines(light)}
+            room |= {f"light_{k}": emitter_dict(light) for k, light in enumerate(frame.plan.lights)}
             radiance, cover = render_mesh(
                 ray_scene({**room, **objects}), frame.camera, samples=samples, bounces=6, seed=index
             )
@@ -104,11 +101,6 @@ def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scen
         seed=frame.plan.seed,
         metered=composite.exposure == "auto",
     )
-
-
-def _shines(light: LightSpec) -> bool:
-    """Whether a light is below the ceiling, which hides others from the splat renderer."""
-    return isinstance(light, EnvironmentLight) or light.position[2] < CEILING
 
 
 def _stands(scene: Scene, name: str) -> bool:

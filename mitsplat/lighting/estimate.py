@@ -255,16 +255,23 @@ def light_lines(estimate: LightEstimate, image: str) -> str:
     for lamp in estimate.lamps:
         position = np.array(settings.around) + settings.distance * lamp.direction
         width, height = settings.distance * np.array(lamp.extents)
-        lines.append(
-            f"  - {{kind: area, position: {list_of(position)}, target: {list_of(settings.around)}, "
-            f"size: {list_of((width, height))}, {radiance_keys(lamp.radiance)}}}"
-        )
+        lines.append(area_line(position, settings.around, (width, height), lamp.radiance))
     if settings.rest == "constant":
         lines.append(f"  - {{kind: environment, {radiance_keys(estimate.ambient / np.pi)}}}")
     else:
         turn = f", rotate_z: {settings.rotate_z:g}" if settings.rotate_z else ""
         lines.append(f"  - {{kind: environment, image: {json.dumps(image, ensure_ascii=False)}{turn}}}")
     return "\n".join(lines) + "\n"
+
+
+def area_line(
+    position: Float64Array, target: Sequence[float] | Float64Array, size: tuple[float, float], radiance: Float64Array
+) -> str:
+    """One of the entries of ``lights``."""
+    return (
+        f"  - {{kind: area, position: {list_of(position)}, target: {list_of(target)}, "
+        f"size: {list_of(size)}, {radiance_keys(radiance)}}}"
+    )
 
 
 def radiance_keys(rgb: Float64Array) -> str:

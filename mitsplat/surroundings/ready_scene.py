@@ -9,7 +9,7 @@ import numpy as np
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.colour import LUMINANCE
-from mitsplat.lighting.estimate import list_of, radiance_keys
+from mitsplat.lighting.estimate import area_line, radiance_keys
 from mitsplat.surroundings.shading import ShadingLight
 from mitsplat.surroundings.supports import Support
 
@@ -78,10 +78,7 @@ def _lights(light: ShadingLight, support: Support) -> str:
         away = float(np.linalg.norm(lamp.position))
         radiance = white * lamp.irradiance * away**3 / (lamp.size**2 * lamp.position[2])
         place = support.pose[:3, :3] @ lamp.position + support.pose[:3, 3]
-        lines.append(
-            f"  - {{kind: area, position: {list_of(place.round(3))}, target: {list_of(middle)}, "
-            f"size: {list_of((lamp.size, lamp.size))}, {radiance_keys(radiance)}}}"
-        )
+        lines.append(area_line(place.round(3), middle, (lamp.size, lamp.size), radiance))
     lines.append(f"  - {{kind: environment, {radiance_keys(white / np.pi * light.ambient)}}}")
     return "\n".join(lines)
 

@@ -19,6 +19,7 @@ from scipy.stats import qmc
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.colour import LUMINANCE
+from mitsplat.lighting.lamps import rectangle_axes
 
 _DISTANCES = (1.0, 1.5, 2.2, 3.3)
 """From the middle to candidates [m]."""
@@ -231,13 +232,8 @@ class _Surface:
         """Points of a square that faces the middle, relative to its own, (P, 3)."""
         if size == 0:
             return np.zeros((1, 3))
-        across = (
-            np.cross([0.0, 0.0, 1.0], place) if abs(place[2]) < 0.999 * np.linalg.norm(place) else np.array([1.0, 0, 0])
-        )
-        across = across / np.linalg.norm(across)
-        along = np.cross(place, across) / np.linalg.norm(place)
         flat = size * (qmc.Sobol(2, seed=1).random(_POINTS) - 0.5)
-        return np.asarray(flat @ np.stack([across, along]))
+        return np.asarray(flat @ rectangle_axes(place / np.linalg.norm(place)))
 
     def improved(
         self, columns: Sequence[Float64Array], place: Float64Array, size: float = _SIZES[1]

@@ -73,12 +73,11 @@ def photograph(
     found = by_name(views, suffix)
     sensors = Sensors()
 
-    def exposed() -> Iterator[tuple[Path, np.ndarray, np.ndarray]]:
+    def exposed() -> Iterator[tuple[Path, np.ndarray, np.ndarray, np.ndarray]]:
         for number, (name, camera) in enumerate(found.items()):
             radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
-            if gains is not None:
-                radiance = radiance * gains[number]
-            yield folder / name, radiance, rng.normal(0, noise, radiance.shape)
+            gain = np.ones(3, dtype=np.float32) if gains is None else gains[number]
+            yield folder / name, radiance, gain, rng.normal(0, noise, radiance.shape)
 
     # Large ones take longer to encode than a GPU does to trace them.
     with ThreadPoolExecutor(usable_cores()) as threads:
@@ -86,10 +85,10 @@ def photograph(
     return found
 
 
-def develop(file: Path, radiance: np.ndarray, noise: np.ndarray) -> None:
-    """Write a photo of light (H, W, 3) with noise in display-encoded values."""
+def develop(file: Path, radiance: np.ndarray, gain: np.ndarray, noise: np.ndarray) -> None:
+    """Write a photo of light (H, W, 3), times a gain for each channel, with noise in display-encoded values."""
     # A path that grazes an edge may end in no number.
-    noisy = np.nan_to_num(np.clip(radiance, 0, 1)) ** (1 / 2.2) + noise
+    noisy = np.nan_to_num(np.clip(radiance * gain, 0, 1)) ** (1 / 2.2) + noise
     Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(file, quality=95)
 
 

@@ -155,14 +155,14 @@ def revision(folder: Path = ROOT) -> dict[str, Any]:
 
 
 def machine(gpu: bool) -> dict[str, Any]:
-    """Processor, its cores, memory [GiB], and the GPU where one is used."""
+    """Processor, those of its cores that this process may run on, memory [GiB], and the GPU where one is used."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     return {
         "processor": names[0] if names else "unknown",
-        "cores": os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "memory_gib": round(memory),
         "gpu": _gpu() if gpu else None,
     }

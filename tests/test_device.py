@@ -1,6 +1,8 @@
 """Devices by their names: what is refused, what ``auto`` chooses, and which GPU a process takes."""
 
 import os
+import subprocess
+import sys
 import uuid
 
 import mitsuba as mi
@@ -216,3 +218,10 @@ def test_the_variant_follows(monkeypatch):
     monkeypatch.setattr(devices.mi, "variant", lambda: "cuda_ad_rgb")
     monkeypatch.setattr(devices, "visible_gpus", lambda: (devices.Gpu("One", 1, 0, "", ""),))
     assert str(current_device()) == "cuda (One)"
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="nothing to restrict processes by")
+def test_cores_are_those_that_a_process_may_run_on() -> None:
+    restrict = "import os\nos.sched_setaffinity(0, [min(os.sched_getaffinity(0))])\n"
+    script = f"{restrict}from mitsplat.cores import usable_cores\nprint(usable_cores())"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "1\n"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from mitsplat.camera import Camera
+from mitsplat.cores import usable_cores
 from mitsplat.render.layers import ensure_variant
 
 
@@ -36,9 +38,9 @@ class Sensors:
         return self._made[key]
 
 
-def by_name(views: Sequence[Camera]) -> dict[str, Camera]:
+def by_name(views: Sequence[Camera], suffix: str = ".png") -> dict[str, Camera]:
     """Cameras by the names of their photos."""
-    return {f"photo{number:02}.png": camera for number, camera in enumerate(views)}
+    return {f"photo{number:02}{suffix}": camera for number, camera in enumerate(views)}
 
 
 def photograph(
@@ -49,6 +51,7 @@ def photograph(
     samples: int,
     noise: float = 0.01,
     gains: np.ndarray | None = None,
+    suffix: str = ".png",
 ) -> dict[str, Camera]:
     """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files.
 
@@ -59,6 +62,7 @@ def photograph(
         samples: Paths per pixel.
         noise: Standard deviation in display-encoded values.
         gains: Of each photo and channel, shape (N, 3), that its light is multiplied by.
+        suffix: Of the files.
     """
     from mitsplat.plugins.device import ray_scene
 
@@ -66,16 +70,26 @@ def photograph(
     folder.mkdir(parents=True, exist_ok=True)
     loaded = ray_scene(scene)
     rng = np.random.default_rng(0)
-    found = by_name(views)
+    found = by_name(views, suffix)
     sensors = Sensors()
-    for number, (name, camera) in enumerate(found.items()):
-        radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
-        if gains is not None:
-            radiance = radiance * gains[number]
-        # A path that grazes an edge may end in no number.
-        noisy = np.nan_to_num(np.clip(radiance, 0, 1)) ** (1 / 2.2) + rng.normal(0, noise, radiance.shape)
-        Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(folder / name)
+
+    def exposed() -> Iterator[tuple[Path, np.ndarray, np.ndarray, np.ndarray]]:
+        for number, (name, camera) in enumerate(found.items()):
+            radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
+            gain = np.ones(3, dtype=np.float32) if gains is None else gains[number]
+            yield folder / name, radiance, gain, rng.normal(0, noise, radiance.shape)
+
+    # Large ones take longer to encode than a GPU does to trace them.
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        list(threads.map(lambda photo: develop(*photo), exposed()))
     return found
+
+
+def develop(file: Path, radiance: np.ndarray, gain: np.ndarray, noise: np.ndarray) -> None:
+    """Write a photo of light (H, W, 3), times a gain for each channel, with noise in display-encoded values."""
+    # A path that grazes an edge may end in no number.
+    noisy = np.nan_to_num(np.clip(radiance * gain, 0, 1)) ** (1 / 2.2) + noise
+    Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(file, quality=95)
 
 
 def show_where(scene: Mapping[str, Any], thing: str, views: Sequence[Camera], folder: Path, finer: int = 3) -> None:

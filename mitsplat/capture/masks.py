@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo, mask_name
 from mitsplat.capture.photos import Prepared
+from mitsplat.cores import usable_cores
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.files import IMAGE_ERRORS, write_file
 from mitsplat.progress import Progress
@@ -76,6 +78,7 @@ def add_masks(
     progress: Progress | None = None,
     points: Float64Array | None = None,
     hidden: Hidden = _NOTHING,
+    threads: int = 1,
 ) -> Capture:
     """The capture with a mask for each photo; photos whose mask is unusable are rejected.
 
@@ -86,20 +89,29 @@ def add_masks(
         progress: Told the photos done.
         points: Points known to be of the object, shape (N, 3), that masks must cover.
         hidden: Where other things may hide the object.
+        threads: How many masks are made at a time.
     """
     photos, rejected = [], dict(capture.rejected)
-    for done, photo in enumerate(capture.photos, start=1):
+
+    def cut(photo: Photo) -> str | None:
+        """Write the mask of a photo, or say why it is unusable."""
         mask, unknown = make(photo), hidden.get(photo.name)
         mask = mask if unknown is None else mask & ~unknown
         reason = _fault(mask, photo.camera, points, unknown)
         if reason is None:
-            file = folder / mask_name(photo.name)
-            write_file(file, partial(_save, mask, unknown))
-            photos.append(replace(photo, mask=file))
-        else:
-            rejected[photo.name] = reason
-        if progress is not None:
-            progress(done, len(capture.photos), "cutting out")
+            write_file(folder / mask_name(photo.name), partial(_save, mask, unknown))
+        return reason
+
+    with ThreadPoolExecutor(threads) as pool:
+        for done, (photo, reason) in enumerate(
+            zip(capture.photos, pool.map(cut, capture.photos), strict=True), start=1
+        ):
+            if reason is None:
+                photos.append(replace(photo, mask=folder / mask_name(photo.name)))
+            else:
+                rejected[photo.name] = reason
+            if progress is not None:
+                progress(done, len(capture.photos), "cutting out")
     return replace(capture, photos=tuple(photos), rejected=rejected)
 
 
@@ -124,7 +136,9 @@ def object_masks(
         hidden: Where other things may hide the object: there masks show nothing, and are transparent.
         progress: Told the photos done.
     """
-    add = partial(add_masks, capture, folder=folder, progress=progress, points=above, hidden=hidden)
+    add = partial(
+        add_masks, capture, folder=folder, progress=progress, points=above, hidden=hidden, threads=usable_cores()
+    )
     masked = add(geometric_masks(points, bare, hidden))
     if len(masked.photos) < _FEWEST:
         return masked
@@ -350,7 +364,7 @@ def _cut(
     part = np.ascontiguousarray(trimap[box])
     found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
     if found.any() and not found.all():
-        cv2.setRNGSeed(0)
+        cv2.setRNGSeed(0)  # of this thread
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
         found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture.capture import Photo, stored_name
+from mitsplat.cores import usable_cores
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, write_file
 from mitsplat.progress import Progress
@@ -91,7 +91,7 @@ def prepare_photos(
     out.mkdir(parents=True, exist_ok=True)
     judged: list[_Judged] = []
     rejected: dict[str, str] = {}
-    with ThreadPoolExecutor(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         results = pool.map(partial(_prepare, folder=folder, out=out, max_size=max_size, upright=upright), files)
         for done, (file, result) in enumerate(zip(files, results, strict=True), start=1):
             if isinstance(result, str):

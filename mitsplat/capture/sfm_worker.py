@@ -24,6 +24,8 @@ zlib.compress(b"before pycolmap")
 import numpy as np  # noqa: E402
 import pycolmap  # noqa: E402
 
+from mitsplat.cores import usable_cores  # noqa: E402
+
 SEED = 1
 SEQUENTIAL_OVERLAP = 10
 MAX_SAMPSON = 4.0
@@ -86,7 +88,9 @@ def run(job: dict[str, Any], folder: Path) -> None:
 
 def say(folder: Path, doing: str) -> None:
     """Leave word of the stage reached."""
-    (folder / "status").write_text(doing)
+    part = folder / "status.part"
+    part.write_text(doing)
+    part.replace(folder / "status")  # at once, as it is read at any time
 
 
 def number(job: dict[str, Any], images: Path, database: Path) -> None:
@@ -113,6 +117,7 @@ def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> 
     say(folder, "finding features")
     number(job, images, database)
     options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = usable_cores()  # COLMAP counts those of the machine, and each takes the memory of a photo
     options.sift.max_num_features = job["features"]
     options.sift.first_octave = job["first_octave"]
     for names in job["groups"]:
@@ -129,20 +134,18 @@ def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> 
 def match(job: dict[str, Any], database: Path, folder: Path) -> None:
     """Verified matches of the pairs that have none yet."""
     say(folder, "matching")
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = usable_cores()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     if job["matching"] == "sequential":
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap = SEQUENTIAL_OVERLAP
-        pycolmap.match_sequential(
-            database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
-        )
+        pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
     else:
         blocks = pycolmap.ExhaustivePairingOptions()
         blocks.block_size = BLOCK
-        pycolmap.match_exhaustive(
-            database, pairing_options=blocks, verification_options=verification, device=pycolmap.Device.cpu
-        )
+        pycolmap.match_exhaustive(database, matching, blocks, verification, device=pycolmap.Device.cpu)
 
 
 def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list[pycolmap.Reconstruction]:

@@ -270,7 +270,7 @@ def _reached(job: Mapping[str, Any], folder: Path) -> tuple[int, int, str]:
         near = photos if job["matching"] == "exhaustive" else 18  # overlap 10 and powers of two up to 512
         pairs = sum(min(place, near) for place in range(photos))
         return min(_rows(folder / "database.db", "two_view_geometries"), pairs), pairs, stage
-    return min(int(count), photos), photos, stage
+    return min(int(count), photos), photos, stage or "starting COLMAP"
 
 
 def _rows(database: Path, table: str) -> int:

@@ -125,17 +125,28 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
 
 
 @contextmanager
-def stage_bar() -> Iterator[Progress]:
-    """A bar on stderr with the time left where that is a terminal, else a line for every stage."""
+def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
+    """A bar on stderr with the time left where that is a terminal, else a line for every stage, and one a minute in it.
+
+    What follows a colon in what is being done is of the moment, and no other stage. Lines within one tell what time is
+    left.
+    """
     if sys.stderr.isatty():
-        with progress_bar("%/s") as bar:
+        with progress_bar(unit) as bar:
             yield bar
         return
-    told: list[str] = []
+    stage, begun, told, first = "", 0.0, 0.0, 0
 
     def tell(done: int, total: int, doing: str) -> None:
-        if told[-1:] != [doing]:
-            told.append(doing)
-            typer.echo(f"{100 * done // total:3d} %: {doing}", err=True)
+        nonlocal stage, begun, told, first
+        now, left = time.monotonic(), ""
+        if doing.partition(":")[0] != stage:
+            stage, begun, first = doing.partition(":")[0], now, done
+        elif now - told >= 60 and done > first:
+            left = f", {(now - begun) * (total - done) / (done - first):.0f} s left"
+        else:
+            return
+        told = now
+        typer.echo(f"{100 * done // total:3d} %: {doing}{left}", err=True)
 
     yield tell

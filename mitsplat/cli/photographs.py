@@ -22,6 +22,7 @@ from mitsplat.cli.options import (
     Seed,
     ShDegree,
     progress_bar,
+    stage_bar,
     take_device,
 )
 from mitsplat.errors import InputError, PartialResultError
@@ -165,11 +166,15 @@ def fit(
     if depth_model is not None:
         with progress_bar("photos/s") as show:
             maps = model_maps(loaded.training, depth_model, out / "depths", depth_kind, progress=show)
-    with progress_bar("steps/s") as show:
+    with stage_bar("steps/s") as show:
 
         def progress(now: FitProgress) -> None:
             checked = "" if now.validation is None else f" ({now.validation:.1f} set aside)"
-            show(int(now.fraction * iterations), iterations, f"{now.psnr:.1f} dB{checked}, {now.gaussians} Gaussians")
+            show(
+                int(now.fraction * iterations),
+                iterations,
+                f"fitting: {now.psnr:.1f} dB{checked}, {now.gaussians} Gaussians",
+            )
 
         result = fit_capture(loaded, out, settings, depths=maps, overwrite=overwrite, progress=progress)
     for warning in result.warnings:
@@ -225,7 +230,7 @@ def capture(
         metric=metric,
         undistorted=undistort,
     )
-    with progress_bar("steps/s") as progress:
+    with stage_bar("steps/s") as progress:
         result = capture_photos(photos, out, settings, progress=progress)
     found, video = result.capture, result.video
     if video is not None:
@@ -318,7 +323,7 @@ def mesh(
         delight=delight,
     )
     take_device(device)
-    with progress_bar("steps") as progress:
+    with stage_bar("steps/s") as progress:
         make = make_asset if kind == "object" else make_surroundings
         done = make(capture, splats, out, job, progress=progress)
     _tell_asset(done)
@@ -381,7 +386,7 @@ def asset(
         delight=delight,
     )
     take_device(device)
-    with progress_bar("steps") as progress:
+    with stage_bar("steps/s") as progress:
         done = make(
             photos,
             out,

@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
+from mitsplat.cores import usable_cores
 from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
 from mitsplat.engine.mps import MOST_CLIENTS, SharedGpu
 from mitsplat.engine.resources import TYPICAL, WorkerMemory, unused_memory
@@ -221,8 +222,7 @@ def run_apart(make: MakeFrame[Result], device: Device | None = None) -> Generato
 
 def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:
     """Most worker processes that this machine has cores and unused memory for, and its GPUs memory, at least 1."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    most = min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own))
+    most = min(usable_cores(), int((unused_memory() * 2**30 - memory.shared) / memory.own))
     if device is not None and device.gpus:
         held = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
         most = min(most, len(device.gpus) * min(held, MOST_CLIENTS))

@@ -7,7 +7,6 @@ see :mod:`mitsplat.fit.folder`.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
 from mitsplat.content_hash import ContentHash
+from mitsplat.cores import usable_cores
 from mitsplat.errors import InputError
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
 from mitsplat.fit.folder import FitFolder, FitResult
@@ -249,7 +249,7 @@ class _Fit:
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        with ThreadPoolExecutor(min(_READERS, os.cpu_count() or 1)) as threads:
+        with ThreadPoolExecutor(min(_READERS, usable_cores())) as threads:
             cut = settings.crop and settings.masks == "alpha" and all(photo.mask is not None for photo in training)
             windows = object_windows(training) if cut else [None] * len(training)
             self.photos = list(

@@ -15,6 +15,7 @@ from mitsplat.boards.targets import Board
 from mitsplat.capture import pipeline as capturing
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.cli.options import stage_bar
 from mitsplat.errors import InputError
 from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
@@ -191,3 +192,19 @@ def test_asset_passes_every_option_on(
         kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
     )
     assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4, masks=masks)
+
+
+def test_a_log_tells_stages_and_the_time_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nobody sees a bar."""
+    clock = iter([0.0, 5.0, 70.0, 80.0, 90.0])
+    monkeypatch.setattr("mitsplat.cli.options.time.monotonic", lambda: next(clock))
+    with stage_bar() as progress:
+        progress(0, 10, "matching")
+        progress(1, 10, "matching")
+        progress(5, 10, "matching")
+        progress(1, 4, "fitting: 20.0 dB")
+        progress(2, 4, "fitting: 21.0 dB")
+    told = capsys.readouterr().err.splitlines()
+    assert told == ["  0 %: matching", " 50 %: matching, 70 s left", " 25 %: fitting: 20.0 dB"]

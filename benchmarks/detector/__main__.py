@@ -161,4 +161,5 @@ def run_jobs(jobs: Sequence[Job], free: Mapping[str, list[str]], options: argpar
                     done.add(job.name)
 
 
-main()
+if __name__ == "__main__":
+    main()

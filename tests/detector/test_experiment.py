@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +18,7 @@ import trimesh
 from ruamel.yaml import YAML
 
 from benchmarks import record
+from benchmarks.detector import __main__ as side_by_side
 from benchmarks.detector import experiment, workshop
 from benchmarks.detector.packages import make_package, relabel
 from mitsplat.spec.spec import SceneSpec
@@ -71,7 +74,7 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
     def train(datasets: list[Path], run: Path, settings: Any, real: Path | None) -> Any:
         learnt = datasets + ([real] if real else [])
         seen[str(run)] = {path.name for folder in learnt for path in folder.glob("*.jpg")}
-        return SimpleNamespace(record={"finished": {"seconds": 1.0}})
+        return SimpleNamespace(path=run, record={"finished": {"seconds": 1.0}})
 
     def evaluate(run: Path, data: Path, **_: Any) -> Any:
         truth = json.loads((data / "labels.json").read_text())
@@ -95,11 +98,51 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
     )
     experiment.measure(options)
     figures = {name: value for name, (value, _) in record._open[0].items()}
-    assert len(seen) == (1 if arm == "synthetic" else 2)
-    assert all(len(names) in (0, 4, 6) for names in seen.values())
+    assert len(seen) == (1 if arm == "synthetic" else 5)
+    assert all(len(names) == (0 if arm == "synthetic" else 8) for names in seen.values())
     assert figures["map50_95"] == pytest.approx(1.0 if arm != "synthetic" else 0.9, abs=0.01)
     assert (figures["scene.1"], figures["scene.0"] < 1) == (pytest.approx(1.0), arm == "synthetic")
     assert len(figures["samples"]) == experiment.SAMPLES
+
+
+def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):
+    plan = experiment.read_arms()
+    options = argparse.Namespace(work=work, plan=experiment.PLAN, workers=2, weights=None, hope=tmp_path)
+    options.devices, options.render_workers = ["cuda:0", "cuda:1"], 8
+    todo = [("hybrid", 0), ("no_shadow", 0)]
+    renders = {job.name: job for job in side_by_side.renders(todo, plan, options)}
+    whole, changed = renders["render-table"], renders["render-table+no_shadow"]
+    assert whole.everywhere and "--frames" not in whole.words and not changed.everywhere
+    assert changed.after == ["render-table"] and changed.words[changed.words.index("--frames") + 1] == "128"
+    trainings = {job.name: job for job in side_by_side.trainings(todo, plan, options)}
+    assert set(trainings["hybrid-0"].after) == {f"hybrid-0-{fold}" for fold in range(5)}
+    assert set(trainings["hybrid-0-4"].after) == {f"render-{name}" for name in plan["arms"]["hybrid"]["scenes"]}
+    assert trainings["no_shadow-0"].after == ["no_shadow-0-0"]
+
+
+def test_jobs_run_in_order_on_free_devices_after_what_they_need(tmp_path, capsys):
+    def job(name: str, then: str, after: Sequence[str] = ()) -> side_by_side.Job:
+        code = f"import os, sys; print(sys.argv[2], os.environ.get('CUDA_VISIBLE_DEVICES')); {then}"
+        return side_by_side.Job(name, "train", [sys.executable, "-c", code], after, hides=name == "shy")
+
+    jobs = [
+        job("late", "pass", ["early"]),
+        job("lost", "pass", ["wrong"]),
+        job("early", "pass"),
+        job("shy", "pass"),
+        job("wrong", "raise SystemExit('no such thing')"),
+    ]
+    free = {"train": ["cuda:1"], "render": []}
+    side_by_side.run_jobs(jobs, free, argparse.Namespace(work=tmp_path, minutes=5))
+    said = [line.split("min  ")[-1] for line in capsys.readouterr().out.splitlines()]
+    assert said == [
+        "early: cuda:1 None",
+        "late: cuda:1 None",
+        "shy: cuda 1",
+        "wrong: status 1: no such thing",
+        "not done, as time is up or what they need is not there: lost",
+    ]
+    assert free["train"] == ["cuda:1"]
 
 
 def test_photographs_of_parts_are_labelled_by_what_is_seen(tmp_path, physics, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -38,6 +39,8 @@ _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
 # Simulations of which the remains may pile up. Newton leaves the model of each, a MiB and more, in reference cycles,
 # which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
 _GARBAGE = 24
+CROWDED = "no room for all"
+_CROWD = 0.1  # share of the objects that are left out at a time where they find no room beside one another
 _POURED = 1.0  # speed of objects that are poured in piles [m/s]: faster, light ones are flung out by heavy ones
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
 
@@ -131,10 +134,10 @@ class Drop:
         """Draw poses until a layout holds.
 
         After ``settle.attempts`` draws what was at fault in all of them is left out, or else what was most often, and
-        the others are drawn anew.
+        the others are drawn anew. Where objects find no room beside one another, the last of them are left out.
 
         Raises:
-            InputError: If objects find no room, though each of them would alone.
+            InputError: If not even half of the objects find room, though each of them would alone.
             NothingRests: If no draw holds, of however few objects.
         """
         dealt = self._dealt(index)
@@ -144,9 +147,11 @@ class Drop:
         refused: list[str] = []
         left_out: list[LeftOut] = []
         sentence = ""
+        whole = len(dealt)
         while dealt:
             faults: dict[int, list[str]] = {one.id: [] for one in dealt}
-            for _ in range(attempts):
+            before = len(refused)
+            while len(refused) < before + attempts and CROWDED not in refused[before:]:
                 found = self._try(index, dealt, refused)
                 if isinstance(found, Layout):
                     return replace(found, left_out=tuple(left_out))
@@ -154,11 +159,16 @@ class Drop:
                 sentence = found.sentence
                 for position in found.blamed:
                     faults[dealt[position].id].append(found.reason)
-            gone = [one for one in dealt if len(faults[one.id]) == attempts]
+            draws = len(refused) - before
+            gone = [one for one in dealt if len(faults[one.id]) == draws]
+            if CROWDED in refused[before:]:
+                gone = dealt[-math.ceil(_CROWD * len(dealt)) :]
+                if 2 * (len(dealt) - len(gone)) < whole:
+                    raise InputError(sentence)
             for one in gone or [max(dealt, key=lambda one: (len(faults[one.id]), one.id))]:
-                reason, times = Counter(faults[one.id] or refused[-attempts:]).most_common(1)[0]
+                reason, times = Counter(faults[one.id] or refused[before:]).most_common(1)[0]
                 said = reason.removeprefix(f"{self.scene.assets[one.asset].name} ")
-                left_out.append(LeftOut(one.id, one.asset, f"{said} in {times} of {attempts} draws"))
+                left_out.append(LeftOut(one.id, one.asset, f"{said} in {times} of {draws} draws"))
                 dealt.remove(one)
         reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused[:attempts]).items())
         must = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
@@ -182,9 +192,8 @@ class Drop:
         except InputError as error:
             # An object that is too large for its region leaves the others room.
             alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
-            if not any(alone):
-                raise
-            return _Refusal("no room for it", np.flatnonzero(alone).tolist(), str(error))
+            reason = "no room for it" if any(alone) else CROWDED
+            return _Refusal(reason, np.flatnonzero(alone).tolist(), str(error))
         world = self._world(assets, self._draw_frictions(index), 2.0 ** refused.count(OVERFLOW), number)
         world.reset(start)
         outcome = self._run(world, number, regions, given)

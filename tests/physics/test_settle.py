@@ -342,6 +342,18 @@ def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, w
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
+def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_data, write_scene, tmp_path):
+    box_asset("tile", (0.04, 0.04, 0.01)).save(tmp_path / "assets/tile")
+    scene_data["objects"] = [{"asset": "assets/tile", "count": 5}]
+    scene_data["region"] = {"min": [-0.045, -0.045, 0.01], "max": [0.045, 0.045, 0.03]}
+    scene_data["settle"] = {"arrangement": "packed", "stepper": "mujoco"}
+    layout = settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+    assert len(layout.instances) >= 3
+    assert [one.id for one in layout.left_out] == [5, 4][: len(layout.left_out)]
+    assert layout.left_out[0].reason == "no room for all in 1 of 1 draws"
+    assert layout.certificate.refused.count("no room for all") == len(layout.left_out)
+
+
 def test_each_object_is_tried_alone(needle_scene, scene_data):
     tried = list(try_alone(load_scene(needle_scene(scene_data))))
     assert tried == [("needle", "upright", ["needle fell over"] * 3), ("nut", "upright", [])]

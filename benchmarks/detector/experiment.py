@@ -20,6 +20,7 @@ import re
 import shutil
 from collections.abc import Mapping
 from copy import deepcopy
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
 from mitsplat.detector.losses import gains
 from mitsplat.detector.training import Run
+from mitsplat.files import write_text
 
 HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")
@@ -107,9 +109,7 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
         for image in labels["images"]:
             if not (folder / image["file_name"]).exists():
                 shutil.copy(work / "photos" / image["file_name"], folder)
-        # Another training may be reading them.
-        (folder / ".labels.json").write_text(json.dumps(labels))
-        (folder / ".labels.json").replace(folder / "labels.json")
+        write_text(folder / "labels.json", json.dumps(labels))
     return folder
 
 
@@ -142,10 +142,11 @@ def listed(
             raise SystemExit(f"there are {len(some)} images, not {images}")
         some = [some[i] for i in sorted(np.random.default_rng(0).permutation(len(some))[:images])]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "train.txt").write_text("".join(f"{path}\n" for path in some))
+    write_text(folder / "train.txt", "".join(f"{path}\n" for path in some))
     names = YAML(typ="safe").load((rendered[0] / "data.yaml").read_text())["names"]
-    with (folder / "data.yaml").open("w") as file:
-        YAML(typ="safe").dump({"train": "train.txt", "names": names}, file)
+    described = StringIO()
+    YAML(typ="safe").dump({"train": "train.txt", "names": names}, described)
+    write_text(folder / "data.yaml", described.getvalue())
     return folder
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.highlight import Lobe
+from mitsplat.plugins.rectangles import Rectangles
 from mitsplat.plugins.sky_irradiance import SkyIrradiance
 
 SURVEY_LATTICE = (233, 144)
@@ -84,6 +85,7 @@ class Emitters:
         self.choice = _Choice(share)
         local = np.where(np.arange(len(emitters)) == sky, 0, share)
         self.local_choice = _Choice(local) if len(emitters) > len(skies) else None
+        self.rectangles = Rectangles.of(emitters, sky)
         infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
         self.infinite = mi.UInt32([int(v) for v in infinite])
         self.sky_colour = None
@@ -109,10 +111,9 @@ class Emitters:
         by_cosine = is_sky if self.even_sky else is_sky & (x < 0.5)
         if self.sky is not None and not self.even_sky:
             x = dr.select(is_sky, dr.select(by_cosine, 2 * x, 2 * x - 1), x)
-        sample, radiance = emitter.sample_direction(si, mi.Point2f(x, point.y), active & ~by_cosine)
-        direction = mi.Vector3f(sample.d)
+        direction, distance, radiance = self._towards(si, index, mi.Point2f(x, point.y), active & ~by_cosine)
         cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
-        irradiance = dr.select(sample.pdf > 0, radiance * cosine, 0)
+        irradiance = radiance * cosine
         if self.sky is not None:
             upward = si.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, point.y)))
             direction = dr.select(by_cosine, upward, direction)
@@ -127,8 +128,16 @@ class Emitters:
             irradiance = dr.select(is_sky, dr.select(density > 0, sky * (cosine / density), 0), irradiance)
         # The distance to a light at infinity comes from the extent of visible meshes, which proxies are not part of.
         infinite = dr.gather(mi.UInt32, self.infinite, index, active) > 0
-        reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, sample.dist))
+        reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, distance))
         return Beam(direction, reach, irradiance / chance)
+
+    def _towards(self, si: Any, index: Any, point: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Where points of emitters are seen from ``si``: unit vector, distance [m], and radiance over their density."""
+        if self.rectangles is None or not (self.sky is None or self.even_sky):
+            emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
+            sample, radiance = emitter.sample_direction(si, point, active)
+            return mi.Vector3f(sample.d), sample.dist, dr.select(sample.pdf > 0, radiance, 0)
+        return self.rectangles.towards(si.p, index, point)
 
     @staticmethod
     def _sky_radiance(si: Any, direction: Any, emitter: Any, active: Any = True) -> Any:
@@ -137,29 +146,34 @@ class Emitters:
         outside.wi = -direction
         return mi.Color3f(emitter.eval(outside, active))
 
-    def open_light(self, si: Any, lobe: Lobe, active: Any) -> tuple[Any, Any]:
-        """Irradiance, and radiance that is mirrored (Color3f), without occluders, from the same directions for all."""
+    def open_light(self, si: Any, lobe: Lobe | None, active: Any) -> tuple[Any, Any]:
+        """Irradiance, and radiance that is mirrored (Color3f), without occluders, from the same directions for all.
+
+        Without a ``lobe``, where nothing is mirrored, this takes less time.
+        """
         total, shine = mi.Color3f(0), mi.Color3f(0)
         if self.local_choice is not None:
             choice = self.local_choice
 
             def local(point: Any) -> tuple[Any, Any]:
                 index, x, chance = choice.sample(point.x)
-                emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
-                light, direction = _facing(si, emitter, mi.Point2f(x, point.y), active)
-                return light / chance, light * (lobe.reflectance(direction) / chance)
+                direction, _, radiance = self._towards(si, index, mi.Point2f(x, point.y), active)
+                light = dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0)
+                return light / chance, 0 if lobe is None else light * (lobe.reflectance(direction) / chance)
 
             total, shine = self._integrate(si, active, OPEN_LATTICE, local)
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
-
-            def mirrored(point: Any) -> tuple[Any, Any]:
-                direction, weight = lobe.sample(point)
-                radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
-                return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
-
             total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)
-            shine += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
+            if lobe is not None:
+                sample_lobe = lobe.sample
+
+                def mirrored(point: Any) -> tuple[Any, Any]:
+                    direction, weight = sample_lobe(point)
+                    radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
+                    return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
+
+                shine += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
         return total, shine
 
     @staticmethod
@@ -203,13 +217,6 @@ def _is_sky(emitter: Any) -> bool:
     flags = emitter.flags()
     infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
     return bool(infinite and not mi.has_flag(flags, mi.EmitterFlags.DeltaDirection))
-
-
-def _facing(si: Any, emitter: Any, point: Any, active: Any) -> tuple[Any, Any]:
-    """Estimate of irradiance from one emitter, and where it comes from."""
-    sample, radiance = emitter.sample_direction(si, point, active)
-    direction = mi.Vector3f(sample.d)
-    return dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0), direction
 
 
 def sky_irradiance(emitter: Any) -> SkyIrradiance:

@@ -74,6 +74,10 @@ class Estimate:
         """All but the number of rays."""
         return self.lit, self.base, self.shine, self.glare, self.squares
 
+    def moved(self, places: Any, count: int) -> Estimate:
+        """The same at ``places`` of ``count`` points, with no rays yet at the others."""
+        return Estimate.nothing(count).updated(places, *self.sums, self.rays)
+
     def updated(self, places: Any, *values: Any) -> Estimate:
         """The estimate with new values at some points."""
         dr.eval(values)  # else what they were made from would be copied before it is written to
@@ -96,13 +100,27 @@ class LightFilter:
     the known neighbours that show the same thing.
     """
 
-    def __init__(self, here: Any, view: View, index: Any) -> None:
-        """A filter at the pixels ``index`` of an image, which show the points ``here``."""
+    def __init__(self, here: Any, view: View, index: Any, coarse: Any = None) -> None:
+        """A filter at the pixels ``index`` of an image, which show the points ``here``.
+
+        Where ``coarse`` is true of a pixel of the image, its neighbours are two pixels apart, and it stands for four.
+        """
         self.view, self.index, self.here = view, index, here
+        self.stride = mi.Int32(1)
+        if coarse is not None:
+            self.stride = dr.select(dr.gather(mi.Bool, coarse, index), mi.Int32(2), 1)
         # What is gathered from neighbours lies together, and holds no more than the pixels in question.
         self.place = dr.full(mi.UInt32, NOWHERE, view.width * view.height)
         dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
         dr.eval(self.place)
+        # Whom neighbours see at a pixel: without those that stand for others, every other column would see fewer.
+        self.shown = self.place
+        if coarse is not None:
+            pixel = dr.arange(mi.UInt32, view.width * view.height)
+            x, y = pixel % view.width, pixel // view.width
+            stands = (y - (y & 1)) * view.width + x - (x & 1)
+            self.shown = dr.select(coarse, dr.gather(mi.UInt32, self.place, stands, coarse), self.place)
+            dr.eval(self.shown)
 
     def rays_for(self, estimate: Estimate, error: float, unshadowed: Any, metered: int = 0) -> Any:
         """Rays per pixel of ``index`` after which light errs no more to the eye than by ``error`` at half of white.
@@ -121,7 +139,7 @@ class LightFilter:
         gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL - 1)), 1)
         light = unshadowed * share
         if metered:
-            exposure = _metered(light, metered)
+            exposure = _metered(light, self.stride * self.stride, metered)
             light, unshadowed = light * exposure, unshadowed * exposure
         # What a step of the display is of the share that arrives, for one of light that is HALF.
         allowed = error * dr.power(dr.clip(light, DARKEST, 1) / HALF, 1 - DISPLAY)
@@ -159,7 +177,7 @@ class LightFilter:
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        traits = _packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])
+        traits = packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])
         alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
             values, along = self._average_along(values, traits, direction, radius, share)
@@ -176,8 +194,8 @@ class LightFilter:
         """
         here, view, width = self.here, self.view, dr.width(self.index)
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
-        along_x, along_y = (dr.opaque(mi.Int32, step) for step in direction)
-        images = _packed(values)
+        along_x, along_y = (dr.opaque(mi.Int32, step) * self.stride for step in direction)
+        images = packed(values)
         own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_TRAITS, width))[8]
         last = dr.opaque(mi.UInt32, radius)
 
@@ -186,7 +204,7 @@ class LightFilter:
             signed = dr.select((step & 1) == 0, -mi.Int32(distance), mi.Int32(distance))
             nx, ny = x + signed * along_x, y + signed * along_y
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
-            place = dr.gather(mi.UInt32, self.place, mi.UInt32(ny * view.width + nx), inside)
+            place = dr.gather(mi.UInt32, self.shown, mi.UInt32(ny * view.width + nx), inside)
             same = inside & (place != NOWHERE)
             other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
             position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
@@ -218,10 +236,15 @@ class LightFilter:
         return averages, weights * weights / (squares * own_rays)
 
 
-def _metered(light: Any, pixels: int) -> Any:
-    """What light is multiplied by for the mean of a picture to look HALF: light here, and 1 at its other pixels."""
-    looks = dr.sum(mi.UInt64(dr.minimum(dr.power(dr.maximum(light, 0), DISPLAY), 4) * _STEPS + 0.5))
-    looks += dr.opaque(mi.UInt64, (pixels - dr.width(light)) * _STEPS)
+def _metered(light: Any, area: Any, pixels: int) -> Any:
+    """What light is multiplied by for the mean of a picture to look HALF.
+
+    It is the light of points that stand for ``area`` pixels each, and 1 at the others.
+    """
+    area = mi.UInt64(area + dr.zeros(mi.Int32, dr.width(light)))  # of one number, the sum would be that number
+    looks = dr.minimum(dr.power(dr.maximum(light, 0), DISPLAY), 4) * _STEPS
+    looks = dr.sum(mi.UInt64(looks + 0.5) * area) - dr.sum(area) * _STEPS
+    looks += dr.opaque(mi.UInt64, pixels * _STEPS)
     mean = mi.Float(looks) / dr.opaque(mi.Float, pixels * _STEPS)
     exposure = HALF * dr.power(dr.maximum(mean, 1e-6), -1 / DISPLAY)
     return dr.clip(exposure, DIMMEST, BRIGHTEST)
@@ -234,7 +257,7 @@ def _padded(count: int) -> int:
     return -(-count // 4) * 4
 
 
-def _packed(columns: list[Any]) -> Any:
+def packed(columns: list[Any]) -> Any:
     """One row of floats per pixel, padded to packets of four."""
     columns = [mi.Float(column) for column in columns]
     count, stride = max(dr.width(column) for column in columns), _padded(len(columns))

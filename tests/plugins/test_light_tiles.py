@@ -97,6 +97,39 @@ def test_faint_shadow_is_that_of_the_form_factor() -> None:
     assert len(np.unique(light[0, faint])) > 100  # no steps
 
 
+def test_faint_shadow_is_a_share_of_what_static_things_leave() -> None:
+    """A roof hides a part F of the sky: a plate before the rest takes f / (1 - F), and one before the roof nothing."""
+    edge, height, top = 0.12, 0.3, 1.0
+    plate = trimesh.creation.box(bounds=[[-edge / 2, -edge / 2, height], [edge / 2, edge / 2, height + 1e-4]])
+    roof = trimesh.creation.box(bounds=[[0.5, -1.5, top], [3.5, 1.5, top + 0.01]])
+    shapes = {
+        "floor": make_splats_shape(floor(2.0), proxy=slab(2.0)),
+        "roof": make_splats_shape(nothing(), proxy=roof),
+        "plate": make_splats_shape(nothing(), proxy=plate, instance=1),
+        "sky": WHITE_SKY,
+    }
+    camera = down_camera(0.9, 192, 80.0)
+    scene = mi.load_dict({"type": "scene", **shapes})
+    light = np.stack(
+        [render_layers(make_integrator(shadow_error=0.03), scene, camera, seed=seed).light[..., 0] for seed in range(4)]
+    )
+    x = (np.arange(192) + 0.5 - 96) * 0.9 / camera.fx
+    factor = edge**2 * height**2 / (np.pi * (x[:, None] ** 2 + x**2 + height**2) ** 2)
+    cell = 0.05
+    across, along = np.meshgrid(np.arange(0.5, 3.5, cell) + cell / 2, np.arange(-1.5, 1.5, cell) + cell / 2)
+    hidden = np.zeros((192, 192))
+    for u, v in zip(across.ravel(), along.ravel(), strict=True):
+        hidden += cell**2 * top**2 / (np.pi * ((x[:, None] - v) ** 2 + (x - u) ** 2 + top**2) ** 2)
+    share = factor / (1 - hidden)
+    faint = (share < 0.012) & (share > 0.002)
+    before_sky, before_roof = faint & (x > 0.15), faint & (x < -0.45) & (np.abs(x[:, None]) < 0.3)
+    assert before_sky.sum() > 1000
+    assert before_roof.sum() > 500
+    assert hidden[before_sky].mean() > 0.2
+    assert abs((1 - light - share)[:, before_sky].mean()) < 0.1 * share[before_sky].mean()
+    assert abs((1 - light)[:, before_roof].mean()) < 0.1 * share[before_roof].mean()
+
+
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("cosine", [1.0, 0.6, 0.15])
 def test_lobe_mirrors_of_an_even_sky_what_its_reflectance_adds_up_to(roughness: float, cosine: float) -> None:

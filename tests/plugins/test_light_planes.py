@@ -18,9 +18,11 @@ from tests.plugins.test_light import WHITE_SKY, nothing
 
 ensure_variant()
 from mitsplat.plugins.device import plain_mesh  # noqa: E402
-from mitsplat.plugins.light_filter import Estimate  # noqa: E402
+from mitsplat.plugins.light_filter import Estimate, LightFilter  # noqa: E402
 from mitsplat.plugins.light_planes import SAMPLES, Planes, between_samples  # noqa: E402
 from mitsplat.plugins.light_tiles import BLOCK  # noqa: E402
+from mitsplat.plugins.lit_surface import Surface  # noqa: E402
+from mitsplat.plugins.rays import View  # noqa: E402
 
 PLAIN = 0x40000001
 """A code as planes have."""
@@ -101,6 +103,27 @@ def test_constant_light_stays_constant_and_a_ramp_has_no_step() -> None:
     ramp = 0.1 + 0.01 * x - 0.003 * y
     # Beyond the border of the image there is nothing to go on to.
     np.testing.assert_allclose(filled(ramp)[:-1, :-1], ramp[:-1, :-1], atol=1e-6)
+
+
+def test_pixels_beside_a_coarse_tile_see_the_same_in_every_column() -> None:
+    """Light that depends on the row alone: those that stand for others are seen at all four."""
+    make_integrator()
+    size = 2 * BLOCK
+    camera = Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=size, height=size, fov_x=20)
+    view = View(size, size, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    y, x = np.mgrid[:size, :size]
+    coarse = y < BLOCK
+    index = np.flatnonzero((~coarse | ((x | y) & 1 == 0)).ravel()).astype(np.uint32)
+    fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+    fields |= {"position": dr.zeros(mi.Point3f, len(index)), "normal": mi.Vector3f(0, 0, 1), "offset": mi.Float(1)}
+    fields |= {"known": dr.full(mi.Bool, True, len(index))}
+    light_filter = LightFilter(Surface(**fields), view, mi.UInt32(index), mi.Bool(coarse.ravel()))
+    values = mi.Float((index // size).astype(np.float32) ** 2)
+    averaged = np.zeros(size * size)
+    averaged[index] = np.array(light_filter.average([values], dr.full(mi.Float, 1, len(index)), 4)[0])
+    rows = averaged.reshape(size, size)
+    np.testing.assert_allclose(rows[BLOCK:], np.broadcast_to(rows[BLOCK:, :1], (BLOCK, size)), rtol=1e-5)
+    assert rows[BLOCK, 0] != BLOCK**2
 
 
 def board(*, size: int = 160, error: float = 0.03, rays: int = 64, seed: int = 0, lamp: float = 0.1) -> Layers:

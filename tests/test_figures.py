@@ -175,7 +175,7 @@ def test_which_commands_are_run_again() -> None:
     assert {"render.frame", "labels.cost", "render.chart-workcell", "scale.fuzz-minutes_8-seed_1000"} <= chosen
     assert not {name for name in chosen if "cuda" in name}
     assert not chosen & {
-        "assets.statue",
+        "assets.photos-buddha-refine",
         "labels.train",
         "render.chart-plant-size_640x480",
         "scenes.build",

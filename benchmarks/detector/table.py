@@ -14,8 +14,10 @@ REFERENCE = "synthetic"
 FIRST = "traced_shadow"
 """The arm that those are compared with which learn from as few images as it does."""
 OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*|scattered|floating|meshes")
-EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000"})
+EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000", "images_707"})
 """Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
+OF_ANOTHER = {"hybrid_707": "images_707"}
+"""Arms that are compared with one of the same images."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 
@@ -33,7 +35,7 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     ]
     for arm in arms or seeds:
         strict, loose = (_mean(seeds[arm], key) for key in ("map50_95", "map50"))
-        reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else REFERENCE
+        reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else OF_ANOTHER.get(arm, REFERENCE)
         compared = "– | –"
         if arm != reference and reference in draws and not (arm in EARLIER and plan == "arms"):
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"

@@ -40,7 +40,8 @@ _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
 # which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
 _GARBAGE = 24
 CROWDED = "no room for all"
-_CROWD = 0.1  # share of the objects that are left out at a time where they find no room beside one another
+_CROWD = 0.1  # share of the objects that are left out at a time where they find no room beside one another,
+_CROWDED = 0.2  # and at the most: a region that lacks room for more is too small
 _POURED = 1.0  # speed of objects that are poured in piles [m/s]: faster, light ones are flung out by heavy ones
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
 
@@ -137,7 +138,7 @@ class Drop:
         the others are drawn anew. Where objects find no room beside one another, the last of them are left out.
 
         Raises:
-            InputError: If not even half of the objects find room, though each of them would alone.
+            InputError: If more than a fifth of the objects finds no room, though each of them would alone.
             NothingRests: If no draw holds, of however few objects.
         """
         dealt = self._dealt(index)
@@ -146,7 +147,7 @@ class Drop:
         attempts = self.scene.spec.settle.attempts
         refused: list[str] = []
         left_out: list[LeftOut] = []
-        sentence = ""
+        sentence = crowded = ""
         whole = len(dealt)
         while dealt:
             faults: dict[int, list[str]] = {one.id: [] for one in dealt}
@@ -157,14 +158,15 @@ class Drop:
                     return replace(found, left_out=tuple(left_out))
                 refused.append(found.reason)
                 sentence = found.sentence
+                crowded = crowded or (sentence if found.reason == CROWDED else "")
                 for position in found.blamed:
                     faults[dealt[position].id].append(found.reason)
             draws = len(refused) - before
             gone = [one for one in dealt if len(faults[one.id]) == draws]
             if CROWDED in refused[before:]:
                 gone = dealt[-math.ceil(_CROWD * len(dealt)) :]
-                if 2 * (len(dealt) - len(gone)) < whole:
-                    raise InputError(sentence)
+                if len(dealt) - len(gone) < (1 - _CROWDED) * whole:
+                    raise InputError(crowded)
             for one in gone or [max(dealt, key=lambda one: (len(faults[one.id]), one.id))]:
                 reason, times = Counter(faults[one.id] or refused[before:]).most_common(1)[0]
                 said = reason.removeprefix(f"{self.scene.assets[one.asset].name} ")

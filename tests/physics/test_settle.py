@@ -348,10 +348,12 @@ def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_dat
     scene_data["region"] = {"min": [-0.045, -0.045, 0.01], "max": [0.045, 0.045, 0.03]}
     scene_data["settle"] = {"arrangement": "packed", "stepper": "mujoco"}
     layout = settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
-    assert len(layout.instances) >= 3
-    assert [one.id for one in layout.left_out] == [5, 4][: len(layout.left_out)]
-    assert layout.left_out[0].reason == "no room for all in 1 of 1 draws"
-    assert layout.certificate.refused.count("no room for all") == len(layout.left_out)
+    assert [one.id for one in layout.instances] == [1, 2, 3, 4]
+    assert [(one.id, one.reason) for one in layout.left_out] == [(5, "no room for all in 1 of 1 draws")]
+    assert layout.certificate.refused.count("no room for all") == 1
+    scene_data["objects"][0]["count"] = 6
+    with pytest.raises(InputError, match=r"region must be large enough .*the 6 of a layout"):
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
 def test_each_object_is_tried_alone(needle_scene, scene_data):
@@ -651,7 +653,7 @@ def test_what_is_a_tower_stands_on_one_another_the_widest_below(scene_data, writ
     np.testing.assert_allclose(bolt[2, 3], 0.055, atol=3e-4)
     np.testing.assert_allclose(np.linalg.norm(nuts[:, :2, 3] - bolt[:2, 3], axis=1), 0, atol=0.017)
     assert np.ptp(np.arctan2(nuts[:, 1, 0], nuts[:, 0, 0])) > 0.1
-    scene_data["objects"][1]["count"] = 15
+    scene_data["objects"][1]["count"] = 30
     with pytest.raises(InputError, match=r"region must be large enough .* settle.arrangement tower"):
         drop_layout(scene_data, write_scene, settle={"arrangement": "tower", "stepper": "mujoco"})
 

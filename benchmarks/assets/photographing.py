@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -72,16 +73,17 @@ def photograph(
     rng = np.random.default_rng(0)
     found = by_name(views, suffix)
     sensors = Sensors()
-
-    def exposed() -> Iterator[tuple[Path, np.ndarray, np.ndarray, np.ndarray]]:
+    # Large ones take longer to encode than a GPU does to trace them; as many wait as there are cores.
+    writing: deque[Future[None]] = deque(maxlen=usable_cores())
+    with ThreadPoolExecutor(usable_cores()) as threads:
         for number, (name, camera) in enumerate(found.items()):
             radiance = np.array(mi.render(loaded, sensor=sensors.like(camera), spp=samples, seed=number))[..., :3]
             gain = np.ones(3, dtype=np.float32) if gains is None else gains[number]
-            yield folder / name, radiance, gain, rng.normal(0, noise, radiance.shape)
-
-    # Large ones take longer to encode than a GPU does to trace them.
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        list(threads.map(lambda photo: develop(*photo), exposed()))
+            if len(writing) == writing.maxlen:
+                writing[0].result()
+            writing.append(threads.submit(develop, folder / name, radiance, gain, rng.normal(0, noise, radiance.shape)))
+        for photo in writing:
+            photo.result()
     return found
 
 

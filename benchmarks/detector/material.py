@@ -10,7 +10,6 @@ assets, and ``photos/``, a COCO folder. What is there already is kept, so that i
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -28,6 +27,7 @@ from benchmarks.detector.packages import make_package, relabel, shape_of
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import read_parts
+from mitsplat.cores import usable_cores
 from mitsplat.device import use_device
 
 PACKAGE = BakeSettings(
@@ -69,7 +69,7 @@ def bake(
 
 def share_cores(processes: int) -> None:
     """Leave Dr.Jit, which has a thread for every core, those of one of so many processes."""
-    dr.set_thread_count(max(1, (os.cpu_count() or 1) // processes))
+    dr.set_thread_count(max(1, usable_cores() // processes))
 
 
 def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.Trimesh:

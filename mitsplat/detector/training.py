@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from mitsplat.content_hash import file_hash
+from mitsplat.cores import usable_cores
 from mitsplat.detector.libraries import (
     check_device,
     check_weights,
@@ -292,7 +292,7 @@ def _train(
             progress(done, settings.steps, f"training, loss {loss:.3g}")
 
     job = fixed_steps.Job(out, listing, sets[0].class_names, plan, masks, step)
-    workers = min(_MOST_WORKERS, os.cpu_count() or 1) if settings.workers is None else settings.workers
+    workers = min(_MOST_WORKERS, usable_cores()) if settings.workers is None else settings.workers
     counted = {
         "steps": settings.steps,
         "images_a_step": settings.batch,

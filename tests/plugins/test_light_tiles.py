@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mitsplat.camera import Camera
 from mitsplat.render.layers import ensure_variant, make_integrator, make_splats_shape, render_layers
 from tests.plugins.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
@@ -71,20 +72,25 @@ def test_tiles_are_those_of_a_loop(width: int, height: int) -> None:
         np.testing.assert_allclose(light[y, x], 1 - total / weights if weights else 1, atol=1e-5)
 
 
-def test_faint_shadow_is_that_of_the_form_factor() -> None:
-    """A small plate takes of an even sky the share of its form factor, A h^2 / (pi d^4), by one ray a pixel."""
-    edge, height = 0.12, 0.3
+def light_below_plate(camera: Camera, edge: float, height: float, **others: dict[str, Any]) -> np.ndarray:
+    """Light of four seeds (4, H, W) on a floor under an even sky, with a small plate in its way and other shapes."""
     plate = trimesh.creation.box(bounds=[[-edge / 2, -edge / 2, height], [edge / 2, edge / 2, height + 1e-4]])
     shapes = {
         "floor": make_splats_shape(floor(2.0), proxy=slab(2.0)),
+        **others,
         "plate": make_splats_shape(nothing(), proxy=plate, instance=1),
         "sky": WHITE_SKY,
     }
-    camera = down_camera(3.0, 192, 24.0)
     scene = mi.load_dict({"type": "scene", **shapes})
-    light = np.stack(
-        [render_layers(make_integrator(shadow_error=0.03), scene, camera, seed=seed).light[..., 0] for seed in range(4)]
-    )
+    integrator = make_integrator(shadow_error=0.03)
+    return np.stack([render_layers(integrator, scene, camera, seed=seed).light[..., 0] for seed in range(4)])
+
+
+def test_faint_shadow_is_that_of_the_form_factor() -> None:
+    """A small plate takes of an even sky the share of its form factor, A h^2 / (pi d^4), by one ray a pixel."""
+    edge, height = 0.12, 0.3
+    camera = down_camera(3.0, 192, 24.0)
+    light = light_below_plate(camera, edge, height)
     x = (np.arange(192) + 0.5 - 96) * 3.0 / camera.fx
     distance2 = x[:, None] ** 2 + x**2 + height**2
     factor = edge**2 * height**2 / (np.pi * distance2**2)
@@ -100,19 +106,9 @@ def test_faint_shadow_is_that_of_the_form_factor() -> None:
 def test_faint_shadow_is_a_share_of_what_static_things_leave() -> None:
     """A roof hides a part F of the sky: a plate before the rest takes f / (1 - F), and one before the roof nothing."""
     edge, height, top = 0.12, 0.3, 1.0
-    plate = trimesh.creation.box(bounds=[[-edge / 2, -edge / 2, height], [edge / 2, edge / 2, height + 1e-4]])
     roof = trimesh.creation.box(bounds=[[0.5, -1.5, top], [3.5, 1.5, top + 0.01]])
-    shapes = {
-        "floor": make_splats_shape(floor(2.0), proxy=slab(2.0)),
-        "roof": make_splats_shape(nothing(), proxy=roof),
-        "plate": make_splats_shape(nothing(), proxy=plate, instance=1),
-        "sky": WHITE_SKY,
-    }
     camera = down_camera(0.9, 192, 80.0)
-    scene = mi.load_dict({"type": "scene", **shapes})
-    light = np.stack(
-        [render_layers(make_integrator(shadow_error=0.03), scene, camera, seed=seed).light[..., 0] for seed in range(4)]
-    )
+    light = light_below_plate(camera, edge, height, roof=make_splats_shape(nothing(), proxy=roof))
     x = (np.arange(192) + 0.5 - 96) * 0.9 / camera.fx
     factor = edge**2 * height**2 / (np.pi * (x[:, None] ** 2 + x**2 + height**2) ** 2)
     cell = 0.05

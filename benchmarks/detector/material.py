@@ -1,10 +1,11 @@
 """Material of the experiment on detectors: assets of scanned objects, packages that no class is, labelled photographs.
 
-    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 90] [--device cuda] [--jobs 8]
+    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 120] [--bags 24] [--device cuda]
+        [--jobs 8]
 
 HOPE holds ``meshes/*.glb`` (textured scans [m], y up), ``photos/*.jpg`` named ``scene_NNNN_LLLL``, and ``labels.json``
-(COCO). WORK gets ``groceries/``, ``packages/`` and ``brands/`` (the scans as other brands print them), folders of
-assets, and ``photos/``, a COCO folder. What is there already is kept, so that it goes on where it was stopped.
+(COCO). WORK gets ``groceries/``, ``packages/``, ``bags/`` and ``brands/`` (the scans as other brands print them),
+folders of assets, and ``photos/``, a COCO folder. What is there already is kept, so that it goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import drjit as dr
 import trimesh
 
 # isort: on
-from benchmarks.detector.packages import make_package, relabel, shape_of
+from benchmarks.detector.packages import make_bag, make_package, relabel, shape_of
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.parts import read_parts
@@ -46,25 +47,13 @@ printed on it."""
 PRINTED = 5
 """Bottles of each scan that are printed all around; others have a label and a cap of any colour."""
 
-PACKAGES = 130
+PACKAGES = 120
 """Of which 90 are boxes, cans and bottles, and the rest what was taken for a class beside them."""
+
+BAGS = 24
 
 DENSITY = 600.0
 """Of packed food with air around it [kg/m^3]."""
-
-
-def bake(
-    mesh: Path | trimesh.Trimesh, out: Path, class_name: str, settings: BakeSettings, up: Literal["y", "z"]
-) -> float:
-    """An asset of small files, whose PSNR [dB] this is; its body is its hull, which cartons and cans all but fill."""
-    hull = parts_hull(mesh, up)
-    result = bake_asset(
-        mesh, name=out.name, class_name=class_name, settings=settings, up=up, density=DENSITY, pieces=[hull]
-    )
-    replace(result.asset, mesh=hull).save(out, splats="splats.spz")
-    notes = "".join(f"; {warning}" for warning in result.warnings)
-    print(f"{out.name}: {len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB{notes}", flush=True)
-    return result.psnr
 
 
 def share_cores(processes: int) -> None:
@@ -85,6 +74,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--gaussians", type=int, default=50000, help="of each scan")
     parser.add_argument("--packages", type=int, default=PACKAGES)
+    parser.add_argument("--bags", type=int, default=BAGS)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--jobs", type=int, default=1, help="assets that are baked at once")
     options = parser.parse_args()
@@ -94,41 +84,61 @@ def main() -> None:
 
 @dataclass(frozen=True)
 class Wanted:
-    """An asset: a scan, a scan as another brand prints it (its number), or a package (without a scan)."""
+    """An asset: a scan, a scan as another brand prints it, or, without a scan, a package or a bag of a seed."""
 
-    out: Path
-    scan: Path | None = None
+    kind: Literal["groceries", "brands", "packages", "bags"]
+    name: str
+    scan: Path = Path()
     seed: int = 0
-    brand: bool = False
+
+    def out(self, work: Path) -> Path:
+        """Its folder."""
+        return work / self.kind / self.name
 
     def mesh(self) -> tuple[Path | trimesh.Trimesh, Literal["y", "z"]]:
         """Textured, and which of its axes points up."""
-        if self.scan is None:
+        if self.kind == "packages":
             return make_package(self.seed), "z"
+        if self.kind == "bags":
+            return make_bag(self.seed), "z"
         up = UP.get(self.scan.stem, "y")
-        if not self.brand:
+        if self.kind == "groceries":
             return self.scan, up
         scan = trimesh.load(self.scan, force="mesh")
         own, plain = self.seed % 2 == 0, self.seed % 1000 >= PRINTED
         return relabel(scan, self.seed, "xyz".index(up), own_colours=own, plain=plain), up
 
-    def bake(self, gaussians: int, device: str) -> float:
-        """Its PSNR [dB]."""
+    def bake(self, work: Path, gaussians: int, device: str) -> float:
+        """An asset of small files, whose PSNR [dB] this is; its body is its hull, which all but bags all but fill."""
         use_device(device)
         mesh, up = self.mesh()
-        if isinstance(mesh, Path):
-            return bake(mesh, self.out, mesh.stem, BakeSettings(gaussians=gaussians), up)
-        return bake(mesh, self.out, "package", PACKAGE, up)
+        settings = BakeSettings(gaussians=gaussians) if self.kind == "groceries" else PACKAGE
+        hulls = [] if self.kind == "bags" else [parts_hull(mesh, up)]
+        result = bake_asset(
+            mesh,
+            name=self.name,
+            class_name=self.name if self.kind == "groceries" else "package",
+            settings=settings,
+            up=up,
+            density=DENSITY,
+            pieces=hulls,
+        )
+        asset = replace(result.asset, mesh=hulls[0]) if hulls else result.asset
+        asset.save(self.out(work), splats="splats.spz")
+        notes = "".join(f"; {warning}" for warning in result.warnings)
+        print(f"{self.name}: {len(asset.splats)} Gaussians, {result.psnr:.1f} dB{notes}", flush=True)
+        return result.psnr
 
 
-def wanted_assets(hope: Path, work: Path, packages: int) -> list[Wanted]:
+def wanted_assets(hope: Path, packages: int = PACKAGES, bags: int = BAGS) -> list[Wanted]:
     """All of the experiment's."""
     wanted = []
     for number, path in enumerate(sorted((hope / "meshes").glob("*.glb"))):
-        wanted.append(Wanted(work / "groceries" / path.stem, path))
+        wanted.append(Wanted("groceries", path.stem, path))
         count = BRANDS[shape_of(trimesh.load(path, force="mesh"))]
-        wanted += [Wanted(work / "brands" / f"{path.stem}_{k}", path, 1000 * number + k, True) for k in range(count)]
-    return wanted + [Wanted(work / "packages" / f"package_{seed:02d}", seed=seed) for seed in range(packages)]
+        wanted += [Wanted("brands", f"{path.stem}_{k}", path, 1000 * number + k) for k in range(count)]
+    wanted += [Wanted("packages", f"package_{seed:02d}", seed=seed) for seed in range(packages)]
+    return wanted + [Wanted("bags", f"bag_{seed:02d}", seed=seed) for seed in range(bags)]
 
 
 def make(options: argparse.Namespace) -> None:
@@ -137,13 +147,13 @@ def make(options: argparse.Namespace) -> None:
     if not photos.exists():
         shutil.copytree(options.hope / "photos", photos)
         shutil.copy(options.hope / "labels.json", photos / "labels.json")
-    wanted = wanted_assets(options.hope, options.work, options.packages)
-    wanted = [one for one in wanted if not (one.out / "asset.yaml").exists()]
+    wanted = wanted_assets(options.hope, options.packages, options.bags)
+    wanted = [one for one in wanted if not (one.out(options.work) / "asset.yaml").exists()]
     # Not an executor of concurrent.futures: with processes of so many tasks it waits for ever once all have ended.
     with get_context("spawn").Pool(options.jobs, share_cores, (options.jobs,), maxtasksperchild=8) as pool:
-        baked = [pool.apply_async(one.bake, (options.gaussians, options.device)) for one in wanted]
+        baked = [pool.apply_async(one.bake, (options.work, options.gaussians, options.device)) for one in wanted]
         for one, psnr in zip(wanted, baked, strict=True):
-            figure(psnr.get(), "dB", one.out.name)
+            figure(psnr.get(), "dB", one.name)
 
 
 if __name__ == "__main__":

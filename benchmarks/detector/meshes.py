@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 # isort: on
 from benchmarks.detector.experiment import write_scene
-from benchmarks.detector.material import PACKAGES, wanted_assets
+from benchmarks.detector.material import wanted_assets
 from mitsplat.asset import Asset
 from mitsplat.bake.parts import Part, part_shape, read_parts
 from mitsplat.colour import decode_srgb, encode_srgb
@@ -57,13 +57,13 @@ def main() -> None:
     options = parser.parse_args()
     ms.use_device(options.device)
     scene = ms.load_scene(write_scene(options.work, options.scene))
-    traced = frames(scene, textured(options.hope, options.work), range(options.frames), options.samples)
+    traced = frames(scene, textured(options.hope), range(options.frames), options.samples)
     print(ms.write_frames(scene, options.work / "data" / options.scene, traced, overwrite=True))
 
 
-def textured(hope: Path, work: Path) -> dict[str, tuple[Part, ...]]:
+def textured(hope: Path) -> dict[str, tuple[Part, ...]]:
     """What all assets were baked of, by their names."""
-    meshes = {one.out.name: one.mesh() for one in wanted_assets(hope, work, PACKAGES)}
+    meshes = {one.name: one.mesh() for one in wanted_assets(hope)}
     return {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
 
 

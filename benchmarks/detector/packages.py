@@ -1,4 +1,4 @@
-"""Packages that no class is: boxes, cans, bottles, tubs and bags, most of them printed, as textured meshes to be baked.
+"""Packages that no class is: boxes, cans, bottles, tubs, and carrier bags, as textured meshes to be baked.
 
 A detector that has never seen another box with words on it takes every box with words for one that it knows. These are
 drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib. Nor
@@ -37,8 +37,33 @@ def make_package(seed: int) -> trimesh.Trimesh:
     rng = np.random.default_rng(seed)
     kinds: Sequence[Callable[[np.random.Generator], trimesh.Trimesh]] = (_box, _can, _bottle)
     if seed >= FIRST_KINDS:
-        kinds = (_tub, _long_box, _squeezed, _bag)
+        kinds = (_tub, _long_box, _squeezed)
     return kinds[seed % len(kinds)](rng)
+
+
+def make_bag(seed: int) -> trimesh.Trimesh:
+    """A crumpled carrier bag, brown, white or grey, darker in its folds: a closed mesh [m], z up, with a texture.
+
+    A ball of which thin layers are moved to and fro, coarse ones first, so that it is folded along their edges.
+    """
+    rng = np.random.default_rng([seed, 1])
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    folded, moved = np.array(ball.vertices), np.zeros_like(ball.vertices)
+    for wave in (1, 1, 2, 2, 4, 4):
+        along = rng.normal(size=3)
+        along *= wave / np.linalg.norm(along)
+        layer = np.abs(2 * ((folded @ along + rng.uniform()) % 1) - 1)[:, None] - 0.5
+        moved += 0.42 / wave**1.4 * layer * rng.normal(size=3)
+        folded += 0.25 / wave * layer * rng.normal(size=3)
+    folded = ball.vertices + moved
+    depth = np.linalg.norm(folded, axis=1)
+    depth = (depth - depth.min()) / np.ptp(depth)
+    tint = [(0.62, 0.42, 0.28), (0.9, 0.9, 0.88), (0.6, 0.6, 0.62)][rng.choice(3, p=[0.5, 0.35, 0.15])]
+    shades = np.outer(0.55 + 0.45 * np.linspace(0, 1, 64), tint)
+    image = Image.fromarray(np.rint(255 * shades)[None].repeat(4, axis=0).astype(np.uint8))
+    uv = np.column_stack([0.01 + 0.98 * depth, np.full(len(depth), 0.5)])
+    vertices = folded * rng.uniform([0.07, 0.05, 0.025], [0.13, 0.1, 0.06])
+    return _textured(vertices, ball.faces, uv, image, rng.uniform(0.25, 0.45))
 
 
 def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
@@ -393,20 +418,3 @@ def _squeezed(rng: np.random.Generator) -> trimesh.Trimesh:
     mesh = _turned(profile, texture, rng.uniform(0.25, 0.6))
     mesh.apply_scale([1, rng.uniform(0.55, 0.85), 1])
     return mesh
-
-
-def _bag(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A crumpled carrier bag: a flat lump with ridges, brown, white or grey, darker in its creases."""
-    ball = trimesh.creation.icosphere(subdivisions=5)
-    creases = np.zeros(len(ball.vertices))
-    for wave in (1.5, 3.0, 6.0):
-        along = rng.normal(size=(2, 3))
-        phase = wave * ball.vertices @ along.T + rng.uniform(0, 2 * np.pi, 2)
-        creases += np.abs(np.sin(phase)).mean(axis=1) / wave**0.6
-    creases = (creases - creases.min()) / np.ptp(creases)
-    vertices = ball.vertices * (0.6 + 0.4 * creases)[:, None] * rng.uniform([0.07, 0.05, 0.02], [0.13, 0.1, 0.06])
-    tint = [(0.62, 0.42, 0.28), (0.9, 0.9, 0.88), (0.6, 0.6, 0.62)][rng.choice(3, p=[0.5, 0.35, 0.15])]
-    shades = np.outer(0.55 + 0.45 * np.linspace(0, 1, 64), tint)
-    image = Image.fromarray(np.rint(255 * shades)[None].repeat(4, axis=0).astype(np.uint8))
-    uv = np.column_stack([0.01 + 0.98 * creases, np.full(len(vertices), 0.5)])
-    return _textured(vertices, ball.faces, uv, image, rng.uniform(0.25, 0.45))

@@ -41,7 +41,7 @@ _FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
 _GARBAGE = 24
 CROWDED = "no room for all"
 _CROWD = 0.1  # share of the objects that are left out at a time where they find no room beside one another,
-_CROWDED = 0.2  # and at the most: a region that lacks room for more is too small
+_CROWDED = 0.5  # and at the most: a region that lacks room for more is too small
 _POURED = 1.0  # speed of objects that are poured in piles [m/s]: faster, light ones are flung out by heavy ones
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
 

@@ -14,10 +14,10 @@ REFERENCE = "synthetic"
 FIRST = "traced_shadow"
 """The arm that those are compared with which learn from as few images as it does."""
 OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*|scattered|floating|meshes")
-EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000", "images_707"})
+EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000", "images_3177"})
 """Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
-OF_ANOTHER = {"hybrid_707": "images_707"}
-"""Arms that are compared with one of the same images."""
+OF_ANOTHER = {"traced_shadow": "images_3177", "hybrid_more": "hybrid_cut", "hybrid_large": "hybrid_cut"}
+"""Arms that are compared with the one from which they differ in one thing."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 

@@ -138,7 +138,7 @@ class Drop:
         the others are drawn anew. Where objects find no room beside one another, the last of them are left out.
 
         Raises:
-            InputError: If more than a fifth of the objects finds no room, though each of them would alone.
+            InputError: If more than half of the objects find no room, though each of them would alone.
             NothingRests: If no draw holds, of however few objects.
         """
         dealt = self._dealt(index)

@@ -351,8 +351,8 @@ def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_dat
     assert [one.id for one in layout.instances] == [1, 2, 3, 4]
     assert [(one.id, one.reason) for one in layout.left_out] == [(5, "no room for all in 1 of 1 draws")]
     assert layout.certificate.refused.count("no room for all") == 1
-    scene_data["objects"][0]["count"] = 6
-    with pytest.raises(InputError, match=r"region must be large enough .*the 6 of a layout"):
+    scene_data["objects"][0]["count"] = 9
+    with pytest.raises(InputError, match=r"region must be large enough .*the 9 of a layout"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 

@@ -118,8 +118,9 @@ def clearance(first: PlacedSurface, second: PlacedSurface, *, reach: float) -> C
     apart = (first.bounds[0] > second.bounds[1] + reach) | (second.bounds[0] > first.bounds[1] + reach)
     if apart.any():
         return Clearance(first, second, reach)
-    distance = min(second.signed_distance(first.points, reach), first.signed_distance(second.points, reach))
-    return Clearance(first, second, distance)
+    distance = second.signed_distance(first.points, reach)
+    # What is measured the other way can only be nearer.
+    return Clearance(first, second, first.signed_distance(second.points, distance))
 
 
 def all_clearances(

@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("arm")
     parser.add_argument("seed", type=int)
     parser.add_argument("--plan", type=Path, default=PLAN)
-    parser.add_argument("--weights", type=Path, help="to start from; random ones if absent")
+    parser.add_argument("--weights", type=Path, help="to start from; random ones if absent, or if the arm says so")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--fold", type=int, help="only train for this one, so that they can be trained side by side")
@@ -178,13 +178,8 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
     if some := {key: arm[key] for key in ("images", "first", "views") if key in arm}:
         rendered = [listed(rendered, work / "listed" / f"{options.arm}-{options.seed}", **some)]
-    settings = TrainSettings(
-        **(plan["train"] | arm.get("train", {})),
-        weights=options.weights,
-        seed=options.seed,
-        device=options.device,
-        workers=options.workers,
-    )
+    said = {"weights": options.weights} | plan["train"] | arm.get("train", {})
+    settings = TrainSettings(**said, seed=options.seed, device=options.device, workers=options.workers)
     real = None
     if arm.get("real"):
         folds = folds_of(plan, options.arm)
@@ -234,7 +229,7 @@ def measure(options: argparse.Namespace) -> None:
         "",
         "samples",
     )
-    figure("COCO" if options.weights else "random", "", "start")
+    figure("random" if trained.record["settings"]["weights"] is None else "COCO", "", "start")
     print(f"{options.arm} {options.seed}: mAP50-95 {whole.map50_95:.3f}, mAP50 {whole.map50:.3f}")
 
 

@@ -1,6 +1,6 @@
 """Material of the experiment on detectors: assets of scanned objects, packages that no class is, labelled photographs.
 
-    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 120] [--bags 24] [--device cuda]
+    python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 120] [--bags 12] [--device cuda]
         [--jobs 8]
 
 HOPE holds ``meshes/*.glb`` (textured scans [m], y up), ``photos/*.jpg`` named ``scene_NNNN_LLLL``, and ``labels.json``
@@ -21,7 +21,9 @@ from typing import Literal
 import mitsplat  # noqa: F401  # which must come before Dr.Jit
 
 import drjit as dr
+import numpy as np
 import trimesh
+from scipy.cluster.vq import kmeans2
 
 # isort: on
 from benchmarks.detector.packages import make_bag, make_package, relabel, shape_of
@@ -50,7 +52,7 @@ PRINTED = 5
 PACKAGES = 120
 """Of which 90 are boxes, cans and bottles, and the rest what was taken for a class beside them."""
 
-BAGS = 24
+BAGS = 12
 
 DENSITY = 600.0
 """Of packed food with air around it [kg/m^3]."""
@@ -65,6 +67,12 @@ def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.T
     """The convex hull of all parts of a mesh [m], z up."""
     parts = read_parts(mesh, metres_per_unit=1.0, up=up, finish=None)
     return trimesh.util.concatenate([part.mesh for part in parts]).convex_hull
+
+
+def hulls_of(mesh: trimesh.Trimesh, count: int = 12) -> list[trimesh.Trimesh]:
+    """Convex hulls [m] of so many patches of a mesh, which is too ragged to be taken apart in a reasonable time."""
+    _, patch = kmeans2(mesh.triangles_center, count, seed=0, minit="++")
+    return [trimesh.convex.convex_hull(mesh.triangles[patch == one].reshape(-1, 3)) for one in np.unique(patch)]
 
 
 def main() -> None:
@@ -109,11 +117,11 @@ class Wanted:
         return relabel(scan, self.seed, "xyz".index(up), own_colours=own, plain=plain), up
 
     def bake(self, work: Path, gaussians: int, device: str) -> float:
-        """An asset of small files, whose PSNR [dB] this is; its body is its hull, which all but bags all but fill."""
+        """An asset of small files, whose PSNR [dB] this is; its body is its hull, which all but a bag all but fill."""
         use_device(device)
         mesh, up = self.mesh()
         settings = BakeSettings(gaussians=gaussians) if self.kind == "groceries" else PACKAGE
-        hulls = [] if self.kind == "bags" else [parts_hull(mesh, up)]
+        pieces = hulls_of(mesh) if self.kind == "bags" else [parts_hull(mesh, up)]
         result = bake_asset(
             mesh,
             name=self.name,
@@ -121,9 +129,9 @@ class Wanted:
             settings=settings,
             up=up,
             density=DENSITY,
-            pieces=hulls,
+            pieces=pieces,
         )
-        asset = replace(result.asset, mesh=hulls[0]) if hulls else result.asset
+        asset = result.asset if self.kind == "bags" else replace(result.asset, mesh=pieces[0])
         asset.save(self.out(work), splats="splats.spz")
         notes = "".join(f"; {warning}" for warning in result.warnings)
         print(f"{self.name}: {len(asset.splats)} Gaussians, {result.psnr:.1f} dB{notes}", flush=True)

@@ -47,7 +47,7 @@ def make_bag(seed: int) -> trimesh.Trimesh:
     A ball of which thin layers are moved to and fro, coarse ones first, so that it is folded along their edges.
     """
     rng = np.random.default_rng([seed, 1])
-    ball = trimesh.creation.icosphere(subdivisions=5)
+    ball = trimesh.creation.icosphere(subdivisions=4)
     folded, moved = np.array(ball.vertices), np.zeros_like(ball.vertices)
     for wave in (1, 1, 2, 2, 4, 4):
         along = rng.normal(size=3)
@@ -62,7 +62,7 @@ def make_bag(seed: int) -> trimesh.Trimesh:
     shades = np.outer(0.55 + 0.45 * np.linspace(0, 1, 64), tint)
     image = Image.fromarray(np.rint(255 * shades)[None].repeat(4, axis=0).astype(np.uint8))
     uv = np.column_stack([0.01 + 0.98 * depth, np.full(len(depth), 0.5)])
-    vertices = folded * rng.uniform([0.07, 0.05, 0.025], [0.13, 0.1, 0.06])
+    vertices = folded * rng.uniform([0.06, 0.045, 0.02], [0.11, 0.08, 0.05])
     return _textured(vertices, ball.faces, uv, image, rng.uniform(0.25, 0.45))
 
 

@@ -315,8 +315,9 @@ class _Draw:
         floor = min(obstacle.bounds[0][2] for obstacle in obstacles)
         reach = float(pose[2, 3] - floor) + 1.0
         while True:
-            placed = PlacedSurface("", self._items[i].surface, pose)
-            distance = min(clearance(placed, obstacle, reach=reach).distance for obstacle in obstacles)
+            placed, distance = PlacedSurface("", self._items[i].surface, pose), reach
+            for obstacle in obstacles:
+                distance = clearance(placed, obstacle, reach=distance).distance
             if distance < _HOVER:
                 return distance > 0
             if placed.bounds[1][2] < floor:

@@ -74,7 +74,7 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
     def train(datasets: list[Path], run: Path, settings: Any, real: Path | None) -> Any:
         learnt = datasets + ([real] if real else [])
         seen[str(run)] = {path.name for folder in learnt for path in folder.glob("*.jpg")}
-        return SimpleNamespace(path=run, record={"finished": {"seconds": 1.0}})
+        return SimpleNamespace(path=run, record={"finished": {"seconds": 1.0}, "settings": {"weights": None}})
 
     def evaluate(run: Path, data: Path, **_: Any) -> Any:
         truth = json.loads((data / "labels.json").read_text())
@@ -103,6 +103,15 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
     assert figures["map50_95"] == pytest.approx(1.0 if arm != "synthetic" else 0.9, abs=0.01)
     assert (figures["scene.1"], figures["scene.0"] < 1) == (pytest.approx(1.0), arm == "synthetic")
     assert len(figures["samples"]) == experiment.SAMPLES
+
+
+@pytest.mark.parametrize(("arm", "starts"), [("real", "coco.pt"), ("scratch", None)])
+def test_an_arm_starts_from_what_it_says(work, monkeypatch, arm, starts):
+    given: list[Path | None] = []
+    monkeypatch.setattr(experiment, "train_detector", lambda *args, **_: given.append(args[2].weights))
+    options = argparse.Namespace(work=work, arm=arm, seed=0, weights=Path("coco.pt"), device="cpu", workers=0)
+    experiment.train_fold(options, experiment.read_arms(), 0)
+    assert given == [starts and Path(starts)]
 
 
 def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):

@@ -3,9 +3,10 @@
     python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
         [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
-Datasets are rendered on all devices, a changed scene after the one that shows the same layouts unchanged. Arms are
-trained when what they learn from is there, in the order in which they are named, all of the first seed before the
-second, and folds of one side by side. What was recorded is not done again; what was interrupted goes on.
+Whole datasets are rendered first, on all devices, as all that follows shares the processor's cores; then a changed
+scene after the one that shows the same layouts unchanged. Arms are trained when what they learn from is there, in the
+order in which they are named, all of the first seed before the second, and folds of one side by side. What was recorded
+is not done again; what was interrupted goes on.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def main() -> None:
         if not (RESULTS / f"{result_of(arm, seed, options.plan)}.json").exists()
     ]
     free = {"render": options.devices * options.renders, "train": options.devices * options.jobs}
-    run_jobs([*renders(todo, plan, options), *trainings(todo, plan, options)], free, options)
+    run_jobs(all_jobs(todo, plan, options), free, options)
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Job:
         kind: Of which so many run on each device at once.
         words: The command, but for the device.
         after: Names of jobs that must have ended well.
+        behind: Names of jobs that must have ended.
         hides: Whether it sees no other GPU than its own, rather than being told the number.
         everywhere: Whether it takes all GPUs.
     """
@@ -73,8 +75,16 @@ class Job:
     kind: str
     words: Sequence[str]
     after: Sequence[str] = ()
+    behind: Sequence[str] = ()
     hides: bool = False
     everywhere: bool = False
+
+
+def all_jobs(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> list[Job]:
+    """Renders and trainings, in order, of which all others wait for those on all GPUs."""
+    jobs = [*renders(todo, plan, options), *trainings(todo, plan, options)]
+    whole = [job.name for job in jobs if job.everywhere]
+    return [job if job.everywhere else replace(job, behind=whole) for job in jobs]
 
 
 def renders(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> Iterator[Job]:
@@ -143,11 +153,12 @@ def run_jobs(jobs: Sequence[Job], free: Mapping[str, list[str]], options: argpar
         )
         return job, device, status == 0
 
-    left, running, done = list(jobs), set[Future[tuple[Job, str, bool]]](), set[str]()
+    left, running, over, well = list(jobs), set[Future[tuple[Job, str, bool]]](), set[str](), set[str]()
     with ThreadPoolExecutor(sum(map(len, free.values())) or 1) as pool:
         while running or left:
             for job in list(left):
-                if time.monotonic() < ends and free[job.kind] and done.issuperset(job.after):
+                ready = well.issuperset(job.after) and over.issuperset(job.behind)
+                if time.monotonic() < ends and free[job.kind] and ready:
                     left.remove(job)
                     running.add(pool.submit(run, job, free[job.kind].pop(0)))
             if not running:
@@ -155,10 +166,11 @@ def run_jobs(jobs: Sequence[Job], free: Mapping[str, list[str]], options: argpar
                 print(f"not done, as time is up or what they need is not there: {names}", flush=True)
                 break
             ended, running = wait(running, return_when=FIRST_COMPLETED)
-            for job, device, well in (future.result() for future in ended):
+            for job, device, is_well in (future.result() for future in ended):
                 free[job.kind].append(device)
-                if well:
-                    done.add(job.name)
+                over.add(job.name)
+                if is_well:
+                    well.add(job.name)
 
 
 if __name__ == "__main__":

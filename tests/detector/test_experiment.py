@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -123,9 +124,11 @@ def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):
     whole, changed = renders["render-table"], renders["render-table+no_shadow"]
     assert whole.everywhere and "--frames" not in whole.words and not changed.everywhere
     assert changed.after == ["render-table"] and changed.words[changed.words.index("--frames") + 1] == "128"
-    trainings = {job.name: job for job in side_by_side.trainings(todo, plan, options)}
+    trainings = {job.name: job for job in side_by_side.all_jobs(todo, plan, options) if job.kind == "train"}
+    all_whole = [f"render-{name}" for name in plan["arms"]["hybrid"]["scenes"]]
+    assert all(job.behind == all_whole for job in trainings.values())
     assert set(trainings["hybrid-0"].after) == {f"hybrid-0-{fold}" for fold in range(5)}
-    assert set(trainings["hybrid-0-4"].after) == {f"render-{name}" for name in plan["arms"]["hybrid"]["scenes"]}
+    assert trainings["hybrid-0-4"].after == all_whole
     assert trainings["no_shadow-0"].after == ["no_shadow-0-0"]
 
 
@@ -141,6 +144,7 @@ def test_jobs_run_in_order_on_free_devices_after_what_they_need(tmp_path, capsys
         job("shy", "pass"),
         job("wrong", "raise SystemExit('no such thing')"),
     ]
+    jobs.insert(0, replace(job("patient", "pass"), behind=["wrong"]))
     free = {"train": ["cuda:1"], "render": []}
     side_by_side.run_jobs(jobs, free, argparse.Namespace(work=tmp_path, minutes=5))
     said = [line.split("min  ")[-1] for line in capsys.readouterr().out.splitlines()]
@@ -149,6 +153,7 @@ def test_jobs_run_in_order_on_free_devices_after_what_they_need(tmp_path, capsys
         "late: cuda:1 None",
         "shy: cuda 1",
         "wrong: status 1: no such thing",
+        "patient: cuda:1 None",
         "not done, as time is up or what they need is not there: lost",
     ]
     assert free["train"] == ["cuda:1"]

@@ -196,4 +196,10 @@ def _checks(rng: np.random.Generator) -> Float64Array:
     return np.asarray((half[:, None] ^ half), dtype=np.float64)
 
 
-_PATTERNS = {"noise": _noise, "wood": _wood, "brushed_metal": _brushed, "checker": _checks}
+def _stripes(_: np.random.Generator) -> Float64Array:
+    """Each band fades as the side of a slat that is turned away from the light, and the next begins at once."""
+    across = (FEATURES * np.arange(SIZE) / SIZE) % 1.0
+    return np.repeat(across[:, None] ** 3, SIZE, axis=1)
+
+
+_PATTERNS = {"noise": _noise, "wood": _wood, "brushed_metal": _brushed, "checker": _checks, "stripes": _stripes}

@@ -70,6 +70,14 @@ class CheckerMaterial(_Patterned):
     scale: PositiveRange = Field((0.02, 0.2), description="Edge of a square [m], drawn.")
 
 
+class StripesMaterial(_Patterned):
+    """Diffuse, straight bands side by side, each darker towards one edge: slats, planks, corrugated sheet."""
+
+    kind: Literal["stripes"] = Field("stripes", description="Bands.")
+    contrast: UnitRange = Field((0.2, 0.7), description="How much darker a band's edge is, drawn.")
+    scale: PositiveRange = Field((0.02, 0.12), description="Width of a band [m], drawn.")
+
+
 class ImageMaterial(StrictModel):
     """Diffuse, an image side by side with itself."""
 
@@ -84,7 +92,13 @@ class ImageMaterial(StrictModel):
 
 
 Material = Annotated[
-    ColourMaterial | NoiseMaterial | WoodMaterial | BrushedMetalMaterial | CheckerMaterial | ImageMaterial,
+    ColourMaterial
+    | NoiseMaterial
+    | WoodMaterial
+    | BrushedMetalMaterial
+    | CheckerMaterial
+    | StripesMaterial
+    | ImageMaterial,
     Field(discriminator="kind"),
 ]
 

@@ -21,7 +21,7 @@ from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
 
-KINDS = ("colour", "noise", "wood", "brushed_metal", "checker")
+KINDS = ("colour", "noise", "wood", "brushed_metal", "checker", "stripes")
 
 
 @pytest.fixture

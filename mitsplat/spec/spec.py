@@ -179,7 +179,7 @@ class SceneSpec(StrictModel):
     hold_out: HoldOut = Field(
         HoldOut(), exclude_if=lambda held: held == HoldOut(), description="What is in the test split alone."
     )
-    quality: PresetName = Field("balanced", description="Rendering preset.")
+    quality: PresetName = Field("fast", description="Rendering preset.")
     rendering: Rendering = Field(Rendering(), description="How splats are drawn.")
     seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
 

@@ -78,7 +78,7 @@ def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_d
     assert run("render", scene_path) == 0
     scene, out = write_dataset.args
     assert out == Path("out/scene")
-    assert (scene.spec.output.width, scene.spec.seed, scene.spec.quality) == (64, 7, "balanced")
+    assert (scene.spec.output.width, scene.spec.seed, scene.spec.quality) == (64, 7, "fast")
     write_dataset.kwargs.pop("progress")
     assert write_dataset.kwargs == {
         "frames": None, "shard": None, "workers": None, "cluster": None, "overwrite": False, "device": CPU,

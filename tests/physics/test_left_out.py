@@ -1,0 +1,117 @@
+"""What a layout leaves out: what finds no rest, and what finds no room."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.errors import InputError
+from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts, try_alone
+from mitsplat.scene.layout import Layout, NothingRests
+from mitsplat.scene.scene import load_scene
+from tests.conftest import box_asset
+
+pytestmark = pytest.mark.usefixtures("physics")
+
+
+@pytest.fixture
+def needle_scene(scene_data, write_scene, tmp_path):
+    """Nuts beside a needle on its point, its weight beside that."""
+    cone = trimesh.creation.cone(0.004, 0.08, sections=16)
+    cone.vertices[:, 2] = 0.08 - cone.vertices[:, 2]
+    cone.vertices[:, 0] += 0.2 * cone.vertices[:, 2]
+    cone.invert()
+    replace(box_asset("needle"), mesh=cone, pieces=()).save(tmp_path / "assets/needle")
+    scene_data["objects"] = [{"asset": "assets/needle"}, {"asset": "assets/nut", "count": 2}]
+    scene_data["settle"] = {"arrangement": "upright", "attempts": 2, "stepper": "mujoco"}
+    return write_scene
+
+
+def test_what_cannot_stand_is_left_out_and_the_others_keep_their_numbers(needle_scene, scene_data):
+    scene = load_scene(needle_scene(scene_data))
+    layout = settle_layout(scene, 0, cached=False)
+    assert [(one.id, scene.assets[one.asset].name) for one in layout.instances] == [(2, "nut"), (3, "nut")]
+    (gone,) = layout.left_out
+    assert (gone.id, scene.assets[gone.asset].name) == (1, "needle")
+    assert gone.reason == "fell over in 2 of 2 draws"
+    assert layout.certificate.refused == ("needle fell over",) * 2
+    assert layout.certificate.attempts == 3
+    assert Layout.from_json(json.loads(json.dumps(layout.to_json()))).left_out == layout.left_out
+    *moments, _ = replay_layout(scene, layout, interval=0.04)
+    start = np.array([one.world_from_object[:3, 3] for one in moments[0].instances])
+    resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
+    assert start.shape == (2, 3)
+    assert np.abs(start - resting).max() < 2e-3  # they were put down where they lie
+
+
+def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(needle_scene, scene_data):
+    scene_data["objects"] = [{"asset": "assets/needle", "count": 2}]
+    scene = load_scene(needle_scene(scene_data))
+    with pytest.raises(NothingRests, match=r"layout 1 must come to rest .*[(]got 2 x needle fell over[)]") as error:
+        settle_layout(scene, 1, cached=False)
+    again = pickle.loads(pickle.dumps(error.value))
+    assert again.layout.instances == ()
+    assert {one.id for one in again.layout.left_out} == {1, 2}
+    assert str(again) == str(error.value)
+    (layout,) = settle_layouts(scene, [1], cached=False)
+    assert layout.to_json() == again.layout.to_json()
+
+
+def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, write_scene, tmp_path, monkeypatch):
+    from mitsplat.physics import placement
+
+    monkeypatch.setattr(placement, "_DRAWS", 2)
+    box_asset("plank", (0.02, 0.02, 0.3)).save(tmp_path / "assets/plank")
+    scene_data["objects"] = [{"asset": "assets/nut"}, {"asset": "assets/plank"}]
+    scene_data["settle"] = {"arrangement": "upright", "attempts": 1, "stepper": "mujoco"}
+    scene = load_scene(write_scene(scene_data))
+    layout = settle_layout(scene, 0, cached=False)
+    assert [one.id for one in layout.instances] == [1]
+    assert [(one.id, one.reason) for one in layout.left_out] == [(2, "no room for it in 1 of 1 draws")]
+    scene_data["objects"] = [{"asset": "assets/plank"}]
+    with pytest.raises(NothingRests, match="region must be large enough"):
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+
+
+def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_data, write_scene, tmp_path):
+    box_asset("tile", (0.04, 0.04, 0.01)).save(tmp_path / "assets/tile")
+    scene_data["objects"] = [{"asset": "assets/tile", "count": 5}]
+    scene_data["region"] = {"min": [-0.045, -0.045, 0.01], "max": [0.045, 0.045, 0.03]}
+    scene_data["settle"] = {"arrangement": "packed", "stepper": "mujoco"}
+    layout = settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+    assert [one.id for one in layout.instances] == [1, 2, 3, 4]
+    assert [(one.id, one.reason) for one in layout.left_out] == [(5, "no room for all in 1 of 1 draws")]
+    assert layout.certificate.refused.count("no room for all") == 1
+    scene_data["objects"][0]["count"] = 9
+    with pytest.raises(InputError, match=r"region must be large enough .*the 9 of a layout"):
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+
+
+def test_each_object_is_tried_alone(needle_scene, scene_data):
+    tried = list(try_alone(load_scene(needle_scene(scene_data))))
+    assert tried == [("needle", "upright", ["needle fell over"] * 3), ("nut", "upright", [])]
+    scene_data["settle"]["arrangement"] = "drop"
+    assert not any(refused for _, _, refused in try_alone(load_scene(needle_scene(scene_data))))
+
+
+def test_a_region_too_small_is_an_error(scene_data, write_scene):
+    scene_data["objects"][0]["count"] = 60
+    scene_data["region"] = {"min": [-0.05, -0.05, 0.01], "max": [0.05, 0.05, 0.08]}
+    with pytest.raises(InputError, match=r"scene.yaml: region must be large enough .*the 61 of a layout"):
+        settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
+
+
+def test_a_region_mostly_inside_of_a_table_is_blamed_on_it(scene_data, write_scene, monkeypatch):
+    from mitsplat.physics import placement as place
+    from mitsplat.physics.drop import drop_of
+
+    monkeypatch.setattr(place, "_DRAWS", 1)
+    rng = np.random.default_rng(0)
+    scene_data["region"] = {"min": [-0.2, -0.2, -0.09], "max": [0.2, 0.2, 0.01]}
+    with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside of 'table', settle"):
+        drop_of(load_scene(write_scene(scene_data)), lambda text: None).draw_poses((0,), rng)

@@ -31,7 +31,7 @@ from benchmarks.assets.photographing import by_name, paint, photograph, show_whe
 from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.capture import Capture, Photo, known_where
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.reconstruct.evaluation import iou, show_asset
@@ -250,8 +250,7 @@ def linear(path: Path) -> np.ndarray:
 
 def overlap(photo: Photo, truth: np.ndarray) -> float:
     """IoU of a photo's mask with the truth, where it does not say that another thing may hide the solid."""
-    hidden = photo.hidden()
-    known = np.ones(truth.shape, dtype=bool) if hidden is None else hidden == 0
+    known = known_where(photo.hidden(), photo.camera)
     return iou((photo.alpha() >= 0.5) & known, truth & known)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from os import PathLike
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsplat.arrays import Float32Array, Float64Array, Int32Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.camera import Camera, Lens
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError
@@ -121,29 +121,37 @@ class Photo:
             InputError: If a file cannot be read or has another size than the camera.
             ValueError: If ``scale`` is not in (0, 1].
         """
+        return self.read(scale, window)[:2]
+
+    def read(
+        self, scale: float = 1.0, window: Window | None = None
+    ) -> tuple[Float32Array, Float32Array | None, Float32Array | None]:
+        """The two of :meth:`picture`, and :meth:`hidden`; the mask is read once for both."""
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be in (0, 1] (got {scale})")
-        rgb = self._read(self.file, "RGB", scale, window)
+        rgb = self._pixels(self.file, ("RGB",), scale, window)
         if self.gain is not None:
             rgb = np.clip(encode_srgb(decode_srgb(rgb) * self.gain), 0, 1).astype(np.float32)
-        return rgb, self.alpha(scale, window)
+        return rgb, *self._matte(scale, window)
 
     def alpha(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
         """The mask of :meth:`picture` alone, for which the photo need not be read."""
-        return None if self.mask is None else self._read(self.mask, "L", scale, window)
+        return self._matte(scale, window)[0]
 
     def hidden(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
         """Where in :meth:`picture` another thing may hide the object, (H, W) in [0, 1]; None where nothing does."""
-        if self.mask is None:
-            return None
-        with _opened(self.mask) as image:  # most masks have no transparency, and need not be read again to tell
-            if image.mode != "LA":
-                return None
-        return np.asarray(1 - self._read(self.mask, "LA", scale, window)[..., 1])
+        return self._matte(scale, window)[1]
 
-    def _read(self, path: Path, mode: Literal["RGB", "L", "LA"], scale: float, window: Window | None) -> Float32Array:
+    def _matte(self, scale: float, window: Window | None) -> tuple[Float32Array | None, Float32Array | None]:
+        if self.mask is None:
+            return None, None
+        values = self._pixels(self.mask, ("L", "LA"), scale, window)
+        return (values, None) if values.ndim == 2 else (values[..., 0].copy(), 1 - values[..., 1])
+
+    def _pixels(self, path: Path, modes: Sequence[str], scale: float, window: Window | None) -> Float32Array:
+        """An image in its mode if that is among ``modes``, else in the first of them."""
         with _opened(path) as image:
-            pixels = image.convert(mode)
+            pixels = image.convert(image.mode if image.mode in modes else modes[0])
         size = (self.camera.width, self.camera.height)
         if pixels.size != size:
             raise InputError(
@@ -155,6 +163,11 @@ class Photo:
         values = np.asarray(pixels, dtype=np.float32) / np.float32(255)
         target = (max(1, round(size[0] * scale)), max(1, round(size[1] * scale)))
         return values if target == size else np.asarray(cv2.resize(values, target, interpolation=cv2.INTER_AREA))
+
+
+def known_where(hidden: Float32Array | None, camera: Camera) -> BoolArray:
+    """Where a mask says whether there is the object, as nothing hides it by :meth:`Photo.hidden`, (H, W)."""
+    return np.ones((camera.height, camera.width), dtype=bool) if hidden is None else np.asarray(hidden == 0)
 
 
 @contextmanager

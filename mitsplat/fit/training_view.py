@@ -72,7 +72,7 @@ class TrainingView:
         inverse_depth: DepthMap | None = None,
         window: Window | None = None,
     ) -> None:
-        rgb, mask = photo.picture(scale, window)
+        rgb, mask, hidden = photo.read(scale, window)
         height, width, _ = rgb.shape
         camera = photo.camera if window is None else photo.camera.cropped(*window)
         self.camera: Camera = camera.resized(width, height)
@@ -81,8 +81,7 @@ class TrainingView:
         pixels = np.rint(np.concatenate([rgb, cover[..., None]], axis=2) * 255).astype(np.uint8)
         self._pixels: npt.NDArray[np.uint8] | None = pixels
         self._photo, self._scale, self._mask_used, self._window = photo, scale, masked, window
-        hidden = photo.hidden(scale, window) if self.masked else None
-        self._hidden = None if hidden is None else np.asarray(hidden > 0)
+        self._hidden = np.asarray(hidden > 0) if self.masked and hidden is not None else None
         self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
         self._depths: tuple[Any, Any] | None = None
         self._half: TrainingView | None = None

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_erosion
 
 from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.camera import Camera
-from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.capture import Capture, Photo, known_where
 from mitsplat.colour import encode_srgb
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.reconstruct.registration import measure_offset, surface_points
@@ -207,13 +207,11 @@ def show_held_out(
 ) -> list[HeldOutView]:
     """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
     sized = [sized_photo(photo, size) for photo in photos]
-    shown = show_asset(splats, mesh, [camera for camera, _, _ in sized])
-    views = []
-    for photo, (_, rgb, mask), view in zip(photos, sized, shown, strict=True):
-        hidden = photo.hidden(scale_to(photo, size))
-        known = np.ones(view.mesh.shape, dtype=bool) if hidden is None else hidden == 0
-        views.append(HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask, known=known))
-    return views
+    shown = show_asset(splats, mesh, [camera for camera, *_ in sized])
+    return [
+        HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask, known=known_where(hidden, camera))
+        for photo, (camera, rgb, mask, hidden), view in zip(photos, sized, shown, strict=True)
+    ]
 
 
 def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[Camera]) -> list[AssetView]:
@@ -236,15 +234,10 @@ def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[C
     return views
 
 
-def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None]:
-    """Camera, colours and mask of a photo, its longest edge at most ``size`` px."""
-    rgb, mask = photo.picture(scale_to(photo, size))
-    return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask
-
-
-def scale_to(photo: Photo, size: int) -> float:
-    """Scale at which the longest edge of a photo is at most ``size`` px."""
-    return min(1.0, size / max(photo.camera.width, photo.camera.height))
+def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None, Float32Array | None]:
+    """Camera, colours, mask, and where that is hidden, of a photo whose longest edge is at most ``size`` px."""
+    rgb, mask, hidden = photo.read(min(1.0, size / max(photo.camera.width, photo.camera.height)))
+    return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask, hidden
 
 
 def judge(

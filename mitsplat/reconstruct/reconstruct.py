@@ -17,7 +17,7 @@ from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.causes import find_causes
-from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, scale_to, show_held_out, sized_photo
+from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
@@ -123,16 +123,14 @@ def reconstruct_asset(
     pictures = [sized_photo(photo, settings.view_size) for photo in capture.training]
     isolation = None
     views: Sequence[MaskedView] = [
-        MaskedView(camera, mask, photo.hidden(scale_to(photo, settings.view_size)))
-        for photo, (camera, _, mask) in zip(capture.training, pictures, strict=True)
-        if mask is not None
+        MaskedView(camera, mask, hidden) for camera, _, mask, hidden in pictures if mask is not None
     ]
     if kind == "object":
         if len(views) < 3:
             raise InputError(f"an object needs photos with masks from at least 3 sides (got {len(views)})")
         isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
-    cameras = [camera for camera, _, _ in pictures]
+    cameras = [camera for camera, *_ in pictures]
     alignment = refinement = sound = None
     if imported is None:
         floor = 0.0 if kind == "object" and capture.table and _stands(splats) else None
@@ -152,7 +150,7 @@ def reconstruct_asset(
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
     causes = None
     if kind == "object":
-        seen = [sized_photo(photo, settings.view_size) for photo in capture.photos]
+        seen = [sized_photo(photo, settings.view_size)[:3] for photo in capture.photos]
         causes = find_causes(capture, seen)
     verdict = judge(
         capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes

@@ -193,7 +193,7 @@ def _photos(capture: Capture) -> str:
     shown = _spread(capture.photos, PHOTOS)
     figures = []
     for photo in shown:
-        _, rgb, mask = sized_photo(photo, _THUMBNAIL)
+        _, rgb, mask, _ = sized_photo(photo, _THUMBNAIL)
         note = "" if photo.mask is not None else ", no mask"
         figures.append(
             f'<figure><img alt="{html.escape(photo.name, quote=True)}" '

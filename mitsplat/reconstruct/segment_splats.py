@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.camera import Camera
+from mitsplat.capture.capture import known_where
 from mitsplat.errors import InputError
 from mitsplat.plugins.backward import pack_cloud, render_differentiable
 from mitsplat.plugins.sensors import view_of
@@ -78,7 +79,7 @@ class MaskedView:
     @property
     def known(self) -> BoolArray:
         """Where the mask says whether there is the object, (H, W)."""
-        return np.ones(self.mask.shape, dtype=bool) if self.hidden is None else np.asarray(self.hidden == 0)
+        return known_where(self.hidden, self.camera)
 
 
 @dataclass(frozen=True, eq=False)

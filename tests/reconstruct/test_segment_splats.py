@@ -57,7 +57,7 @@ def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject
     parts = [known_object.splats, table, speck, needle, buried]
     views = [
         MaskedView(camera, mask)
-        for camera, _, mask in (sized_photo(photo, 160) for photo in known_object.capture.photos)
+        for camera, _, mask, _ in (sized_photo(photo, 160) for photo in known_object.capture.photos)
         if mask is not None and camera.centre[2] > 0  # nobody looks through the table
     ]
     found = isolate_object(Splats.concatenate(parts), views)
@@ -80,7 +80,7 @@ def test_lost_tells_what_masks_leave_out(known_object: KnownObject) -> None:
     """Where splats are missing in the middle of the masks, as much alpha is lost as pixels are bare."""
     views = [
         MaskedView(camera, mask if number % 2 else np.zeros_like(mask))
-        for number, (camera, _, mask) in enumerate(sized_photo(photo, 160) for photo in known_object.capture.photos)
+        for number, (camera, _, mask, _) in enumerate(sized_photo(photo, 160) for photo in known_object.capture.photos)
         if mask is not None
     ]
     assert isolate_object(known_object.splats, views).lost > 0.05

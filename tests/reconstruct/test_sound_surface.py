@@ -22,7 +22,7 @@ SETTINGS = SurfaceSettings(voxels=64, faces=4000)
 
 def views_of(known: KnownObject) -> list[MaskedView]:
     sized = [sized_photo(photo, 160) for photo in known.capture.training]
-    return [MaskedView(camera, mask) for camera, _, mask in sized if mask is not None]
+    return [MaskedView(camera, mask) for camera, _, mask, _ in sized if mask is not None]
 
 
 def test_what_masks_and_splats_bear_out_is_kept_as_fine_as_it_is(known_object: KnownObject) -> None:

@@ -25,7 +25,7 @@ from tests.conftest import KnownObject
 
 def views_of(known: KnownObject) -> tuple[list[Camera], list[np.ndarray]]:
     sized = [sized_photo(photo, 160) for photo in known.capture.training]
-    return [camera for camera, _, _ in sized], [mask for _, _, mask in sized if mask is not None]
+    return [camera for camera, *_ in sized], [mask for _, _, mask, _ in sized if mask is not None]
 
 
 @pytest.fixture(scope="module")

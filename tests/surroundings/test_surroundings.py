@@ -211,6 +211,7 @@ def test_the_asset_has_its_table_in_z_0(made: tuple[Path, AssetResult]) -> None:
     middle = np.abs(asset.mesh.vertices[:, :2]).max(axis=1) < 0.2
     assert np.abs(asset.mesh.vertices[middle & (asset.mesh.vertices[:, 2] > -0.1), 2]).max() < 1e-6
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # its own pictures, not what the fit reported
+    assert "Removed things" not in done.verdict.rows
     assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
 
 

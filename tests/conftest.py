@@ -101,6 +101,14 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def unsynced() -> Iterator[None]:
+    """Files of this process are left to the operating system: no test pulls the plug, and many would wait for disks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
 @pytest.fixture(scope="module")
 def physics() -> Iterator[None]:
     """Every world of a module is made under the settings that layouts are settled with."""

@@ -21,7 +21,7 @@ BOX = np.array([0.07, 0.05, 0.07])
 
 SIZE = (480, 360)
 """Of photos [px]."""
-FILM_SIZE = (400, 300)
+FILM_SIZE = (320, 240)
 """Of a video [px]."""
 
 
@@ -65,15 +65,18 @@ def _sides(rng: np.random.Generator) -> list[dict[str, Any]]:
 
 
 def walk(count: int) -> list[Camera]:
-    """Cameras of a hand that goes once around the box, up and down a little."""
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    """Cameras of a hand that goes around the box, up and down a little, 96 of them in a turn."""
+    angles = 2 * np.pi / 96 * np.arange(count)
     heights, radii = 0.19 + 0.03 * np.sin(3 * angles), 0.23 + 0.015 * np.cos(3 * angles)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
     return [Camera.look_at(place, (0, 0, 0.02), width=FILM_SIZE[0], height=FILM_SIZE[1], fov_x=48) for place in places]
 
 
-def render_video(file: Path, count: int = 96, *, samples: int = 4) -> dict[int, Camera]:
-    """Render a video of 30 frames a second, of which every tenth is blurred; returns its cameras by frame."""
+def render_video(file: Path, count: int = 68, *, samples: int = 4) -> dict[int, Camera]:
+    """Render a video of 30 frames a second, of which every tenth is blurred; returns its cameras by frame.
+
+    As many as show all sides.
+    """
     with TemporaryDirectory() as folder:
         found = photograph(box_scene(5), walk(count), Path(folder), samples=samples)
         writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 30.0, FILM_SIZE)

@@ -22,7 +22,7 @@ def sky_with_a_sun() -> dict[str, object]:
 
 def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
     """Irradiance (N, 3) on unit normals (N, 3), by the midpoint rule over the sphere."""
-    rows, columns = 720, 1440
+    rows, columns = 384, 768
     theta = (np.arange(rows) + 0.5) / rows * np.pi
     phi = (np.arange(columns) + 0.5) / columns * 2 * np.pi
     theta, phi = (grid.ravel() for grid in np.meshgrid(theta, phi, indexing="ij"))

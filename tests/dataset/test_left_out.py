@@ -87,11 +87,9 @@ def test_the_report_tells_of_them(whole: DatasetSummary, tmp_path: Path) -> None
     )
 
 
-@pytest.mark.parametrize("workers", [2, 7])
-def test_any_number_of_workers_makes_the_same_bytes(
-    scene: Scene, whole: DatasetSummary, tmp_path: Path, workers: int
-) -> None:
-    assert files_of(write(scene, tmp_path / "out", workers=workers).path) == files_of(whole.path)
+def test_several_workers_make_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
+    """As many as the layouts cannot be shared evenly among."""
+    assert files_of(write(scene, tmp_path / "out", workers=3).path) == files_of(whole.path)
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:

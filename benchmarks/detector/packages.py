@@ -48,13 +48,13 @@ def make_bag(seed: int) -> trimesh.Trimesh:
     """
     rng = np.random.default_rng([seed, 1])
     ball = trimesh.creation.icosphere(subdivisions=4)
-    folded, moved = np.array(ball.vertices), np.zeros_like(ball.vertices)
+    places, moved = np.array(ball.vertices), np.zeros_like(ball.vertices)
     for wave in (1, 1, 2, 2, 4, 4):
         along = rng.normal(size=3)
         along *= wave / np.linalg.norm(along)
-        layer = np.abs(2 * ((folded @ along + rng.uniform()) % 1) - 1)[:, None] - 0.5
+        layer = np.abs(2 * ((places @ along + rng.uniform()) % 1) - 1)[:, None] - 0.5
         moved += 0.42 / wave**1.4 * layer * rng.normal(size=3)
-        folded += 0.25 / wave * layer * rng.normal(size=3)
+        places += 0.25 / wave * layer * rng.normal(size=3)
     folded = ball.vertices + moved
     depth = np.linalg.norm(folded, axis=1)
     depth = (depth - depth.min()) / np.ptp(depth)

@@ -43,6 +43,19 @@ def saturation_matrix(factor: float) -> Float64Array:
     return matrix
 
 
+def chroma_matrix(factor: float, degrees: float) -> Float64Array:
+    """Matrix (3, 3) on linear sRGB that takes a hue at an angle from red ``factor`` times as far from the grey axis.
+
+    So it takes the opposite one, and those between them as much nearer; greys stay.
+    """
+    angle = np.radians(degrees)
+    red, across = np.array([2, -1, -1]) / np.sqrt(6), np.array([0, 1, -1]) / np.sqrt(2)
+    along = np.cos(angle) * red + np.sin(angle) * across
+    beside = np.cos(angle) * across - np.sin(angle) * red
+    matrix: Float64Array = np.full((3, 3), 1 / 3) + factor * np.outer(along, along) + np.outer(beside, beside) / factor
+    return matrix
+
+
 @lru_cache(maxsize=256)
 def black_body_colour(kelvin: float) -> tuple[float, float, float]:
     """Linear sRGB of a black body (Kang et al. 2002), of luminance 1; a negative component counts as 0."""

@@ -6,6 +6,7 @@ Commands import what they need inside of their functions, so that the start of e
 from __future__ import annotations
 
 import json
+import statistics
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -147,7 +148,7 @@ def compare(
 ) -> None:
     """Say where labelled photographs lie outside of rendered images, and what to change.
 
-    Objects' brightness, saturation, size and number, images' brightness and noise, of all and of each class.
+    Objects' brightness, colours, size and number, images' brightness and noise, of all and of each class.
     """
     from mitsplat.detector.likeness import compare_with_photographs
     from mitsplat.files import write_text
@@ -161,6 +162,14 @@ def compare(
         for trait in traits:
             if trait.advice:
                 _tell(f"{name}: {trait.name}", trait)
+    if found.hues:
+        turned = sorted(found.hues.values())
+        typer.echo(
+            f"hues of {len(turned)} classes: photographs' are turned by {turned[0]:+.0f} to {turned[-1]:+.0f} degrees, "
+            f"{statistics.median(turned):+.0f} in the median"
+        )
+        if found.hue_advice:
+            typer.echo(f"  {found.hue_advice}")
     if found.same_size is not None:
         typer.echo(
             f"objects are about as large on photographs of {found.same_size} px as on rendered images of {size} px: "

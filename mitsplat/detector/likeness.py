@@ -1,4 +1,4 @@
-"""How far labelled photographs lie outside of rendered images: brightness, saturation and size of objects, noise.
+"""How far labelled photographs lie outside of rendered images: brightness, colours and size of objects, noise.
 
 A detector fails where photographs show what it was never shown. Means of whole pictures hide that: objects are small,
 and a camera that meters the picture makes them dark where what lies around is bright. So objects are measured within
@@ -16,9 +16,10 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.stats import binom
 
-from mitsplat.arrays import BoolArray, ByteImage
+from mitsplat.arrays import BoolArray, ByteImage, Float64Array
 from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
@@ -38,6 +39,14 @@ _DARK = 40
 
 BRIGHTNESS, SIZE = "brightness of objects", "size of objects"
 _WHOLE = "size of objects that no border cuts"
+_HUES = 120
+"""Bins of a turn of hues."""
+_FARTHEST = 15
+"""Bins by which hues are looked for on either side."""
+_COLOURED = 25
+"""Bytes by which channels differ in what has a hue."""
+_TURNED = 8.0
+"""Degrees by which hues differ in half of the classes where a camera shows colours in its own way."""
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
         "of 255",
@@ -55,6 +64,9 @@ _TRAITS: dict[str, tuple[str, str, str]] = {
 
 _Values: TypeAlias = dict[tuple[str, int | None], list[float]]
 """Values of a trait: of all objects or images, and of those of a class by its index."""
+
+_Hues: TypeAlias = dict[int, Float64Array]
+"""Sums of shares of hues of the objects of a class, by its index, shape (_HUES,)."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +104,8 @@ class Likeness:
             smaller, of objects that no border cuts. None if no class is shown often enough by both.
         traits: Of all of them.
         classes: Brightness and saturation of each class that both show often enough.
+        hues: By how much photographs show its colours turned, towards green from red, of each such class that has any
+            [degrees].
     """
 
     images: int
@@ -99,6 +113,15 @@ class Likeness:
     same_size: int | None
     traits: tuple[Trait, ...]
     classes: dict[str, tuple[Trait, ...]]
+    hues: dict[str, float]
+
+    @property
+    def hue_advice(self) -> str:
+        """What to change, if photographs show the colours of classes turned; empty otherwise."""
+        turned = list(self.hues.values())
+        if not turned or np.median(np.abs(turned)) < _TURNED:
+            return ""
+        return "have the camera turn colours as far, by randomise.hue, and more by randomise.chroma_stretch"
 
 
 def compare_with_photographs(
@@ -134,10 +157,11 @@ def compare_with_photographs(
     ours = _evenly([sample for one in sets for sample in one.samples], most)
     theirs = _evenly(list(real.samples), most)
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
+    hues: tuple[_Hues, _Hues] = defaultdict(_no_hues), defaultdict(_no_hues)
     for number, sample in enumerate(ours + theirs):
         if progress is not None:
             progress(number, len(ours) + len(theirs), "measuring images")
-        _measure(sample, size, sides[number >= len(ours)])
+        _measure(sample, size, sides[number >= len(ours)], hues[number >= len(ours)])
 
     def traits_of(index: int | None) -> tuple[Trait, ...]:
         shown = [key for key in _TRAITS if all(side.get((key, index)) for side in sides)]
@@ -149,9 +173,33 @@ def compare_with_photographs(
         for index, name in enumerate(real.class_names)
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
+    indices = {name: real.class_names.index(name) for name in classes}
+    coloured = {name: index for name, index in indices.items() if all(side[index].any() for side in hues)}
+    turned = {name: _turn(hues[0][index], hues[1][index]) for name, index in coloured.items()}
     larger = _larger(sides, len(real.class_names))
     same_size = None if larger is None else max(round(size * larger / STRIDE), 1) * STRIDE
-    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes)
+    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, turned)
+
+
+def _no_hues() -> Float64Array:
+    return np.zeros(_HUES)
+
+
+def _hues_of(pixels: ByteImage) -> Float64Array:
+    """Shares of hues among pixels (N, 3), BGR, by how far they are from grey, shape (_HUES,); 0 where all are grey."""
+    hue = cv2.cvtColor(pixels[None].astype(np.float32) / 255, cv2.COLOR_BGR2HSV)[0, :, 0]
+    chroma = np.ptp(pixels.astype(float), axis=1)
+    places = (hue * (_HUES / 360)).astype(np.intp) % _HUES
+    found = np.bincount(places, chroma * (chroma >= _COLOURED), _HUES)
+    return np.asarray(found / max(found.sum(), 1.0))
+
+
+def _turn(ours: Float64Array, theirs: Float64Array) -> float:
+    """Degrees by which hues must be turned so that they overlap most with others."""
+    smooth, wanted = (gaussian_filter1d(side / side.sum(), 2.0, mode="wrap") for side in (ours, theirs))
+    turns = sorted(range(-_FARTHEST, _FARTHEST + 1), key=abs)
+    overlaps = [float(np.minimum(np.roll(smooth, turn), wanted).sum()) for turn in turns]
+    return 360 / _HUES * turns[int(np.argmax(overlaps))]
 
 
 def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:
@@ -169,7 +217,7 @@ def _evenly(samples: list[Sample], most: int) -> list[Sample]:
     return [samples[place] for place in places]
 
 
-def _measure(sample: Sample, size: int, values: _Values) -> None:
+def _measure(sample: Sample, size: int, values: _Values, hues: _Hues) -> None:
     """Add what an image shows at a longer side of ``size`` pixels."""
     stored = cv2.imread(str(sample.path), cv2.IMREAD_COLOR)
     if stored is None:
@@ -189,6 +237,7 @@ def _measure(sample: Sample, size: int, values: _Values) -> None:
             values[_WHOLE, instance.class_index].append(side)
         inside = _inside(instance, sample, width, height)
         if inside.sum() >= _SMALLEST:
+            hues[instance.class_index] += _hues_of(picture[inside])
             pixels = picture[inside].astype(float)
             most = pixels.max(axis=1)
             saturation = (most - pixels.min(axis=1)) / np.maximum(most, 1)

@@ -14,7 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
-from mitsplat.colour import LUMINANCE, encode_srgb, hue_matrix, saturation_matrix, white_balance_matrix
+from mitsplat.colour import (
+    LUMINANCE,
+    chroma_matrix,
+    encode_srgb,
+    hue_matrix,
+    saturation_matrix,
+    white_balance_matrix,
+)
 from mitsplat.plugins.device import wrapped
 from mitsplat.render.layers import Layers, device_array, host_array
 from mitsplat.spec.image import Composite, ImageShadow, Sensor
@@ -99,9 +106,10 @@ def develop(
     Args:
         linear: Linear sRGB, 1 = display white.
         draws: ``exposure`` [stops], ``vignetting`` [stops in the corners], ``chromatic_aberration`` [px in the
-            corners, red outwards and blue inwards], ``motion_blur`` [px] along ``motion_angle``
-            [degrees], ``iso``, ``white_balance`` [K], ``hue`` [degrees], ``saturation``, ``sharpening`` [share of what
-            exceeds a blur of 1 px], ``jpeg`` [quality]; what is missing changes nothing.
+            corners, red outwards and blue inwards], ``motion_blur`` [px] along ``motion_angle`` [degrees], ``iso``,
+            ``white_balance`` [K], ``chroma_stretch`` along ``chroma_angle`` [degrees], ``hue`` [degrees],
+            ``saturation``, ``sharpening`` [share of what exceeds a blur of 1 px], ``jpeg`` [quality]; what is missing
+            changes nothing.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
         sensor: What turns ``iso`` into noise.
         seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
@@ -142,6 +150,7 @@ def develop_layers(
         white_balance=draws.get("white_balance", 6504.0),
         hue=draws.get("hue", 0.0),
         saturation=draws.get("saturation", 1.0),
+        chroma=(draws.get("chroma_stretch", 1.0), draws.get("chroma_angle", 0.0)),
     )
     if not np.array_equal(matrix, np.eye(3)):
         linear = mi.Color3f(*[sum(_opaque(m) * c for m, c in zip(row, linear, strict=True)) for row in matrix])
@@ -335,15 +344,24 @@ def _compressed(image: ByteImage, quality: int) -> ByteImage:
     return np.ascontiguousarray(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)[..., ::-1])
 
 
-def colour_matrix(*, white_balance: float = 6504.0, hue: float = 0.0, saturation: float = 1.0) -> Float64Array:
-    """One 3x3 matrix on linear sRGB for white balance, hue and saturation.
+def colour_matrix(
+    *,
+    white_balance: float = 6504.0,
+    hue: float = 0.0,
+    saturation: float = 1.0,
+    chroma: tuple[float, float] = (1.0, 0.0),
+) -> Float64Array:
+    """One 3x3 matrix on linear sRGB for white balance, chroma, hue and saturation, in this order.
 
-    White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; hue turns colours
-    about the grey axis; saturation scales their distance from the grey of the same luminance.
+    White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; chroma is a factor and
+    an angle of :func:`mitsplat.colour.chroma_matrix`; hue turns colours about the grey axis; saturation scales their
+    distance from the grey of the same luminance.
     """
     matrix = np.eye(3)
     if white_balance != 6504.0:
         matrix = white_balance_matrix(float(white_balance))
+    if chroma[0] != 1.0:
+        matrix = chroma_matrix(*chroma) @ matrix
     if hue:
         matrix = hue_matrix(hue) @ matrix
     if saturation != 1.0:

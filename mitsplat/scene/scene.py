@@ -38,6 +38,7 @@ from mitsplat.scene.references import (
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.viewpoints import View, camera_at, view_of
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
+from mitsplat.spec.image import Randomise
 from mitsplat.spec.lights import LightEntry, LightSpec
 from mitsplat.spec.objects import MAIN, ObjectSpec
 from mitsplat.spec.shapes import Region
@@ -46,9 +47,11 @@ from mitsplat.yaml_input import key_place, load_yaml
 
 _DRAWN = (
     *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
-    *("white_balance", "hue", "saturation", "sharpening", "jpeg"),
+    *("white_balance", "hue", "saturation", "chroma_stretch", "chroma_angle", "sharpening", "jpeg"),
 )
 """What is drawn anew for every frame."""
+_ANGLES = {"motion_angle": 360.0, "chroma_angle": 180.0}
+"""Those that are drawn from a full turn, or from all axes [degrees]."""
 
 _MADE_IN_PYTHON = "<python>.yaml"
 """Name of the scene file that a scene made in Python has not: errors begin with it, datasets keep such a file."""
@@ -332,13 +335,22 @@ def plan_frame(
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))
             for name in _DRAWN
-            if (bounds := (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)) is not None
-            and (name not in ("chromatic_aberration", "sharpening") or any(bounds))
+            if (bounds := _drawn_from(ranges, name)) is not None
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
         viewpoint=here.drawn,
         belt=belt_of(spec, view),
     )
+
+
+def _drawn_from(ranges: Randomise, name: str) -> tuple[float, float] | None:
+    """The range of what is drawn for a frame, None if the scene has none of it."""
+    if name in ("chromatic_aberration", "sharpening") and not any(getattr(ranges, name)):
+        return None
+    if name in ("chroma_stretch", "chroma_angle") and ranges.chroma_stretch == (1.0, 1.0):
+        return None
+    bounds: tuple[float, float] | None = (0.0, _ANGLES[name]) if name in _ANGLES else getattr(ranges, name)
+    return bounds
 
 
 def scene_json_schema() -> dict[str, Any]:

@@ -26,6 +26,12 @@ class Randomise(StrictModel):
     exposure: Range = Field((0.0, 0.0), description="Exposure [stops].")
     hue: Range = Field((0.0, 0.0), description="Hue shift [degrees].")
     saturation: NonNegativeRange = Field((1.0, 1.0), description="Factor on saturation.")
+    chroma_stretch: PositiveRange = Field(
+        (1.0, 1.0),
+        exclude_if=lambda stretch: stretch == (1.0, 1.0),
+        description="How many times farther from grey the camera shows a hue and its opposite, and nearer the hues "
+        "between, in a direction drawn anew: cameras show colours each in its own way, and greys alike.",
+    )
     white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)] = Field(
         (6504.0, 6504.0), description="Correlated colour temperature that is shown as white [K]."
     )

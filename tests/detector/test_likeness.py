@@ -54,6 +54,19 @@ def test_what_is_measured_is_what_was_painted(rendered: Path, photographs: Path)
     assert trait(found, "objects of an image").real[::2] == (1, 2)
 
 
+@pytest.mark.parametrize("turn", [0, -21, 15])
+def test_hues_that_a_camera_turns_are_told(rendered: Path, photographs: Path, turn: int) -> None:
+    def turned(image: np.ndarray) -> np.ndarray:
+        hsv = cv2.cvtColor((image / 255).astype(np.float32), cv2.COLOR_BGR2HSV)
+        hsv[..., 0] = (hsv[..., 0] + turn) % 360
+        return 255 * cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)
+
+    change(photographs, turned)
+    found = compare_with_photographs([rendered], photographs, size=WIDTH)
+    assert found.hues == {name: pytest.approx(turn, abs=3) for name in HUES}
+    assert bool(found.hue_advice) == (turn != 0)
+
+
 def test_photographs_that_show_things_small_are_searched_large(tmp_path: Path, rendered: Path) -> None:
     photographs = write_coco(tmp_path / "photographs", 20, form="boxes", first=1000)
     labels = json.loads((photographs / "labels.json").read_text())

@@ -53,6 +53,16 @@ def test_hue_turns_and_keeps_grey() -> None:
     np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
 
 
+@pytest.mark.parametrize("angle", [0.0, 50.0, 120.0])
+def test_chroma_is_stretched_along_a_hue_and_its_opposite(angle: float) -> None:
+    """Hues are those of colours about the grey axis: at 120 degrees from red lies green."""
+    turned, across = colour_matrix(hue=angle) @ [1, 0, 0], colour_matrix(hue=angle + 90) @ [1, 0, 0]
+    matrix, grey = colour_matrix(chroma=(1.5, angle)), np.full(3, 1 / 3)
+    np.testing.assert_allclose(matrix @ (turned - grey), 1.5 * (turned - grey), atol=1e-12)
+    np.testing.assert_allclose(matrix @ (across - grey), (across - grey) / 1.5, atol=1e-12)
+    np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
+
+
 def test_saturation_zero_is_grey_of_equal_luminance() -> None:
     grey = colour_matrix(saturation=0.0) @ [0.2, 0.6, 0.1]
     np.testing.assert_allclose(grey, 0.2126 * 0.2 + 0.7152 * 0.6 + 0.0722 * 0.1, rtol=1e-6)
@@ -186,8 +196,11 @@ def test_motion_blur_is_a_correlation_beyond_replicated_borders(length: float, a
 def test_other_draws_compile_nothing() -> None:
     linear = np.random.default_rng(2).random((30, 40, 3)).astype(np.float32)
     names = ("exposure", "vignetting", "motion_blur", "motion_angle", "iso", "white_balance", "hue", "saturation")
-    names += ("chromatic_aberration",)
-    drawn = [(0.3, 0.5, 3.0, 20.0, 200.0, 5000.0, 3.0, 1.1, 0.7), (-0.2, 0.9, 11.0, 80.0, 900.0, 7e3, -5.0, 0.9, -2.0)]
+    names += ("chromatic_aberration", "chroma_stretch", "chroma_angle")
+    drawn = [
+        (0.3, 0.5, 3.0, 20.0, 200.0, 5000.0, 3.0, 1.1, 0.7, 1.2, 30.0),
+        (-0.2, 0.9, 11.0, 80.0, 900.0, 7e3, -5.0, 0.9, -2.0, 0.9, 80.0),
+    ]
 
     def kernels(draws: tuple[float, ...], seed: int) -> set[Any]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -363,6 +363,18 @@ def test_draws_fill_their_ranges(random_scene: Scene) -> None:
     assert all(-1 <= exposure <= 1 for exposure in exposures)
 
 
+def test_colours_of_a_camera_are_drawn_where_a_scene_asks_for_them(random_scene: Scene) -> None:
+    spec = random_scene.spec
+    varied = spec.model_copy(update={"randomise": spec.randomise.model_copy(update={"chroma_stretch": (1.0, 1.4)})})
+    plain = plan_frame(random_scene, 3).draws
+    draws = [plan_frame(replace(random_scene, spec=varied), index).draws for index in range(12)]
+    assert draws[3].keys() - plain.keys() == {"chroma_stretch", "chroma_angle"}
+    assert all(draws[3][name] == value for name, value in plain.items())
+    stretches, angles = ([one[name] for one in draws] for name in ("chroma_stretch", "chroma_angle"))
+    assert 1 <= min(stretches) < 1.2 < max(stretches) <= 1.4
+    assert 0 <= min(angles) < 60 and 120 < max(angles) <= 180
+
+
 def test_light_factor_is_drawn_once_per_layout(random_scene: Scene) -> None:
     radiance = [plan_frame(random_scene, index).lights[0].radiance for index in range(12)]
     assert len(set(radiance)) == 3

@@ -18,6 +18,8 @@ from mitsplat.mesh import contact_points, join_meshes
 from mitsplat.warp_start import quiet_warp
 
 _SAMPLES, _BATCH = 4000, 256
+ROUNDING = 1e-6
+"""By how much distances in single precision may err [m], and more."""
 _FAR = 1e6  # farther than any inside point is from its surface [m]
 
 
@@ -119,8 +121,9 @@ def clearance(first: PlacedSurface, second: PlacedSurface, *, reach: float) -> C
     if apart.any():
         return Clearance(first, second, reach)
     distance = second.signed_distance(first.points, reach)
-    # What is measured the other way can only be nearer.
-    return Clearance(first, second, first.signed_distance(second.points, distance))
+    # The other way only what is nearer counts; of points in a mesh, which may have holes, all count.
+    nearer = reach if distance < 0 else distance + ROUNDING
+    return Clearance(first, second, min(distance, first.signed_distance(second.points, nearer)))
 
 
 def all_clearances(

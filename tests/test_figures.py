@@ -66,6 +66,10 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     assert synthetic.startswith("| `synthetic` | 2 | 0.410 | ") and synthetic.endswith("| 0.820 | – | – |")
     assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")  # of the same views
     assert earlier.endswith("| – | – |")  # of other scenes
+    results["detector.experiment-no_shadow-0"]["figures"]["scenes"] = ["of later ones", ""]
+    results["detector.experiment-real-0"]["figures"]["scenes"] = ["", ""]
+    *_, shadow, real, _, _ = experiment_table(results).splitlines()
+    assert shadow.endswith("| – | – |") and real.endswith("| `synthetic` | 0.150 to 0.170 |")
     *_, shadow, synthetic = experiment_table(results, "workshop").splitlines()
     assert shadow.endswith("| `synthetic` | 0.100 to 0.100 |") and synthetic.startswith("| `synthetic` | 1 | 0.300 | ")
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import fcntl
+import hashlib
 import json
 import re
 import shutil
@@ -54,6 +55,18 @@ def scenes_of(arm: Mapping[str, Any]) -> list[str]:
 def result_of(arm: str, seed: int, plan: Path = PLAN) -> str:
     """The name of what is recorded of an arm and a seed."""
     return f"detector.experiment-{arm}-{seed}" + ("" if plan == PLAN else f"-plan_{plan.stem}")
+
+
+def state_of_scenes(plan: Mapping[str, Any], arm: str) -> str:
+    """A hash of the scenes that an arm learns from, but for its own change: arms of others are not compared.
+
+    Empty if there are none.
+    """
+    unchanged = [scene.partition("+")[0] for scene in scenes_of(plan["arms"][arm])]
+    if not unchanged:
+        return ""
+    said = [plan["changes"][scene] for scene in unchanged]
+    return hashlib.sha256(((HERE / plan["scene"]).read_text() + json.dumps(said)).encode()).hexdigest()[:16]
 
 
 def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
@@ -229,6 +242,7 @@ def measure(options: argparse.Namespace) -> None:
         "",
         "samples",
     )
+    figure(state_of_scenes(plan, options.arm), "", "scenes")
     figure("random" if trained.record["settings"]["weights"] is None else "COCO", "", "start")
     print(f"{options.arm} {options.seed}: mAP50-95 {whole.map50_95:.3f}, mAP50 {whole.map50:.3f}")
 

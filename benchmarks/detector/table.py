@@ -17,7 +17,7 @@ OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*|scattered
 EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000", "images_3177"})
 """Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
 OF_ANOTHER = {"traced_shadow": "images_3177", "hybrid_more": "hybrid_cut", "hybrid_large": "hybrid_cut"}
-"""Arms that are compared with the one from which they differ in one thing."""
+"""Arms that are compared with the one that they are a variant of."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 
@@ -37,7 +37,8 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
         strict, loose = (_mean(seeds[arm], key) for key in ("map50_95", "map50"))
         reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else OF_ANOTHER.get(arm, REFERENCE)
         compared = "– | –"
-        if arm != reference and reference in draws and not (arm in EARLIER and plan == "arms"):
+        known = reference in seeds and _of_same_scenes(seeds[arm], seeds[reference])
+        if arm != reference and known and not (arm in EARLIER and plan == "arms"):
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"
         count = len(seeds[arm])
         lines.append(f"| `{arm}` | {count} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")
@@ -77,6 +78,12 @@ def _by_arm(results: Mapping[str, Mapping[str, Any]], plan: str, *wanted: str) -
     if missing := [arm for arm in wanted if arm not in seeds]:
         raise KeyError(f"no result of {missing[0]} in {plan}.yaml")
     return dict(seeds)
+
+
+def _of_same_scenes(*arms: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether arms learnt from scenes of one description, or from none."""
+    stated = {tuple(one.get("scenes", [None])) for arm in arms for one in arm}
+    return len(stated - {("", "")}) <= 1
 
 
 def _redrawn(samples: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -104,8 +104,8 @@ class Likeness:
             smaller, of objects that no border cuts. None if no class is shown often enough by both.
         traits: Of all of them.
         classes: Brightness and saturation of each class that both show often enough.
-        hues: By how much photographs show its colours turned, towards green from red, of each such class that has any
-            [degrees].
+        hues: By how much photographs show its colours turned, towards green from red, of each such class of which that
+            can be told [degrees].
     """
 
     images: int
@@ -176,9 +176,10 @@ def compare_with_photographs(
     indices = {name: real.class_names.index(name) for name in classes}
     coloured = {name: index for name, index in indices.items() if all(side[index].any() for side in hues)}
     turned = {name: _turn(hues[0][index], hues[1][index]) for name, index in coloured.items()}
+    near = {name: turn for name, turn in turned.items() if turn is not None}
     larger = _larger(sides, len(real.class_names))
     same_size = None if larger is None else max(round(size * larger / STRIDE), 1) * STRIDE
-    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, turned)
+    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, near)
 
 
 def _no_hues() -> Float64Array:
@@ -186,20 +187,21 @@ def _no_hues() -> Float64Array:
 
 
 def _hues_of(pixels: ByteImage) -> Float64Array:
-    """Shares of hues among pixels (N, 3), BGR, by how far they are from grey, shape (_HUES,); 0 where all are grey."""
+    """How far from grey pixels (N, 3), BGR, are by their hues, of all of them [bytes], shape (_HUES,)."""
     hue = cv2.cvtColor(pixels[None].astype(np.float32) / 255, cv2.COLOR_BGR2HSV)[0, :, 0]
     chroma = np.ptp(pixels.astype(float), axis=1)
     places = (hue * (_HUES / 360)).astype(np.intp) % _HUES
     found = np.bincount(places, chroma * (chroma >= _COLOURED), _HUES)
-    return np.asarray(found / max(found.sum(), 1.0))
+    return np.asarray(found / len(pixels))
 
 
-def _turn(ours: Float64Array, theirs: Float64Array) -> float:
-    """Degrees by which hues must be turned so that they overlap most with others."""
+def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
+    """Degrees by which hues must be turned so that they overlap most with others; None if that is not near."""
     smooth, wanted = (gaussian_filter1d(side / side.sum(), 2.0, mode="wrap") for side in (ours, theirs))
     turns = sorted(range(-_FARTHEST, _FARTHEST + 1), key=abs)
     overlaps = [float(np.minimum(np.roll(smooth, turn), wanted).sum()) for turn in turns]
-    return 360 / _HUES * turns[int(np.argmax(overlaps))]
+    best = turns[int(np.argmax(overlaps))]
+    return None if abs(best) == _FARTHEST else 360 / _HUES * best
 
 
 def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.mesh_distance import PlacedSurface, Surface, clearance
+from mitsplat.mesh_distance import ROUNDING, PlacedSurface, Surface, clearance
 from mitsplat.scene.walls import PILE_HEIGHT
 from mitsplat.spec.objects import Arrangement
 from mitsplat.spec.shapes import Region
@@ -317,7 +317,8 @@ class _Draw:
         while True:
             placed, distance = PlacedSurface("", self._items[i].surface, pose), reach
             for obstacle in obstacles:
-                distance = clearance(placed, obstacle, reach=distance).distance
+                nearer = clearance(placed, obstacle, reach=max(distance, 0.0) + ROUNDING).distance
+                distance = min(distance, nearer)
             if distance < _HOVER:
                 return distance > 0
             if placed.bounds[1][2] < floor:

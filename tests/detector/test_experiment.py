@@ -102,6 +102,7 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
     assert len(seen) == (1 if arm == "synthetic" else 5)
     assert all(len(names) == (0 if arm == "synthetic" else 8) for names in seen.values())
     assert figures["map50_95"] == pytest.approx(1.0 if arm != "synthetic" else 0.9, abs=0.01)
+    assert (figures["scenes"] == "") == (arm == "real")
     assert (figures["scene.1"], figures["scene.0"] < 1) == (pytest.approx(1.0), arm == "synthetic")
     assert len(figures["samples"]) == experiment.SAMPLES
 

@@ -50,8 +50,6 @@ _DRAWN = (
     *("white_balance", "hue", "saturation", "chroma_stretch", "chroma_angle", "sharpening", "jpeg"),
 )
 """What is drawn anew for every frame."""
-_ANGLES = {"motion_angle": 360.0, "chroma_angle": 180.0}
-"""Those that are drawn from a full turn, or from all axes [degrees]."""
 
 _MADE_IN_PYTHON = "<python>.yaml"
 """Name of the scene file that a scene made in Python has not: errors begin with it, datasets keep such a file."""
@@ -349,7 +347,7 @@ def _drawn_from(ranges: Randomise, name: str) -> tuple[float, float] | None:
         return None
     if name in ("chroma_stretch", "chroma_angle") and ranges.chroma_stretch == (1.0, 1.0):
         return None
-    bounds: tuple[float, float] | None = (0.0, _ANGLES[name]) if name in _ANGLES else getattr(ranges, name)
+    bounds: tuple[float, float] | None = (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)
     return bounds
 
 

@@ -30,7 +30,13 @@ class Randomise(StrictModel):
         (1.0, 1.0),
         exclude_if=lambda stretch: stretch == (1.0, 1.0),
         description="How many times farther from grey the camera shows a hue and its opposite, and nearer the hues "
-        "between, in a direction drawn anew: cameras show colours each in its own way, and greys alike.",
+        "between: cameras show colours each in its own way, and greys alike.",
+    )
+    chroma_angle: Range = Field(
+        (0.0, 180.0),
+        exclude_if=lambda angle: angle == (0.0, 180.0),
+        description="Angle of that hue from red, towards green [degrees]: at 0 blue is seen nearer to cyan, and orange "
+        "to red.",
     )
     white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)] = Field(
         (6504.0, 6504.0), description="Correlated colour temperature that is shown as white [K]."

@@ -66,7 +66,7 @@ _Values: TypeAlias = dict[tuple[str, int | None], list[float]]
 """Values of a trait: of all objects or images, and of those of a class by its index."""
 
 _Hues: TypeAlias = dict[int, Float64Array]
-"""Sums of shares of hues of the objects of a class, by its index, shape (_HUES,)."""
+"""Sums over the objects of a class, by its index, of what :func:`_hues_of` tells of each."""
 
 
 @dataclass(frozen=True)
@@ -173,13 +173,14 @@ def compare_with_photographs(
         for index, name in enumerate(real.class_names)
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
-    indices = {name: real.class_names.index(name) for name in classes}
-    coloured = {name: index for name, index in indices.items() if all(side[index].any() for side in hues)}
-    turned = {name: _turn(hues[0][index], hues[1][index]) for name, index in coloured.items()}
-    near = {name: turn for name, turn in turned.items() if turn is not None}
+    turned = {
+        name: turn
+        for index, name in enumerate(real.class_names)
+        if name in classes and (turn := _turn(hues[0][index], hues[1][index])) is not None
+    }
     larger = _larger(sides, len(real.class_names))
     same_size = None if larger is None else max(round(size * larger / STRIDE), 1) * STRIDE
-    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, near)
+    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, turned)
 
 
 def _no_hues() -> Float64Array:
@@ -196,7 +197,9 @@ def _hues_of(pixels: ByteImage) -> Float64Array:
 
 
 def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
-    """Degrees by which hues must be turned so that they overlap most with others; None if that is not near."""
+    """Degrees by which hues must be turned so that they overlap most with others; None if none are there or near."""
+    if not (ours.any() and theirs.any()):
+        return None
     smooth, wanted = (gaussian_filter1d(side / side.sum(), 2.0, mode="wrap") for side in (ours, theirs))
     turns = sorted(range(-_FARTHEST, _FARTHEST + 1), key=abs)
     overlaps = [float(np.minimum(np.roll(smooth, turn), wanted).sum()) for turn in turns]

@@ -16,7 +16,15 @@ FIRST = "traced_shadow"
 OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*|scattered|floating|meshes")
 EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000", "images_3177"})
 """Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
-OF_ANOTHER = {"traced_shadow": "images_3177", "hybrid_more": "hybrid_cut", "hybrid_large": "hybrid_cut"}
+BEFORE = frozenset({"images_3087"})
+"""Those that are compared with what is drawn now, to tell what the scenes' change gave."""
+OF_ANOTHER = {
+    "traced_shadow": "images_3177",
+    "large": "images_3087",
+    "hybrid_cut": "images_3087",
+    "hybrid_more": "hybrid_cut",
+    "hybrid_large": "hybrid_cut",
+}
 """Arms that are compared with the one that they are a variant of."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
@@ -37,7 +45,7 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
         strict, loose = (_mean(seeds[arm], key) for key in ("map50_95", "map50"))
         reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else OF_ANOTHER.get(arm, REFERENCE)
         compared = "– | –"
-        known = reference in seeds and _of_same_scenes(seeds[arm], seeds[reference])
+        known = reference in seeds and (arm in BEFORE or _of_same_scenes(seeds[arm], seeds[reference]))
         if arm != reference and known and not (arm in EARLIER and plan == "arms"):
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"
         count = len(seeds[arm])

@@ -1,9 +1,8 @@
-"""From photographs to captures: a rendered one whose truth is known, cameras that are given, and hopeless folders."""
+"""From photographs to captures: a rendered one whose truth is known, and hopeless folders."""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import signal
 import sqlite3
@@ -21,19 +20,14 @@ from PIL import ExifTags, Image, ImageFilter
 
 from benchmarks.assets.photographing import photograph
 from mitsplat.camera import Camera
-from mitsplat.capture import known_poses as poses
 from mitsplat.capture import pipeline as take
 from mitsplat.capture import structure_from_motion as sfm
-from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.masks import agreed_masks, geometric_masks, object_masks, object_points
+from mitsplat.capture.capture import Capture
 from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
-from mitsplat.capture.photos import Prepared, prepare_photos
-from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, _hidden_parts, capture_photos
+from mitsplat.capture.photos import Prepared
+from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.isolation import ChosenObject
-from mitsplat.reconstruct.evaluation import iou
 from tests import rendered
 from tests.cli.typed import run
 
@@ -108,44 +102,6 @@ def test_a_capture_that_is_made_anew_is_none_until_it_is_whole(
         Capture.load(out)
 
 
-def overlap(mask: np.ndarray, true: Camera) -> float:
-    """IoU of a mask with the rendered box, seen by its true camera."""
-    corners = rendered.BOX * (np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [0, 1]), axis=-1).reshape(-1, 3))
-    hull = cv2.convexHull(true.project(corners)[0].astype(np.float32))
-    outline = np.zeros(rendered.SIZE[::-1], dtype=np.uint8)
-    cv2.fillConvexPoly(outline, np.rint((hull - 0.5) * 16).astype(np.int32), 1, shift=4)
-    return float(np.sum(mask & (outline > 0)) / np.sum(mask | (outline > 0)))
-
-
-def test_the_rendered_object_is_cut_out(
-    photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult]
-) -> None:
-    overlaps = []
-    for photo in captured[2].capture.photos:
-        alpha = photo.picture()[1]
-        assert alpha is not None
-        overlaps.append(overlap(alpha > 0.5, photos[1][photo.name]))
-    assert np.median(overlaps) > 0.97
-    assert min(overlaps) > 0.95
-
-
-def test_masks_are_set_right_by_those_of_other_photos(
-    photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult], tmp_path: Path
-) -> None:
-    """A mask that spills over the table and a photo that was refused one are like the others afterwards."""
-    capture = captured[2].capture
-    spilt = np.zeros(rendered.SIZE[::-1], dtype=np.uint8)
-    spilt[60:330, 90:400] = 255
-    Image.fromarray(spilt).save(tmp_path / "spilt.png")
-    assert overlap(spilt > 0, photos[1][capture.photos[4].name]) < 0.5
-    wrong = [replace(photo, mask=tmp_path / "spilt.png") if k == 4 else photo for k, photo in enumerate(capture.photos)]
-    del wrong[9]
-    make = agreed_masks(replace(capture, photos=tuple(wrong)), object_points(capture))
-    for number in (4, 9):
-        photo = capture.photos[number]
-        assert overlap(make(replace(photo, mask=None)), photos[1][photo.name]) > 0.95
-
-
 def test_pycolmap_stays_in_its_own_process(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
     assert "pycolmap" not in sys.modules
     assert zlib.decompress(zlib.compress(b"a" * 10000)) == b"a" * 10000
@@ -170,174 +126,6 @@ def test_a_finished_capture_is_not_made_again(
     assert (again.given, again.source) == (result.given, result.source)
     with pytest.raises(AssertionError, match="COLMAP was run again"):
         capture_photos(given, out, CaptureSettings(board=rendered.BOARD, max_size=400))
-
-
-def write_colmap_text(folder: Path, capture: Capture) -> None:
-    """The capture as COLMAP's text files, with points."""
-    from scipy.spatial.transform import Rotation
-
-    folder.mkdir()
-    cameras, images, tracks = [], [], [[] for _ in capture.points]
-    for number, photo in enumerate(capture.photos, start=1):
-        camera, pose = photo.camera, photo.camera.camera_from_world
-        k1, k2, p1, p2 = camera.distortion or (0.0,) * 4
-        cameras.append(
-            f"{number} OPENCV {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r} "
-            f"{k1!r} {k2!r} {p1!r} {p2!r}"
-        )
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-        images.append(" ".join(map(str, (number, w, x, y, z, *pose[:3, 3].tolist(), number, photo.name))))
-        pixels, _ = camera.project(capture.points[photo.seen])
-        images.append(" ".join(f"{u} {v} {k + 1}" for (u, v), k in zip(pixels.tolist(), photo.seen, strict=True)))
-        for place, k in enumerate(photo.seen):
-            tracks[k].append(f"{number} {place}")
-    points = [
-        " ".join(map(str, (k + 1, *point.tolist(), *colour.tolist(), 0.1, *track)))
-        for k, (point, colour, track) in enumerate(zip(capture.points, capture.colours, tracks, strict=True))
-    ]
-    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-
-
-def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
-    given, _, result = captured
-    write_colmap_text(tmp_path / "model", result.capture)
-    settings = CaptureSettings(kind="environment", poses=tmp_path / "model", metric=True, max_size=240)
-    capture = capture_photos(given, tmp_path / "out", settings).capture
-    assert (capture.units, capture.up) == ("metre", "z")
-    np.testing.assert_allclose(capture.points, result.capture.points, atol=1e-12)
-    for one, other in zip(capture.photos, result.capture.photos, strict=True):
-        np.testing.assert_allclose(one.camera.world_from_camera, other.camera.world_from_camera, atol=1e-9)
-        assert one.camera.fx == pytest.approx(other.camera.fx / 2)
-        np.testing.assert_array_equal(one.seen, other.seen)
-    (tmp_path / "model/images.txt").write_text("1 0.5 broken\n")
-    with pytest.raises(InputError, match="model: not a readable COLMAP model"):
-        capture_photos(given, tmp_path / "broken", settings)
-
-
-def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
-    folder, truth = (
-        tmp_path / "four",
-        {name: photos[1][name] for name in ("photo00.png", "photo01.png", "photo02.png", "photo03.png")},
-    )
-    folder.mkdir()
-    for name in truth:
-        shutil.copy(photos[0] / name, folder)
-    frames = [
-        {
-            "file_path": f"./images/{Path(name).stem}",
-            "transform_matrix": (c.world_from_camera * (1, -1, -1, 1)).tolist(),
-        }
-        for name, c in truth.items()
-    ]
-    camera = next(iter(truth.values()))
-    content = {"camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx), "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=480)
-    model = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
-    for name, true in truth.items():
-        np.testing.assert_allclose(model.cameras[name].world_from_camera, true.world_from_camera, atol=1e-12)
-        assert model.cameras[name].fx == pytest.approx(true.fx)
-    assert len(model.points) > 30
-    assert np.median(np.abs(model.points[:, 2])) < 2e-3  # most are on the board, z = 0
-    content["frames"][1]["transform_matrix"][0][0] = 7
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"transforms\.json: frames\[1\]: world_from_camera must be a rotation"):
-        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
-    (tmp_path / "transforms.json").write_text('{"frames": []}')
-    with pytest.raises(InputError, match=r"transforms\.json: frames: "):
-        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
-
-
-def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
-    given, _, result = captured
-    write_colmap_text(tmp_path / "model", result.capture)
-    (tmp_path / "masks").mkdir()
-    for photo in result.capture.photos:
-        mask = Image.new("L", rendered.SIZE)
-        mask.paste(255, (100, 80, 300, 250))
-        mask.save(tmp_path / "masks" / f"{Path(photo.name).stem}.png")
-    Image.new("L", rendered.SIZE).save(tmp_path / "masks/photo03.png")
-    settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
-    capture = capture_photos(given, tmp_path / "out", settings).capture
-    assert capture.rejected["photo03.png"] == "its mask covers only 0.0% of it"
-    assert len(capture.photos) == 15
-    alpha = capture.photos[0].picture()[1]
-    assert alpha is not None
-    assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
-    (tmp_path / "masks/photo05.png").unlink()
-    with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
-        capture_photos(given, tmp_path / "out", settings)
-    Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")
-    with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 480x360 px \(got 300x300\)"):
-        capture_photos(given, tmp_path / "out", settings)
-
-
-def test_photos_in_which_another_thing_stands_before_the_object_are_left_out() -> None:
-    rng = np.random.default_rng(0)
-    ball = rng.normal(size=(400, 3))
-    ball *= 0.04 / np.linalg.norm(ball, axis=1, keepdims=True)
-    photos = tuple(
-        Photo(f"{turn:03}.jpg", Path("none.jpg"), Camera.look_at(eye, (0, 0, 0), width=320, height=240, fov_x=40))
-        for turn in range(0, 360, 45)
-        for eye in [(0.4 * np.cos(np.radians(turn)), 0.4 * np.sin(np.radians(turn)), 0.1)]
-    )
-    capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3)), rejected={"blurred.jpg": "it is blurred"})
-    found, hidden = _hidden_parts(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
-    assert [photo.name for photo in found.photos] == [f"{turn:03}.jpg" for turn in range(45, 360, 45)]
-    assert not hidden and found.rejected.keys() == {"blurred.jpg", "000.jpg"}
-    assert re.fullmatch(r"another thing stands before the object and may hide \d+% of it", found.rejected["000.jpg"])
-    aside = 0.75 * ball + np.array([0.12, 0.05, 0.03])
-    found, hidden = _hidden_parts(capture, ChosenObject(ball, ball, (aside,)))
-    assert len(found.photos) == 8 and hidden.keys() == {"000.jpg", "045.jpg"}
-    pixels, _ = photos[0].camera.project(aside)
-    x, y = pixels[np.linalg.norm(pixels - (160, 120), axis=1) < 40].astype(int).T  # before the object
-    assert len(x) > 20 and hidden["000.jpg"][y, x].all() and hidden["000.jpg"].mean() < 0.2
-
-
-def test_masks_are_transparent_where_the_object_may_be_hidden(
-    captured: tuple[Path, Path, CaptureResult], tmp_path: Path
-) -> None:
-    capture = captured[2].capture
-    whole = capture.photos[1].alpha()
-    assert whole is not None and capture.photos[1].hidden() is None
-    veil = np.zeros(whole.shape, dtype=bool)
-    column = int(np.median(np.nonzero(whole)[1]))
-    veil[:, column - 5 : column + 15] = True  # across the middle: both sides stay
-    points = object_points(capture)
-    name = capture.photos[1].name
-    found = object_masks(capture, points, points[points[:, 2] > 0], tmp_path, hidden={name: veil})
-    saved = Capture.load(found.save(tmp_path / "saved") and tmp_path / "saved")
-    assert len(saved.photos) == len(capture.photos)
-    assert [photo.name for photo in saved.photos if photo.hidden() is not None] == [name]
-    photo = next(photo for photo in saved.photos if photo.name == name)
-    mask, hidden = photo.alpha(), photo.hidden()
-    assert mask is not None and hidden is not None
-    np.testing.assert_array_equal(hidden, veil)
-    assert not mask[veil].any()
-    assert iou((mask >= 0.5) & ~veil, (whole >= 0.5) & ~veil) > 0.95
-    half = photo.hidden(0.5, (column - 40, 0, 80, 80))
-    assert half is not None and half.shape == (40, 40) and half[:, 20:25].all() and not half[:, :16].any()
-
-
-def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> None:
-    capture = captured[2].capture
-    with pytest.raises(InputError, match="no object stands out of the table"):
-        object_points(replace(capture, points=capture.points * (1, 1, 0)))
-    behind = geometric_masks(np.array([[0.0, 0, 50], [0.1, 0, 50], [0, 0.1, 50]]))
-    assert not behind(capture.photos[1]).any()
-
-
-def test_a_point_beside_the_camera_changes_no_mask(captured: tuple[Path, Path, CaptureResult]) -> None:
-    """It is projected to more pixels than an integer holds."""
-    capture = captured[2].capture
-    photo, points = capture.photos[1], object_points(capture)
-    right, _, forward, centre = photo.camera.world_from_camera[:3].T
-    beside = centre + right + 1e-12 * forward
-    assert np.nanmax(np.abs(photo.camera.project(beside)[0])) > 2**31
-    mask = geometric_masks(points)(photo)
-    assert mask.any()
-    np.testing.assert_array_equal(geometric_masks(np.concatenate([points, beside[None]]))(photo), mask)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -606,35 +394,6 @@ def test_photos_of_another_thing_are_left_out(
     assert {photo.name for photo in capture.photos} == {f"photo{number:02}.png" for number in range(6)}
     assert set(capture.rejected) == {f"other{number:02}.png" for number in range(4)}
     assert "rejected: other00.png: it " in said
-
-
-def test_lenses_of_other_models_are_refused() -> None:
-    with pytest.raises(InputError, match="lens model FOV is not supported: use one of SIMPLE_PINHOLE, "):
-        sfm.opencv_camera("FOV", 4, 3, [1] * 5, np.eye(4)[:3])
-    with pytest.raises(InputError, match="a camera of lens model OPENCV_FISHEYE cannot be used: a fisheye must show"):
-        sfm.opencv_camera("OPENCV_FISHEYE", 4000, 3000, [300, 300, 2000, 1500, 0, 0, 0, 0], np.eye(4)[:3])
-
-
-def test_fisheyes_are_read(tmp_path: Path) -> None:
-    """From a COLMAP model and from a transforms.json: the angle to the axis grows as OpenCV's polynomial says."""
-    values = 300.0, 301.0, 160.0, 120.0, 0.02, -0.01, 0.003, 0.001
-    angle = 0.4
-    shown = angle * (1 + 0.02 * angle**2 - 0.01 * angle**4 + 0.003 * angle**6 + 0.001 * angle**8)
-    pixel = [[160 + 300 * shown, 120]]
-    given = tmp_path / "model"
-    given.mkdir()
-    (given / "cameras.txt").write_text(f"1 OPENCV_FISHEYE 320 240 {' '.join(map(str, values))}\n")
-    (given / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n")
-    (given / "points3D.txt").write_text("")
-    colmap = sfm.read_model(given, tmp_path / "work").cameras["a.png"]
-    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
-    frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
-    lens = dict(zip(names, values, strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV_FISHEYE"}
-    (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": [frame]}))
-    nerf = poses._read_transforms(tmp_path / "transforms.json", {}).cameras["a.png"]
-    for camera in (colmap, nerf):
-        assert camera.lens == "fisheye"
-        np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,151 @@
+"""Cameras and masks that others found: COLMAP models, NeRF transforms, folders of masks."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsplat.camera import Camera
+from mitsplat.capture import known_poses as poses
+from mitsplat.capture import structure_from_motion as sfm
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.known_poses import read_poses
+from mitsplat.capture.photos import prepare_photos
+from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
+from mitsplat.errors import InputError
+from tests import rendered
+
+
+def write_colmap_text(folder: Path, capture: Capture) -> None:
+    """The capture as COLMAP's text files, with points."""
+    from scipy.spatial.transform import Rotation
+
+    folder.mkdir()
+    cameras, images, tracks = [], [], [[] for _ in capture.points]
+    for number, photo in enumerate(capture.photos, start=1):
+        camera, pose = photo.camera, photo.camera.camera_from_world
+        k1, k2, p1, p2 = camera.distortion or (0.0,) * 4
+        cameras.append(
+            f"{number} OPENCV {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r} "
+            f"{k1!r} {k2!r} {p1!r} {p2!r}"
+        )
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+        images.append(" ".join(map(str, (number, w, x, y, z, *pose[:3, 3].tolist(), number, photo.name))))
+        pixels, _ = camera.project(capture.points[photo.seen])
+        images.append(" ".join(f"{u} {v} {k + 1}" for (u, v), k in zip(pixels.tolist(), photo.seen, strict=True)))
+        for place, k in enumerate(photo.seen):
+            tracks[k].append(f"{number} {place}")
+    points = [
+        " ".join(map(str, (k + 1, *point.tolist(), *colour.tolist(), 0.1, *track)))
+        for k, (point, colour, track) in enumerate(zip(capture.points, capture.colours, tracks, strict=True))
+    ]
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+    given, _, result = captured
+    write_colmap_text(tmp_path / "model", result.capture)
+    settings = CaptureSettings(kind="environment", poses=tmp_path / "model", metric=True, max_size=240)
+    capture = capture_photos(given, tmp_path / "out", settings).capture
+    assert (capture.units, capture.up) == ("metre", "z")
+    np.testing.assert_allclose(capture.points, result.capture.points, atol=1e-12)
+    for one, other in zip(capture.photos, result.capture.photos, strict=True):
+        np.testing.assert_allclose(one.camera.world_from_camera, other.camera.world_from_camera, atol=1e-9)
+        assert one.camera.fx == pytest.approx(other.camera.fx / 2)
+        np.testing.assert_array_equal(one.seen, other.seen)
+    (tmp_path / "model/images.txt").write_text("1 0.5 broken\n")
+    with pytest.raises(InputError, match="model: not a readable COLMAP model"):
+        capture_photos(given, tmp_path / "broken", settings)
+
+
+def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
+    folder, truth = (
+        tmp_path / "four",
+        {name: photos[1][name] for name in ("photo00.png", "photo01.png", "photo02.png", "photo03.png")},
+    )
+    folder.mkdir()
+    for name in truth:
+        shutil.copy(photos[0] / name, folder)
+    frames = [
+        {
+            "file_path": f"./images/{Path(name).stem}",
+            "transform_matrix": (c.world_from_camera * (1, -1, -1, 1)).tolist(),
+        }
+        for name, c in truth.items()
+    ]
+    camera = next(iter(truth.values()))
+    content = {"camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx), "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=480)
+    model = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+    for name, true in truth.items():
+        np.testing.assert_allclose(model.cameras[name].world_from_camera, true.world_from_camera, atol=1e-12)
+        assert model.cameras[name].fx == pytest.approx(true.fx)
+    assert len(model.points) > 30
+    assert np.median(np.abs(model.points[:, 2])) < 2e-3  # most are on the board, z = 0
+    content["frames"][1]["transform_matrix"][0][0] = 7
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"transforms\.json: frames\[1\]: world_from_camera must be a rotation"):
+        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    with pytest.raises(InputError, match=r"transforms\.json: frames: "):
+        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+
+
+def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+    given, _, result = captured
+    write_colmap_text(tmp_path / "model", result.capture)
+    (tmp_path / "masks").mkdir()
+    for photo in result.capture.photos:
+        mask = Image.new("L", rendered.SIZE)
+        mask.paste(255, (100, 80, 300, 250))
+        mask.save(tmp_path / "masks" / f"{Path(photo.name).stem}.png")
+    Image.new("L", rendered.SIZE).save(tmp_path / "masks/photo03.png")
+    settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
+    capture = capture_photos(given, tmp_path / "out", settings).capture
+    assert capture.rejected["photo03.png"] == "its mask covers only 0.0% of it"
+    assert len(capture.photos) == 15
+    alpha = capture.photos[0].picture()[1]
+    assert alpha is not None
+    assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
+    (tmp_path / "masks/photo05.png").unlink()
+    with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
+        capture_photos(given, tmp_path / "out", settings)
+    Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")
+    with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 480x360 px \(got 300x300\)"):
+        capture_photos(given, tmp_path / "out", settings)
+
+
+def test_lenses_of_other_models_are_refused() -> None:
+    with pytest.raises(InputError, match="lens model FOV is not supported: use one of SIMPLE_PINHOLE, "):
+        sfm.opencv_camera("FOV", 4, 3, [1] * 5, np.eye(4)[:3])
+    with pytest.raises(InputError, match="a camera of lens model OPENCV_FISHEYE cannot be used: a fisheye must show"):
+        sfm.opencv_camera("OPENCV_FISHEYE", 4000, 3000, [300, 300, 2000, 1500, 0, 0, 0, 0], np.eye(4)[:3])
+
+
+def test_fisheyes_are_read(tmp_path: Path) -> None:
+    """From a COLMAP model and from a transforms.json: the angle to the axis grows as OpenCV's polynomial says."""
+    values = 300.0, 301.0, 160.0, 120.0, 0.02, -0.01, 0.003, 0.001
+    angle = 0.4
+    shown = angle * (1 + 0.02 * angle**2 - 0.01 * angle**4 + 0.003 * angle**6 + 0.001 * angle**8)
+    pixel = [[160 + 300 * shown, 120]]
+    given = tmp_path / "model"
+    given.mkdir()
+    (given / "cameras.txt").write_text(f"1 OPENCV_FISHEYE 320 240 {' '.join(map(str, values))}\n")
+    (given / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n")
+    (given / "points3D.txt").write_text("")
+    colmap = sfm.read_model(given, tmp_path / "work").cameras["a.png"]
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
+    frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
+    lens = dict(zip(names, values, strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV_FISHEYE"}
+    (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": [frame]}))
+    nerf = poses._read_transforms(tmp_path / "transforms.json", {}).cameras["a.png"]
+    for camera in (colmap, nerf):
+        assert camera.lens == "fisheye"
+        np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)

@@ -35,7 +35,7 @@ from benchmarks.scale.projection import project
 TEMPLATES = ROOT / "benchmarks" / "templates"
 PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md"}
 SAID = "said.md"
-VIEWS, BYTES = 12, 2.5e5
+VIEWS, BYTES = 8, 2.5e5
 """Frames of a layout, and bytes of a frame, in the projection: those of the default scene."""
 LATE = 50
 """Commits by which a revision is older than the newest one when a caption says so."""
@@ -59,7 +59,7 @@ def projected(results: Results) -> dict[str, list[Any]]:
     frame = value_of(results, "render.frame", "whole_frame")
     rendering = max(frame) if isinstance(frame, list) else frame
     writing = value_of(results, "labels.cost", "yolo_coco.write")
-    settle = value_of(results, "physics.settle-share", "warp.cpu")
+    settle = value_of(results, "physics.settle-share", "mujoco.cpu")
     found = project(rendering + writing, BYTES, settle, VIEWS)
     figures: dict[str, list[Any]] = {
         "rendering": [rendering, "s"],

@@ -97,13 +97,18 @@ def mass_properties(
         density: [kg/m^3]; ignored where ``mass`` is given.
         mass: [kg] or None.
     """
-    solid = mesh if mesh.is_watertight and mesh.is_winding_consistent else join_meshes(pieces)
+    solid = solid_of(mesh, pieces)
     actual_density = density if mass is None else mass / float(solid.volume)
     return MassProperties(
         mass=actual_density * float(solid.volume),
         centre=np.array(solid.center_mass, dtype=np.float64),
         inertia=np.array(solid.moment_inertia, dtype=np.float64) * (actual_density / float(solid.density)),
     )
+
+
+def solid_of(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """What has a volume: the mesh if it is closed, else its convex pieces."""
+    return mesh if mesh.is_watertight and mesh.is_winding_consistent else join_meshes(pieces)
 
 
 def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

@@ -16,7 +16,7 @@ from mitsplat.dataset.prospects import doubts, run_faults
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
-from mitsplat.mesh import mass_properties
+from mitsplat.mesh import mass_properties, solid_of
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
@@ -126,7 +126,7 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
     yield Finding(
         "watertightness", bool(mesh.is_watertight) or asset.kind == "environment",
         "closed" if mesh.is_watertight else "open",
-        "close it (`mitsplat mesh`, or a mesh editor): mass and inertia are those of its convex hull else",
+        "close it (`mitsplat mesh`, or a mesh editor): mass and inertia are those of its convex pieces else",
     )  # fmt: skip
     if asset.kind == "object":
         yield from _mass(asset, mesh)
@@ -144,11 +144,13 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
 
 
 def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
-    solid = mesh if mesh.is_watertight and mesh.is_winding_consistent else mesh.convex_hull
-    found = mass_properties(solid, asset.pieces or (solid,), density=asset.density, mass=asset.mass)
-    density = found.mass / abs(float(solid.volume)) if solid.volume else float("inf")
+    pieces = asset.pieces or (mesh.convex_hull,)
+    solid = solid_of(mesh, pieces)
+    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
+    density = mass / abs(float(solid.volume)) if solid.volume else float("inf")
+    hull = "" if solid is mesh or asset.pieces else " if it filled its convex hull: its convex pieces are not made yet"
     yield Finding(
-        "mass", DENSITIES[0] <= density <= DENSITIES[1], f"{found.mass:.3g} kg, of {density:.0f} kg/m^3",
+        "mass", DENSITIES[0] <= density <= DENSITIES[1], f"{mass:.3g} kg, of {density:.0f} kg/m^3{hull}",
         "set mass [kg] or density [kg/m^3] in asset.yaml; a wrong unit of length shows here too",
     )  # fmt: skip
 

@@ -69,8 +69,8 @@ def _summary(
     lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
     rules = results["rules"]
     note = (
-        "Average precision by COCO's rules: mean over 101 recalls and IoU thresholds 0.5 to 0.95, up to "
-        f"{MOST_DETECTIONS} detections of a class and image with scores of {rules['least_score']} or more, overlaps "
+        "Average precision by COCO's rules: mean over 101 recalls and IoU thresholds 0.5 to 0.95, at most "
+        f"{MOST_DETECTIONS} detections an image with scores of {rules['least_score']} or more, overlaps "
         f"beyond {rules['nms_iou']} suppressed."
     )
     return _section("summary", "Summary", f"<table>{lines}</table><p>{note}</p>")

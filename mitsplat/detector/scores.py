@@ -27,7 +27,7 @@ IouType = Literal["bbox", "segm"]
 Detection = dict[str, Any]
 
 MOST_DETECTIONS = 300
-"""Detections of a class that count in an image, those with the highest scores; COCO's own summary takes 100."""
+"""Detections of all classes that count in an image, with the highest scores; COCO's own summary takes 100 of each."""
 CONFIDENCE, IOU = 0.25, 0.5
 """Least score, and least overlap of boxes, of what counts as found in the confusion matrix."""
 

@@ -45,7 +45,7 @@ from mitsplat.spec.spec import FORMATS, Output, SceneSpec
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame
 
-__all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "encode_image", "write_collection", "write_frame"]
+__all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "encode_image", "write_frame"]
 
 TABLE = {
     **{task: yolo.format_of(task) for task in yolo.TASKS},
@@ -163,11 +163,3 @@ class CollectionWriter:
         """Give the files their names."""
         for describer in self._describers:
             describer.keep()
-
-
-def write_collection(root: Path, records: Iterable[Record], catalogue: Catalogue, formats: Iterable[str]) -> None:
-    """Write what describes a whole dataset, from the ``records`` of its frames by ascending index."""
-    with CollectionWriter(root, catalogue, formats) as collection:
-        for record in records:
-            collection.add(record)
-        collection.keep()

@@ -261,7 +261,10 @@ def _scene_shooter(
 ) -> Callable[[int], Shot]:
     scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
     drawn = scene.spec.rendering
-    quality = replace(quality, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings)
+    response = drawn.response if quality.response == "perspective" else quality.response
+    quality = replace(
+        quality, response=response, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings
+    )
     indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
 
     def shoot(i: int) -> Shot:

@@ -65,11 +65,19 @@ class MaskedView:
         camera: From where.
         mask: Share of each pixel that is the object, (H, W) in [0, 1].
         hidden: Where another thing may hide the object, (H, W) in [0, 1]; None: nowhere.
+
+    Raises:
+        ValueError: If the mask is not of the camera's size.
     """
 
     camera: Camera
     mask: Float32Array
     hidden: Float32Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check."""
+        if self.mask.shape != (self.camera.height, self.camera.width):
+            raise ValueError(f"a mask must be of its camera's {self.camera.height} x {self.camera.width} px")
 
     @property
     def possible(self) -> Float32Array:
@@ -105,20 +113,6 @@ class Isolation:
     lost: float
 
 
-def visible_weights(splats: Splats, view: MaskedView) -> Float64Array:
-    """Blended weight of each Gaussian inside and outside the mask, where that is known, shape (N, 2) [px].
-
-    The picture is linear in the colours: the derivative of ``sum of mask * red`` with respect to the red of a Gaussian
-    is its weight ``T a`` summed over the mask, and green serves for what is outside.
-
-    Raises:
-        ValueError: If the mask is not of the camera's size.
-    """
-    if view.mask.shape != (view.camera.height, view.camera.width):
-        raise ValueError(f"a mask must be of its camera's {view.camera.height} x {view.camera.width} px")
-    return _Weigher(splats)(view)
-
-
 def isolate_object(
     splats: Splats,
     views: Sequence[MaskedView],
@@ -137,7 +131,7 @@ def isolate_object(
     """
     if not views:
         raise InputError("masks are needed to isolate an object (got no view with one)")
-    weigher = _Weigher(splats)
+    weigher = VisibleWeights(splats)
     weights = np.zeros((len(splats), 2))
     for done, view in enumerate(views, 1):
         weights += weigher(view)
@@ -165,8 +159,12 @@ def isolate_object(
     )
 
 
-class _Weigher:
-    """:func:`visible_weights` of one cloud that is uploaded once."""
+class VisibleWeights:
+    """Blended weights of a cloud's Gaussians in views, which is uploaded once.
+
+    The picture is linear in the colours: the derivative of ``sum of mask * red`` with respect to the red of a Gaussian
+    is its weight ``T a`` summed over the mask, and green serves for what is outside.
+    """
 
     def __init__(self, splats: Splats) -> None:
         ensure_variant()
@@ -175,6 +173,7 @@ class _Weigher:
         self._inputs = [mi.Float(np.ravel(values)) for values in fields]
 
     def __call__(self, view: MaskedView) -> Float64Array:
+        """Weight of each inside and outside the mask, where that is known, shape (N, 2) [px]."""
         colours = dr.zeros(mi.Float, 3 * self._count)
         dr.enable_grad(colours)
         cloud = pack_cloud(*self._inputs, colours, 1)

@@ -77,12 +77,10 @@ class ShadingLight:
     Attributes:
         lamps: The strongest first.
         ambient: Irradiance from all sides at an open place, linear RGB.
-        explained: Share of the mean deviation of what is seen, in logarithms, that lamps explain.
     """
 
     lamps: tuple[ShadingLamp, ...]
     ambient: Float64Array
-    explained: float
 
     @property
     def ambient_share(self) -> float:
@@ -111,7 +109,6 @@ def light_of_shading(
     lamps = list[tuple[Float64Array, float]]()
     columns = [surface.sky()]
     left, _ = surface.explain(columns)
-    alone = left
     scan = _Surface(colours, heights, open_to_view, cell, _SCANNED)
     candidates = [distance * way for distance in _DISTANCES for way in _ways()]
     shades = [scan.lit(place, 0.0) for place in candidates]
@@ -140,7 +137,6 @@ def light_of_shading(
     return ShadingLight(
         tuple(ShadingLamp(lamps[k][0], lamps[k][1], tinted[:, k]) for k in order),
         np.full(3, weights[0] / weights.sum()),
-        1 - left / alone,
     )
 
 

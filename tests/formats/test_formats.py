@@ -24,7 +24,7 @@ from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.files import Record
 from mitsplat.formats import coco, maps, voc
-from mitsplat.formats.registry import Catalogue, write_collection, write_frame
+from mitsplat.formats.registry import Catalogue, CollectionWriter, write_frame
 from mitsplat.formats.yolo import rotated_box
 from mitsplat.frames.flow import optical_flow
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
@@ -171,7 +171,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     catalogue = Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES, depth_sensor=sensor)
     frames = [frame_of(Drawn(covered), index) for index, covered in enumerate(LAYOUTS.values())]
     records = [write_frame(frame, root, spec, catalogue) for frame in frames]  # type: ignore[arg-type]
-    write_collection(root, records, catalogue, FORMATS)
+    with CollectionWriter(root, catalogue, FORMATS) as collection:
+        for record in records:
+            collection.add(record)
+        collection.keep()
     return Written(root, frames, records)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.reconstruct.evaluation import sized_photo
-from mitsplat.reconstruct.segment_splats import MaskedView, find_floaters, isolate_object, visible_weights
+from mitsplat.reconstruct.segment_splats import MaskedView, VisibleWeights, find_floaters, isolate_object
 from mitsplat.splats import Splats
 from tests.conftest import KnownObject
 from tests.plugins.test_backward import separated
@@ -26,7 +26,7 @@ def test_weights_are_those_of_the_twin() -> None:
         order = np.argsort(z, kind="stable")
         behind = np.concatenate([[1.0], np.cumprod(1 - opacity[order])[:-1]])
         expected[order] += (behind * opacity[order])[:, None] * (share, 1 - share)
-    found = visible_weights(splats, MaskedView(CAMERA, mask))
+    found = VisibleWeights(splats)(MaskedView(CAMERA, mask))
     assert expected.max() > 3
     # What is cut where the opacity falls below 0.002 is missing.
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.05)
@@ -34,7 +34,7 @@ def test_weights_are_those_of_the_twin() -> None:
 
 def test_a_mask_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match="24 x 32 px"):
-        visible_weights(separated(2, 1), MaskedView(CAMERA, np.ones((32, 24), dtype=np.float32)))
+        MaskedView(CAMERA, np.ones((32, 24), dtype=np.float32))
 
 
 def rubbish(means: np.ndarray, scale: object, opacity: float = 0.9) -> Splats:

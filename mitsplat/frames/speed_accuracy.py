@@ -260,11 +260,10 @@ def _scene_shooter(
     path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
 ) -> Callable[[int], Shot]:
     scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
-    drawn = scene.spec.rendering
-    response = drawn.response if quality.response == "perspective" else quality.response
-    quality = replace(
-        quality, response=response, kernel=drawn.kernel, samples=drawn.samples, lens_rings=drawn.lens_rings
-    )
+    drawn = scene.spec.rendering.model_dump()
+    if quality.response == "ewa":  # what the step is about
+        del drawn["response"]
+    quality = replace(quality, **drawn)
     indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
 
     def shoot(i: int) -> Shot:

@@ -137,6 +137,16 @@ def test_the_command(tmp_path, capsys):
     assert "      to do: close it" in lines[lines.index("look  watertightness: open") + 1]
 
 
+def test_an_open_mesh_weighs_what_its_pieces_do():
+    half = GOOD.mesh.copy().apply_transform(np.diag([0.5, 1, 1, 1]))
+    for pieces, said in (
+        ((half,), "0.06 kg, of 1000 kg/m^3"),
+        ((), "0.12 kg, of 1000 kg/m^3 if it filled its convex hull: its convex pieces are not made yet"),
+    ):
+        found = {finding.name: finding for finding in check_asset(replace(GOOD, mesh=OPEN, pieces=pieces))}
+        assert found["mass"].text == said
+
+
 def test_what_cannot_be_read_is_one_sentence(tmp_path, capsys):
     box_asset("nut").save(tmp_path / "nut")
     splats = tmp_path / "nut/splats.ply"

@@ -1,10 +1,10 @@
 """All arms and seeds of the experiment on detectors, side by side, as far as time allows.
 
     python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
-        [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
+        [--render-devices cpu] [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
-Whole datasets are rendered first, on all devices, as all that follows shares the processor's cores; then a changed
-scene after the one that shows the same layouts unchanged. Arms are trained when what they learn from is there, in the
+Whole datasets are rendered first, on all devices that render; then a changed scene after the one that shows the same
+layouts unchanged, beside what trains: on the processor, if that is to take nothing from it. Arms are trained when what they learn from is there, in the
 order in which they are named, all of the first seed before the second, and folds of one side by side. What was recorded
 is not done again; what was interrupted goes on.
 """
@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="*", help="all of the plan, in its order, if absent")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--devices", nargs="+", default=["cuda:0"])
+    parser.add_argument("--render-devices", nargs="+", help="what renders, such as cpu; the same if absent")
     parser.add_argument("--jobs", type=int, default=4, help="trainings at once on each device")
     parser.add_argument("--workers", type=int, default=4, help="processes of each training that read images")
     parser.add_argument("--renders", type=int, default=1, help="datasets that are rendered at once on each device")
@@ -45,6 +46,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"), help="where scans are")
     options = parser.parse_args()
+    options.render_devices = options.render_devices or options.devices
     plan = read_arms(options.plan)
     arms = options.arms or list(plan["arms"])
     todo = [
@@ -53,7 +55,7 @@ def main() -> None:
         for arm in arms
         if not (RESULTS / f"{result_of(arm, seed, options.plan)}.json").exists()
     ]
-    free = {"render": options.devices * options.renders, "train": options.devices * options.jobs}
+    free = {"render": options.render_devices * options.renders, "train": options.devices * options.jobs}
     run_jobs(all_jobs(todo, plan, options), free, options)
 
 
@@ -108,7 +110,7 @@ def renders(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: a
             words += ["-o", str(options.work / "data" / scene)]
             words += ["--workers", str(min(options.render_workers, workers))]
             words += [] if frames is None else ["--frames", str(frames)]
-            everywhere = frames is None and len(options.devices) > 1
+            everywhere = frames is None and len(options.render_devices) > 1
         after = [f"render-{unchanged}"] if change and unchanged in wanted else []
         yield Job(f"render-{scene}", "render", words, after, hides=not everywhere, everywhere=everywhere)
 

@@ -119,7 +119,7 @@ def test_an_arm_starts_from_what_it_says(work, monkeypatch, arm, starts):
 def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):
     plan = experiment.read_arms()
     options = argparse.Namespace(work=work, plan=experiment.PLAN, workers=2, weights=None, hope=tmp_path)
-    options.devices, options.render_workers = ["cuda:0", "cuda:1"], 8
+    options.render_devices, options.render_workers = ["cuda:0", "cuda:1"], 8
     todo = [("hybrid", 0), ("no_shadow", 0)]
     renders = {job.name: job for job in side_by_side.renders(todo, plan, options)}
     whole, changed = renders["render-table"], renders["render-table+no_shadow"]

@@ -4,9 +4,9 @@
         [--render-devices cpu] [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
 Whole datasets are rendered first, on all devices that render; then a changed scene after the one that shows the same
-layouts unchanged, beside what trains: on the processor, if that is to take nothing from it. Arms are trained when what they learn from is there, in the
-order in which they are named, all of the first seed before the second, and folds of one side by side. What was recorded
-is not done again; what was interrupted goes on.
+layouts unchanged, beside what trains: on the processor, if that is to take nothing from it. Arms are trained when what
+they learn from is there, in the order in which they are named, all of the first seed before the second, and folds of
+one side by side. What was recorded is not done again; what was interrupted goes on.
 """
 
 from __future__ import annotations

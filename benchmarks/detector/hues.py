@@ -1,6 +1,6 @@
 """By how much photographs show the hues of each class turned, with and without a camera that turns colours.
 
-    python -m benchmarks.detector.hues WORK [--scenes table seat carton stood packed]
+    python -m benchmarks.detector.hues WORK
 
 WORK is what ``benchmarks.detector.material`` made, with the datasets that the arms ``synthetic`` and ``no_hue`` learn
 from in ``data/``, of which the second shows the first layouts and views of the first.
@@ -13,21 +13,20 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.detector.experiment import read_arms
 from benchmarks.record import figure, recording
 from mitsplat.detector.likeness import compare_with_photographs
-
-SCENES = ("table", "seat", "carton", "stood", "packed")
 
 
 def main() -> None:
     """Compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--scenes", nargs="+", default=SCENES)
     options = parser.parse_args()
     with recording("detector.hues", parser, options, ignore=("work",)):
         for camera, change in (("as scanned", "+no_hue"), ("as drawn", "")):
-            datasets = [options.work / "data" / f"{scene}{change}" for scene in options.scenes]
+            scenes = read_arms()["arms"]["synthetic"]["scenes"]
+            datasets = [options.work / "data" / f"{scene}{change}" for scene in scenes]
             found = compare_with_photographs(datasets, options.work / "photos")
             turns = list(found.hues.values())
             figure(found.images, "", camera, "images")

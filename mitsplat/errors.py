@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import re
 
-_OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory", re.IGNORECASE)
+_OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory|can.t allocate memory|insufficient memory", re.IGNORECASE)
 
 
 class InputError(ValueError):

@@ -19,11 +19,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from mitsplat.content_hash import file_hash
-from mitsplat.detector.libraries import check_device, check_torchvision, load_libraries, torch_device, versions
+from mitsplat.detector.libraries import (
+    check_device,
+    check_torchvision,
+    check_weights,
+    load_libraries,
+    torch_device,
+    under_another_name,
+    versions,
+)
 from mitsplat.detector.losses import gains
 from mitsplat.detector.report import make_report
 from mitsplat.detector.scores import (
@@ -35,7 +42,7 @@ from mitsplat.detector.scores import (
     DetectionMatches,
     confuse,
 )
-from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_set
+from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_picture, read_set
 from mitsplat.detector.training import open_run
 from mitsplat.errors import InputError
 from mitsplat.files import storage_errors, write_text
@@ -99,8 +106,14 @@ def evaluate_detector(
     found = in_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
     if trained.has_masks:
         check_masks(found)
+    name = f"{root.resolve().name}-{split}"
+    out = trained.path / "evaluation" / name if out is None else Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: must be a folder (got a file)")
     load_libraries()
     check_torchvision()
+    network = str(trained.record["settings"]["model"])
+    check_weights(trained.weights, network, masks=trained.has_masks, classes=len(trained.class_names))
     number, device_name = torch_device(device)
     started = time.perf_counter()
     detections = detect(
@@ -114,14 +127,7 @@ def evaluate_detector(
         "versions": versions(),
         "seconds": round(time.perf_counter() - started, 1),
     }
-    name = f"{root.resolve().name}-{split}"
-    return write_evaluation(
-        found,
-        detections,
-        trained.path / "evaluation" / name if out is None else Path(out),
-        masks=trained.has_masks,
-        about=about,
-    )
+    return write_evaluation(found, detections, out, masks=trained.has_masks, about=about)
 
 
 def detect(
@@ -139,10 +145,11 @@ def detect(
     """
     from ultralytics import YOLO  # optional
 
-    model, found = YOLO(str(weights), task="segment" if masks else "detect"), []
+    with under_another_name(weights) as name:
+        model, found = YOLO(name, task="segment" if masks else "detect"), []
     for number, sample in enumerate(samples, start=1):
         (result,) = model.predict(
-            cv2.imread(str(sample.path), cv2.IMREAD_COLOR),
+            read_picture(sample.path),
             conf=LEAST_SCORE,
             iou=NMS_IOU,
             max_det=MOST_DETECTIONS,

@@ -11,7 +11,7 @@ import io
 import random
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from ultralytics.utils.ops import resample_segments
 from ultralytics.utils.torch_utils import strip_optimizer
 
 from mitsplat.arrays import Int64Array
-from mitsplat.detector.libraries import UNREADABLE
+from mitsplat.detector.libraries import UNREADABLE, under_another_name
 from mitsplat.errors import InputError, MissingResourceError
 
 EPOCH = 50
@@ -109,7 +109,6 @@ def train_job(
     settings: dict[str, Any] = {
         "task": "segment" if job.masks else "detect",
         "model": network,
-        "pretrained": str(weights) if weights else False,
         "epochs": epochs,
         "batch": batch,
         "nbs": batch,  # one update of the weights for each batch
@@ -134,14 +133,16 @@ def train_job(
         "momentum": 0.9,
         "warmup_bias_lr": 0.0,
     }
-    last = job.run / LAST
-    if last.is_file():
-        settings["resume"] = str(last)
     callbacks: defaultdict[str, list[Callable[[Any], None]]] = defaultdict(list)
     callbacks["on_train_epoch_start"].append(_FixedSteps.begin_epoch)
     callbacks["on_train_batch_end"].append(_FixedSteps.end_step)
-    trainer = (_Masks if job.masks else _Boxes)(job, settings, callbacks)
-    trainer.train()
+    last = job.run / LAST
+    with ExitStack() as links:
+        settings["pretrained"] = links.enter_context(under_another_name(weights)) if weights else False
+        if last.is_file():
+            settings["resume"] = links.enter_context(under_another_name(last))
+        trainer = (_Masks if job.masks else _Boxes)(job, settings, callbacks)
+        trainer.train()
     return trainer.outcome()
 
 
@@ -160,7 +161,8 @@ def epochs_done(run: Path) -> int:
         InputError: If it cannot be read.
     """
     try:
-        return int(torch_safe_load(run / LAST)[0]["epoch"]) + 1
+        with under_another_name(run / LAST) as name:
+            return int(torch_safe_load(name)[0]["epoch"]) + 1
     except UNREADABLE as error:
         raise InputError(
             f"{run / LAST}: cannot be read ({type(error).__name__}): begin anew with --overwrite"

@@ -11,6 +11,8 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from pickle import UnpicklingError
@@ -132,16 +134,26 @@ def read_network(model: str) -> tuple[str, bool]:
 
     name = model if Path(model).suffix in (".yaml", ".yml") else f"{model}.yaml"
     try:
-        task = guess_model_task(yaml_model_load(name))
+        content = yaml_model_load(name)
+        task = guess_model_task(content)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"--model must be a network of Ultralytics, such as yolo11n-seg (got {model})") from error
     if task not in ("detect", "segment"):
         raise InputError(f"--model must predict boxes or masks, such as yolo11n or yolo11n-seg (got {model}: {task})")
+    head = str(content["head"][-1][-2])
+    if "World" in head or "YOLOE" in head:
+        raise InputError(f"--model must tell classes by images alone, not by words (got {model}: {head})")
     return name, task == "segment"
 
 
-def check_weights(weights: Path, network: str, *, masks: bool) -> None:
-    """Refuse weights that are not of a network, whatever the classes that they know.
+def check_weights(weights: Path, network: str, *, masks: bool, classes: int | None = None) -> None:
+    """Refuse weights that are not of a network.
+
+    Args:
+        weights: The file.
+        network: Name of the network's YAML file.
+        masks: Whether the network predicts masks.
+        classes: How many it must tell apart; any number if None.
 
     Raises:
         InputError: If they cannot be read, or their tensors are others.
@@ -150,6 +162,8 @@ def check_weights(weights: Path, network: str, *, masks: bool) -> None:
 
     found = load_weights(weights)
     kind = SegmentationModel if masks else DetectionModel
+    if classes not in (None, len(found.names)):
+        raise InputError(f"{weights}: must tell {classes} classes apart (got {len(found.names)})")
     expected = kind(network, nc=len(found.names), verbose=False).state_dict()
     own = found.state_dict()
     for name in sorted(expected.keys() | own.keys()):
@@ -159,6 +173,19 @@ def check_weights(weights: Path, network: str, *, masks: bool) -> None:
                 f"{weights}: does not fit {network}: {name} must have the shape {shapes[1] or 'of nothing'} "
                 f"(got {shapes[0] or 'none'})"
             )
+
+
+@contextmanager
+def under_another_name(path: Path) -> Iterator[str]:
+    """A link to a file of weights, by which Ultralytics reads it as it is.
+
+    By some names it takes files for its own, which it downloads where they look torn, and removes; of others it leaves
+    out letters.
+    """
+    with tempfile.TemporaryDirectory(prefix="mitsplat-weights-") as folder:
+        link = Path(folder) / "given.pt"
+        link.symlink_to(path.resolve())
+        yield str(link)
 
 
 def load_weights(path: Path) -> Any:
@@ -172,6 +199,7 @@ def load_weights(path: Path) -> Any:
     if not path.is_file() or path.suffix != ".pt":
         raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {path})")
     try:
-        return load_checkpoint(path)[0]
+        with under_another_name(path) as name:
+            return load_checkpoint(name)[0]
     except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read as weights of Ultralytics ({type(error).__name__})") from error

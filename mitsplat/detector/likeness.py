@@ -17,10 +17,9 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.stats import binom
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
-from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_set
+from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_picture, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress
@@ -29,6 +28,8 @@ FEWEST, FEWEST_RENDERED = 5, 20
 """Objects of a class, on photographs and rendered, from which it is judged."""
 CHANCE = 0.01
 """Of so many outside of the rendered range by chance; what is less likely is advised on."""
+_DRAWS = 299
+"""Times that images are dealt anew to both sides, which tells what chance does."""
 _TAIL = 0.05
 _SMALLEST = 64
 """Area within a label from which its colour is measured [px]."""
@@ -62,8 +63,8 @@ _TRAITS: dict[str, tuple[str, str, str]] = {
 }
 """Unit, and what to change if photographs have less, or more."""
 
-_Values: TypeAlias = dict[tuple[str, int | None], list[float]]
-"""Values of a trait: of all objects or images, and of those of a class by its index."""
+_Values: TypeAlias = dict[tuple[str, int | None], list[tuple[int, float]]]
+"""Values of a trait, each with its image's number: of all objects or images, and of those of a class by its index."""
 
 _Hues: TypeAlias = dict[int, Float64Array]
 """Sums over the objects of a class, by its index, of what :func:`_hues_of` tells of each."""
@@ -161,7 +162,7 @@ def compare_with_photographs(
     for number, sample in enumerate(ours + theirs):
         if progress is not None:
             progress(number, len(ours) + len(theirs), "measuring images")
-        _measure(sample, size, sides[number >= len(ours)], hues[number >= len(ours)])
+        _measure(sample, number, size, sides[number >= len(ours)], hues[number >= len(ours)])
 
     def traits_of(index: int | None) -> tuple[Trait, ...]:
         shown = [key for key in _TRAITS if all(side.get((key, index)) for side in sides)]
@@ -213,7 +214,8 @@ def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:
     for index in range(classes):
         ours, theirs = (side.get((_WHOLE, index), []) for side in sides)
         if len(ours) >= FEWEST_RENDERED and len(theirs) >= FEWEST:
-            ratios.append(np.quantile(ours, 0.75) / np.quantile(theirs, 0.75))
+            upper = [np.quantile([value for _, value in values], 0.75) for values in (ours, theirs)]
+            ratios.append(upper[0] / upper[1])
     return float(np.median(ratios)) if ratios else None
 
 
@@ -222,11 +224,9 @@ def _evenly(samples: list[Sample], most: int) -> list[Sample]:
     return [samples[place] for place in places]
 
 
-def _measure(sample: Sample, size: int, values: _Values, hues: _Hues) -> None:
-    """Add what an image shows at a longer side of ``size`` pixels."""
-    stored = cv2.imread(str(sample.path), cv2.IMREAD_COLOR)
-    if stored is None:
-        raise InputError(f"{sample.path}: cannot be read as an image")
+def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hues) -> None:
+    """Add what an image of a number shows at a longer side of ``size`` pixels."""
+    stored = read_picture(sample.path)
     scale = size / max(sample.width, sample.height)
     width, height = (max(round(scale * side), 1) for side in (sample.width, sample.height))
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -235,11 +235,11 @@ def _measure(sample: Sample, size: int, values: _Values, hues: _Hues) -> None:
     for instance in objects:
         x0, y0, x1, y1 = instance.box
         side = scale * float(np.sqrt(max(x1 - x0, 0) * max(y1 - y0, 0)))
-        values[SIZE, None].append(side)
+        values[SIZE, None].append((number, side))
         if min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1:
             cut += 1
         else:
-            values[_WHOLE, instance.class_index].append(side)
+            values[_WHOLE, instance.class_index].append((number, side))
         inside = _inside(instance, sample, width, height)
         if inside.sum() >= _SMALLEST:
             hues[instance.class_index] += _hues_of(picture[inside])
@@ -247,15 +247,15 @@ def _measure(sample: Sample, size: int, values: _Values, hues: _Hues) -> None:
             most = pixels.max(axis=1)
             saturation = (most - pixels.min(axis=1)) / np.maximum(most, 1)
             for index in (None, instance.class_index):
-                values[BRIGHTNESS, index].append(float(np.median(most)))
-                values["saturation of objects", index].append(100 * float(np.median(saturation)))
-    values["objects of an image", None].append(float(len(objects)))
+                values[BRIGHTNESS, index].append((number, float(np.median(most))))
+                values["saturation of objects", index].append((number, 100 * float(np.median(saturation))))
+    values["objects of an image", None].append((number, float(len(objects))))
     if objects:
-        values["objects cut by the border", None].append(100 * cut / len(objects))
-    values["brightness of images", None].append(float(picture.mean()))
+        values["objects cut by the border", None].append((number, 100 * cut / len(objects)))
+    values["brightness of images", None].append((number, float(picture.mean())))
     noise = _noise(picture[..., 1], picture.max(axis=2))
     if noise is not None:
-        values["noise of images", None].append(noise)
+        values["noise of images", None].append((number, noise))
 
 
 def _inside(instance: Instance, sample: Sample, width: int, height: int) -> BoolArray:
@@ -285,16 +285,46 @@ def _noise(green: ByteImage, bright: ByteImage) -> float | None:
     return float(np.median(np.abs(cv2.Laplacian(values, cv2.CV_32F))[flat]))
 
 
-def _trait(name: str, rendered: Sequence[float], real: Sequence[float]) -> Trait:
+def _trait(name: str, rendered: Sequence[tuple[int, float]], real: Sequence[tuple[int, float]]) -> Trait:
     unit, less, more = _TRAITS[name]
-    ours, theirs = (np.quantile(values, [_TAIL, 0.5, 1 - _TAIL]) for values in (rendered, real))
-    outside = np.asarray(real) < ours[0], np.asarray(real) > ours[2]
-    too_low, too_high = (bool(binom.sf(beyond.sum() - 1, len(beyond), _TAIL) < CHANCE) for beyond in outside)
+    images, values = np.array([*rendered, *real], dtype=float).T
+    photographed = np.arange(len(values)) >= len(rendered)
+    ours, theirs = (np.quantile(values[side], [_TAIL, 0.5, 1 - _TAIL]) for side in (~photographed, photographed))
+    outside = _outside(values, photographed)
+    too_low, too_high = _unlikely(outside, images, values, photographed)
     advice = {
         (True, False): less,
         (False, True): more,
         (True, True): "photographs differ more among themselves: widen both ends of the range",
     }
     quantiles = [(float(values[0]), float(values[1]), float(values[2])) for values in (ours, theirs)]
-    below, above = (float(beyond.mean()) for beyond in outside)
+    below, above = outside.tolist()
     return Trait(name, unit, quantiles[0], quantiles[1], below, above, advice.get((too_low, too_high), ""))
+
+
+def _outside(values: Float64Array, photographed: BoolArray) -> Float64Array:
+    """Shares of photographs' values below and above the middle nine tenths of the others, shape (2,)."""
+    low, high = np.quantile(values[~photographed], [_TAIL, 1 - _TAIL])
+    real = values[photographed]
+    return np.array([np.mean(real < low), np.mean(real > high)])
+
+
+def _unlikely(
+    outside: Float64Array, images: Float64Array, values: Float64Array, photographed: BoolArray
+) -> tuple[bool, bool]:
+    """Whether as much lies outside on a side in less than :data:`CHANCE` of deals of all images to the two sides.
+
+    What one image shows stays together: its objects share its light. Of too few objects nothing is said.
+    """
+    if (~photographed).sum() < FEWEST_RENDERED or photographed.sum() < FEWEST:
+        return False, False
+    names, places = np.unique(images, return_inverse=True)
+    count = len(np.unique(images[photographed]))
+    rng = np.random.default_rng(0)
+    as_much = np.ones(2)
+    for _ in range(_DRAWS):
+        dealt = np.zeros(len(names), dtype=bool)
+        dealt[rng.choice(len(names), count, replace=False)] = True
+        as_much += _outside(values, dealt[places]) >= outside
+    low, high = (as_much / (_DRAWS + 1) < CHANCE).tolist()
+    return low, high

@@ -12,7 +12,7 @@ from pycocotools import mask as coco_mask
 
 from mitsplat.detector.losses import KINDS
 from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePrecision, Confusion, Detection
-from mitsplat.detector.sets import LabelledSet, Sample
+from mitsplat.detector.sets import LabelledSet, Sample, read_picture
 from mitsplat.html import inline_image, make_page, mask_path
 from mitsplat.labels.overlay import class_colour
 from mitsplat.masks import Silhouette
@@ -167,7 +167,7 @@ def worst_images(confusion: Confusion) -> list[int]:
 
 
 def _picture(sample: Sample, shown: Sequence[Mapping[str, Any]], class_names: Sequence[str], what: str) -> str:
-    image = np.asarray(cv2.imread(str(sample.path), cv2.IMREAD_COLOR))
+    image = read_picture(sample.path)
     scale = min(1.0, _THUMBNAIL / sample.width)
     size = max(1, round(sample.width * scale)), max(1, round(sample.height * scale))
     unit, marks, names = sample.width / _THUMBNAIL, [], []

@@ -16,19 +16,22 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from PIL import Image
 from pycocotools import mask as coco_mask
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, SPLITS, is_inside
@@ -40,6 +43,8 @@ Split = Literal["train", "val", "test", "all"]
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Images that Ultralytics reads as well."""
+_WHOLE, _DECODED = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "TIFF")
+"""Formats of which Pillow tells whether a file is torn, and those of which only decoding it does."""
 
 STRIDE = 32
 """What Ultralytics' networks divide the sides of images by [px]."""
@@ -48,6 +53,7 @@ _BEYOND = 0.01
 """How far positions may lie outside of the image, as a share of its sides; they are cut off there."""
 SMALLEST = 10
 """Sides of images that Ultralytics takes [px]."""
+_JPEG_ENDS = b"\xff\xd9"
 _ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
 """The EXIF tag by which OpenCV turns images as it reads them, and its values that swap width and height."""
 
@@ -136,7 +142,7 @@ class LabelledSet:
         """What a record says of it; its digest is that of images, labels and classes."""
         sha = ContentHash()
         sha.add_json([self.class_names, [(sample.name, sample.digest) for sample in self.samples]])
-        counts = Counter(instance.class_index for sample in self.samples for instance in sample.instances)
+        counts = Counter(i.class_index for sample in self.samples for i in sample.instances if not i.crowd)
         return {
             "path": str(self.root),
             "kind": self.kind,
@@ -168,13 +174,13 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
         return _yolo(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
     if (root / "data.yaml").is_file():
         content = _yaml(root / "data.yaml")
-        base = content.get("path") or "."
+        if "kpt_shape" in content:
+            raise InputError(f"{root / 'data.yaml'}: its labels are of keypoints (kpt_shape), not of boxes or masks")
+        base = str(content.get("path") or ".")
         entries = {name: content[name] for name in SPLITS if content.get(name)}
         listed = {
-            name: [
-                f"{base}/{entry}" for entry in (entries[name] if isinstance(entries[name], list) else [entries[name]])
-            ]
-            for name in entries
+            name: [_entry(root, base, str(entry)) for entry in (given if isinstance(given, list) else [given])]
+            for name, given in entries.items()
         }
         return _yolo(root, "yolo", split, _class_names(content, root / "data.yaml"), listed, progress)
     return _coco(root, split, progress)
@@ -249,7 +255,8 @@ def _yolo(
     wanted = [name for name in SPLITS if split in (name, "all") and name in listed]
     images = list(dict.fromkeys(path for name in wanted for entry in listed[name] for path in _images(root, entry)))
     if not images:
-        raise InputError(f"{root}: there is no image for {split}" + _has(_counted(root, listed)))
+        sought = ", ".join(str(root / entry) for name in wanted for entry in listed[name])
+        raise InputError(f"{root}: there is no image for {split}" + (_has(_counted(root, listed)) or f" in {sought}"))
     if not any(_label_of(image).is_file() for image in images):
         raise InputError(f"{root}: there is no label of its images, such as {_label_of(images[0])}")
 
@@ -258,6 +265,9 @@ def _yolo(
         label = _label_of(image)
         if label.is_file():
             text = label.read_text(encoding="utf-8-sig", errors="replace")
+        elif label.is_symlink() or label.exists():
+            what = "a folder" if label.exists() else "a link to nothing"
+            raise InputError(f"{label}: must be a file (got {what})")
         elif kind == "mitsplat":
             raise InputError(f"{label}: is missing, though its image is there")
         else:
@@ -267,6 +277,12 @@ def _yolo(
         return Sample(image, _below(root, image), width, height, instances, content.hexdigest())
 
     return LabelledSet(root, kind, split, classes, _all(read, images, root, progress))
+
+
+def _entry(root: Path, base: str, entry: str) -> str:
+    """Where images of a split are said to be; from below ``data.yaml`` if not beside its folder, as exports have it."""
+    place, inner = str(Path(base, entry)), entry.removeprefix("../")
+    return str(Path(base, inner)) if inner != entry and not (root / place).exists() else place
 
 
 def _counted(root: Path, listed: dict[str, list[str]]) -> dict[str, int]:
@@ -282,11 +298,24 @@ def _images(root: Path, entry: str) -> list[Path]:
     """Images of a folder or of a list, by name; none if it is missing."""
     place = root / entry
     if place.is_dir():
-        return sorted(path for path in place.rglob("*") if path.suffix.lower() in SUFFIXES)
+        return _images_below(place)
     if not place.is_file():
         return []
-    lines = place.read_text(encoding="utf-8-sig").split("\n")
+    try:
+        lines = place.read_text(encoding="utf-8-sig").split("\n")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{place}: must be a folder of images, or a list of them in UTF-8 ({error.reason})") from error
     return [place.parent / line.strip() for line in lines if line.strip()]
+
+
+def _images_below(folder: Path) -> list[Path]:
+    """Images anywhere in a folder, and in folders that it links to, by name."""
+    found, seen = list[Path](), set[str]()
+    for place, folders, files in os.walk(folder, followlinks=True):
+        seen.add(os.path.realpath(place))
+        folders[:] = [name for name in folders if os.path.realpath(Path(place, name)) not in seen]
+        found += [Path(place, name) for name in files]
+    return sorted(path for path in found if path.suffix.lower() in SUFFIXES)
 
 
 def _label_of(image: Path) -> Path:
@@ -333,7 +362,17 @@ def _clipped(points: Float64Array, size: tuple[int, int], place: str) -> Float64
 
 
 def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
-    path, content = _coco_file(root, split)
+    parts = [_coco_part(root, split, *file, progress) for file in _coco_files(root, split).items()]
+    parts = [in_classes(part, parts[0].class_names, str(root)) for part in parts]
+    samples = tuple(sample for part in parts for sample in part.samples)
+    twice = [name for name, count in Counter(sample.name for sample in samples).items() if count > 1]
+    if twice:
+        raise InputError(f"{root}: each image must be in one of its COCO files (got {twice[0]} in several)")
+    return replace(parts[0], samples=samples)
+
+
+def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], progress: Progress | None) -> LabelledSet:
+    """The images of one file of a folder."""
     try:
         categories = sorted(content["categories"], key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
@@ -348,8 +387,8 @@ def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
             by_image[annotation["image_id"]].append(annotation)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: is no COCO dataset of instances (key {error} is missing or wrong)") from error
-    if len(set(names)) < len(names) or len(by_image) < len(content["images"]):
-        raise InputError(f"{path}: ids of images and names of categories must differ")
+    if len(set(names)) < len(names) or len(index) < len(names) or len(by_image) < len(content["images"]):
+        raise InputError(f"{path}: ids of images, and ids and names of categories, must differ")
     if not by_image:
         raise InputError(f"{root}: there is no image for {split}")
     find = _finder(root, path)
@@ -371,8 +410,8 @@ def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
     return LabelledSet(root, "coco", split, names, _all(read, images, root, progress))
 
 
-def _coco_file(root: Path, split: Split) -> tuple[Path, dict[str, Any]]:
-    """The file of a folder that labels a split, and what it says."""
+def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
+    """The files of a folder that label a split, and what they say: one, or, for ``all``, all of them."""
     files = {path: _json(path) for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))}
     files = {
         path: content
@@ -380,9 +419,10 @@ def _coco_file(root: Path, split: Split) -> tuple[Path, dict[str, Any]]:
         if isinstance(content, dict) and {"images", "annotations", "categories"} <= content.keys()
     }
     if len(files) > 1:
-        files = {path: content for path, content in files.items() if split in path.stem} or files
-    if len(files) == 1:
-        return next(iter(files.items()))
+        named = {path: content for path, content in files.items() if split in re.findall("[a-z]+", path.stem.lower())}
+        files = named or files
+    if len(files) == 1 or (files and split == "all"):
+        return files
     if files:
         raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {_names(files)})")
     raise InputError(
@@ -405,9 +445,8 @@ def _json(path: Path) -> Any:
 def _finder(root: Path, listing: Path) -> Callable[[str], Path]:
     """Finds the images that a file of annotations names."""
     below: dict[str, list[Path]] = {}
-    for path in sorted(root.rglob("*")):
-        if path.suffix.lower() in SUFFIXES:
-            below.setdefault(path.name, []).append(path)
+    for path in _images_below(root):
+        below.setdefault(path.name, []).append(path)
 
     def find(name: str) -> Path:
         if not is_inside(root, name):
@@ -447,18 +486,53 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                 rle = coco_mask.merge(coco_mask.frPyObjects(given, height, width))
             elif list(given["size"]) != [height, width]:
                 raise InputError(f"{place}: segmentation must be of {height} x {width} px (got {given['size']})")
-            elif isinstance(given["counts"], list):
-                rle = coco_mask.frPyObjects(given, height, width)
             else:
-                rle = {"size": [height, width], "counts": str(given["counts"]).encode("ascii")}
-            if not coco_mask.decode(rle).any():  # which refuses run lengths that are not of as many pixels
+                lengths = given["counts"] if isinstance(given["counts"], list) else _run_lengths(str(given["counts"]))
+                if sum(lengths) != height * width or min(lengths) < 0:  # decoding would make up what is missing
+                    raise InputError(
+                        f"{place}: run lengths must be of {height} x {width} px, {height * width} (got {sum(lengths)})"
+                    )
+                rle = coco_mask.frPyObjects({"size": [height, width], "counts": lengths}, height, width)
+            if not coco_mask.decode(rle).any():
                 raise InputError(f"{place}: segmentation must cover a pixel")
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
             raise InputError(f"{place}: segmentation must be polygons or run lengths ({error})") from error
-    crowd = bool(annotation.get("iscrowd"))
-    return Instance(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), crowd)
+    crowd = annotation.get("iscrowd") or 0
+    if crowd not in (0, 1):
+        raise InputError(f"{place}: iscrowd must be 0 or 1 (got {crowd!r})")
+    return Instance(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), bool(crowd))
+
+
+def _run_lengths(code: str) -> list[int]:
+    """What COCO's compressed code of a mask says: five bits a letter, from the third on differences to two before."""
+    lengths: list[int] = []
+    value = shift = 0
+    for letter in code:
+        bits = ord(letter) - 48
+        value |= (bits & 31) << shift
+        shift += 5
+        if not bits & 32:
+            value -= (bits & 16) << (shift - 4)
+            lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))
+            value = shift = 0
+    return lengths
+
+
+def read_picture(path: Path) -> ByteImage:
+    """An image as it is shown, turned by its EXIF orientation: shape (H, W, 3), BGR.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    try:  # not by OpenCV, which takes names in UTF-8 alone
+        picture = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):
+        picture = None
+    if picture is None:
+        raise InputError(f"{path}: cannot be read as an image")
+    return np.asarray(picture, dtype=np.uint8)
 
 
 def _look(path: Path) -> tuple[int, int, ContentHash]:
@@ -473,14 +547,31 @@ def _look(path: Path) -> tuple[int, int, ContentHash]:
         with Image.open(io.BytesIO(data)) as image:
             width, height = image.size
             turned = image.getexif().get(_ORIENTATION) in _TURNED
-            jpeg = image.format in ("JPEG", "MPO")
+            form = image.format
     except IMAGE_ERRORS as error:
         raise InputError(f"{path}: cannot be read as an image ({error})") from error
-    if jpeg and not data.endswith(b"\xff\xd9"):
-        raise InputError(f"{path}: is torn: a JPEG file must end with its end marker")
+    if form in ("JPEG", "MPO") and not data.endswith(_JPEG_ENDS):
+        raise InputError(f"{path}: {_ends(data)}")
+    if form not in _WHOLE + _DECODED:
+        raise InputError(f"{path}: must be a JPEG, PNG, BMP, TIFF or WebP file (got {form})")
+    if turned:
+        width, height = height, width
+    if form in _DECODED and read_picture(path).shape[:2] != (height, width):
+        raise InputError(f"{path}: must be read by OpenCV as by others, {width} x {height} px: save it as PNG")
     if min(width, height) < SMALLEST:
         raise InputError(f"{path}: an image must have sides of {SMALLEST} px or more (got {width} x {height})")
-    return (height, width, ContentHash(data)) if turned else (width, height, ContentHash(data))
+    return width, height, ContentHash(data)
+
+
+def _ends(jpeg: bytes) -> str:
+    """What is wrong with a JPEG file that does not end with its end marker, which Ultralytics would write anew."""
+    try:
+        with Image.open(io.BytesIO(jpeg)) as image:
+            image.load()
+    except IMAGE_ERRORS:
+        return "is torn: a JPEG file must end with its end marker"
+    after = len(jpeg) - jpeg.rindex(_JPEG_ENDS) - len(_JPEG_ENDS)
+    return f"has {after} bytes after its end marker: cut them off, or save it anew"
 
 
 def _below(root: Path, path: Path) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 import pycocotools.mask as coco_mask
 
 from mitsplat.arrays import BoolArray
-from mitsplat.detector.sets import SMALLEST, Instance, LabelledSet
+from mitsplat.detector.sets import SMALLEST, Instance, LabelledSet, read_picture
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import outline
 from mitsplat.masks import Silhouette
@@ -41,9 +41,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
     folder.mkdir(parents=True, exist_ok=True)
     samples = []
     for number, sample in enumerate(photographs.samples):
-        picture = cv2.imread(str(sample.path), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise InputError(f"{sample.path}: cannot be read as an image")
+        picture = read_picture(sample.path)
         width, height = (max(round(side * size / real_size), 1) for side in (sample.width, sample.height))
         if min(width, height) < SMALLEST:
             raise InputError(

@@ -87,6 +87,8 @@ class TrainSettings:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise InputError(f"{name} must be {least} or more (got {value})")
+        if self.seed >= 2**32:
+            raise InputError(f"seed must be less than 2^32 (got {self.seed})")
         if self.size % STRIDE:
             raise InputError(f"size must be a multiple of {STRIDE} px (got {self.size})")
         if not 0 < self.share < 1:
@@ -168,6 +170,8 @@ def train_detector(
     network, masks = read_network(settings.model)
     settings = replace(settings, model=network)
     sets, photographs = read_sets(datasets, real, masks=masks, progress=progress)
+    for found in [*sets, *([photographs] if photographs else [])]:
+        _check_apart(out, found)
     if settings.weights is not None:
         check_weights(settings.weights, network, masks=masks)
     device, device_name = torch_device(settings.device)
@@ -220,6 +224,9 @@ def read_sets(
     found = [read_set(path, "train", progress) for path in datasets]
     if real is not None:
         found.append(read_set(real, "train", progress))
+    for one in found:
+        if all(instance.crowd for sample in one.samples for instance in sample.instances):
+            raise InputError(f"{one.root}: nothing but crowds is labelled, from which nothing can be learnt")
     found = [in_classes(one, found[0].class_names, str(found[0].root)) for one in found]
     if masks:
         for one in found:
@@ -357,9 +364,18 @@ def _digests(described: Any) -> list[str]:
 def _check_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: must be a folder (got a file)")
-    strange = [path.name for path in out.iterdir() if path.name not in _OWN] if out.is_dir() else []
-    if out.is_dir() and not (out / RUN).is_file() and [name for name in strange if not name.startswith(".")]:
-        raise InputError(f"{out}: holds something else than a run (got {sorted(strange)[0]}): give another folder")
+    if not out.is_dir() or (out / RUN).is_file():
+        return
+    if strange := sorted(path.name for path in out.iterdir() if not path.name.startswith(".")):
+        raise InputError(f"{out}: holds something else than a run (got {strange[0]}): give another folder")
+
+
+def _check_apart(out: Path, found: LabelledSet) -> None:
+    """Refuse to learn from what lies in the folder of the run, which is removed from it."""
+    folder = out.resolve()
+    for path in (found.root, *(sample.path for sample in found.samples)):
+        if path.resolve().is_relative_to(folder):
+            raise InputError(f"{out}: must not hold what is learnt from (got {path}): give another folder")
 
 
 def _clear(out: Path) -> None:

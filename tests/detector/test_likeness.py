@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsplat.cli import app
-from mitsplat.detector.likeness import Likeness, Trait, compare_with_photographs
+from mitsplat.detector.likeness import BRIGHTNESS, Likeness, Trait, _trait, compare_with_photographs
 from mitsplat.errors import InputError
 from tests.detector.painted import HEIGHT, HUES, WIDTH, write_coco, write_yolo
 
@@ -176,3 +176,16 @@ def test_the_command_says_it_and_writes_it(rendered: Path, photographs: Path, tm
     kept = json.loads(out.read_text())
     assert kept["traits"][0]["real"] == [88, 88, 88]
     assert CliRunner().invoke(app, ["compare", str(rendered)]).exit_code != 0
+
+
+def test_what_is_drawn_alike_gets_advice_by_chance_alone() -> None:
+    """Objects of one image share its light, and so are no opinions of their own."""
+    rng, advised = np.random.default_rng(3), 0
+    for _ in range(100):
+        lights = rng.normal(100, 20, 42)
+        values = [(image, light + rng.normal(0, 5)) for image, light in enumerate(lights) for _ in range(6)]
+        advised += bool(_trait(BRIGHTNESS, values[: 30 * 6], values[30 * 6 :]).advice)
+    assert advised <= 6
+    darker = [(image, value - 60) for image, value in values[30 * 6 :]]
+    assert _trait(BRIGHTNESS, values[: 30 * 6], darker).advice.startswith("lower randomise.exposure")
+    assert _trait(BRIGHTNESS, values[: 30 * 6], darker[:4]).advice == ""  # too few

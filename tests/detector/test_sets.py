@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from PIL import Image
 from pycocotools import mask as coco_mask
 
-from mitsplat.detector.sets import LabelledSet, check_masks, in_classes, read_set
+from mitsplat.detector.sets import LabelledSet, _run_lengths, check_masks, in_classes, read_picture, read_set
 from mitsplat.detector.training import read_sets, write_data
 from mitsplat.errors import InputError
 from tests.detector.painted import CLASSES, HEIGHT, WIDTH, paint, write_coco, write_yolo
@@ -156,6 +157,44 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         ),
         r"000009.jpg: is torn",
     ),
+    "trailer": (
+        lambda root: (root / "images/train/000009.jpg").write_bytes(
+            cv2.imencode(".jpg", paint(1)[0])[1].tobytes() + b"trailer"
+        ),
+        r"000009.jpg: has 7 bytes after its end marker",
+    ),
+    "bmp": (
+        lambda root: (root / "images/train/000009.bmp").write_bytes(
+            cv2.imencode(".bmp", paint(1)[0])[1].tobytes()[:9000]
+        ),
+        r"000009.bmp: (cannot be read as an image|must be read by OpenCV as by others)",
+    ),
+    "gif": (
+        lambda root: Image.fromarray(paint(1)[0]).save(root / "images/train/000001.png", format="GIF"),
+        r"000001.png: must be a JPEG, PNG, BMP, TIFF or WebP file \(got GIF\)",
+    ),
+    "link": (
+        lambda root: (
+            (root / "labels/train/000001.txt").unlink(),
+            (root / "labels/train/000001.txt").symlink_to(root / "elsewhere.txt"),
+        ),
+        r"000001.txt: must be a file \(got a link to nothing\)",
+    ),
+    "keypoints": (
+        lambda root: (root / "data.yaml").write_text("train: images/train\nnames: [disc, box]\nkpt_shape: [2, 2]\n"),
+        r"data.yaml: its labels are of keypoints \(kpt_shape\)",
+    ),
+    "latin": (
+        lambda root: (
+            (root / "data.yaml").write_text("train: some.txt\nnames: [disc, box]\n"),
+            (root / "some.txt").write_bytes("./images/train/caf\u00e9.png\n".encode("latin-1")),
+        ),
+        r"some.txt: must be a folder of images, or a list of them in UTF-8",
+    ),
+    "nowhere": (
+        lambda root: (root / "data.yaml").write_text("train: pictures\nnames: [disc, box]\n"),
+        r"there is no image for train in .*/pictures",
+    ),
     "labels": (lambda root: [path.unlink() for path in root.glob("labels/*/*")], "there is no label of its images"),
     "listed": (
         lambda root: (
@@ -209,8 +248,18 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
         lambda c: c["annotations"][0].update(segmentation={"size": [9, 9], "counts": "1"}),
         "segmentation must be of 64 x 96 px",
     ),
+    "short": (
+        lambda c: c["annotations"][0].update(segmentation={"size": [64, 96], "counts": [100, 20]}),
+        r"run lengths must be of 64 x 96 px, 6144 \(got 120\)",
+    ),
+    "short code": (
+        lambda c: c["annotations"][0].update(segmentation={"size": [64, 96], "counts": "zzzz"}),
+        "run lengths must be of 64 x 96 px",
+    ),
+    "crowd": (lambda c: c["annotations"][0].update(iscrowd="0"), "iscrowd must be 0 or 1 \\(got '0'\\)"),
     "key": (lambda c: c["annotations"][0].pop("image_id"), "key 'image_id' is missing"),
-    "names": (lambda c: c["categories"][0].update(name="box"), "names of categories must differ"),
+    "names": (lambda c: c["categories"][0].update(name="box"), "names of categories, must differ"),
+    "ids": (lambda c: [one.update(id=1) for one in c["categories"]], "names of categories, must differ|category_id"),
     "nothing": (lambda c: c.update(images=[], annotations=[]), "there is no image"),
 }
 
@@ -232,6 +281,61 @@ def test_a_folder_of_nothing_is_refused(tmp_path: Path) -> None:
         read_set(tmp_path, "train")
     with pytest.raises(InputError, match=r"must be the folder of a dataset \(got nothing\)"):
         read_set(tmp_path / "none", "train")
+
+
+def test_run_lengths_are_those_of_the_code() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        height, width = rng.integers(1, 300, 2).tolist()
+        mask = np.asfortranarray(cv2.blur(rng.random((height, width)), (9, 9)) > rng.uniform(0.4, 0.6), dtype=np.uint8)
+        code = coco_mask.encode(mask)
+        lengths = _run_lengths(code["counts"].decode())
+        assert sum(lengths) == height * width
+        again = coco_mask.frPyObjects({"size": [height, width], "counts": lengths}, height, width)
+        assert again["counts"] == code["counts"]
+
+
+def test_linked_folders_are_followed_once(tmp_path: Path) -> None:
+    root, other = write_yolo(tmp_path / "root", {"train": 2}), write_yolo(tmp_path / "other", {"train": 3})
+    for kind in ("images", "labels"):
+        (root / kind / "train/more").symlink_to(other / kind / "train")
+    (other / "images/train/back").symlink_to(root / "images/train")
+    assert len(read_set(root, "train").samples) == 5
+
+
+@pytest.mark.parametrize("where", ["absolute", "beside"])
+def test_folders_are_found_where_exports_say(tmp_path: Path, where: str) -> None:
+    root = write_yolo(tmp_path / "root", {"train": 2})
+    entry = {"absolute": root / "images/train", "beside": "../images/train"}[where]
+    (root / "data.yaml").write_text(f"train: {entry}\nnames: [disc, box]\n")
+    assert len(read_set(root, "train").samples) == 2
+
+
+def test_all_of_coco_is_all_of_its_files(tmp_path: Path) -> None:
+    root = write_coco(tmp_path, 4)
+    content = json.loads((root / "labels.json").read_text())
+    (root / "labels.json").unlink()
+    for name, images in (
+        ("instances_train2017", content["images"][:3]),
+        ("constrained_val2017", content["images"][3:]),
+    ):
+        ids = {image["id"] for image in images}
+        some = [annotation for annotation in content["annotations"] if annotation["image_id"] in ids]
+        (root / f"{name}.json").write_text(json.dumps(content | {"images": images, "annotations": some}))
+    assert [len(read_set(root, split).samples) for split in ("train", "val", "all")] == [3, 1, 4]  # type: ignore[arg-type]
+    (root / "old_train.json").write_text((root / "instances_train2017.json").read_text())
+    with pytest.raises(InputError, match="each image must be in one of its COCO files"):
+        read_set(root, "all")
+
+
+def test_pictures_are_read_by_any_name(tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.jpg"))
+    turned = Image.Exif()
+    turned[274] = 6
+    Image.fromarray(paint(0)[0]).save(path, exif=turned)
+    assert read_picture(path).shape == (WIDTH, HEIGHT, 3)
+    with pytest.raises(InputError, match=r"none\.png: cannot be read as an image"):
+        read_picture(tmp_path / "none.png")
 
 
 def test_a_digest_tells_of_every_change(tmp_path: Path) -> None:

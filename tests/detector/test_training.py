@@ -23,6 +23,7 @@ from mitsplat.cli import app
 from mitsplat.content_hash import file_hash
 from mitsplat.detector import libraries
 from mitsplat.detector.evaluation import evaluate_detector, truth_of
+from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.scores import average_precision
 from mitsplat.detector.sets import read_set
@@ -52,6 +53,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
     "odd": ({"size": 100}, r"size must be a multiple of 32 px \(got 100\)"),
     "share": ({"share": 1.0}, r"share of real images must lie between 0 and 1 \(got 1\)"),
     "real_size": ({"real_size": 320}, r"real_size must be no less than size, 640 px \(got 320\)"),
+    "large seed": ({"seed": 2**32}, r"seed must be less than 2\^32 \(got 4294967296\)"),
     "seed": ({"seed": -1}, r"seed must be 0 or more"),
     "device": ({"device": "gpu"}, r"device must be auto, cpu, cuda or cuda:N \(got gpu\)"),
 }
@@ -171,6 +173,19 @@ def _stranger(folder: Path) -> None:
     (folder / "run/thesis.tex").write_text("")
 
 
+def _own_names(folder: Path) -> None:
+    (folder / "run/data").mkdir(parents=True)
+    (folder / "run/data/notes.txt").write_text("mine")
+
+
+def _crowds(folder: Path) -> None:
+    labels = write_coco(folder / "crowds", 2) / "labels.json"
+    content = json.loads(labels.read_text())
+    for annotation in content["annotations"]:
+        annotation["iscrowd"] = 1
+    labels.write_text(json.dumps(content))
+
+
 def _others(folder: Path) -> None:
     write_yolo(folder / "other", {"train": 1}, classes=("disc", "box", "gear"))
 
@@ -186,6 +201,8 @@ def _boxes(folder: Path) -> None:
 
 REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "stranger": (_stranger, {}, r"run: holds something else than a run \(got thesis.tex\)"),
+    "own names": (_own_names, {}, r"run: holds something else than a run \(got data\)"),
+    "crowds": (_crowds, {"real": "crowds"}, "crowds: nothing but crowds is labelled"),
     "empty": (_empty, {}, r"cell: there is no image for train \(it has 1 for val\)"),
     "classes": (_others, {"more": "other"}, "other: its classes must be those of .*cell: it also has gear"),
     "real classes": (_others, {"real": "other"}, "other: its classes must be those of .*cell: it also has gear"),
@@ -209,6 +226,19 @@ def test_what_cannot_be_learnt_is_refused_before_it_begins(
         train_detector(datasets, tmp_path / "run", settings, real=real)
     assert "\n" not in str(told.value) and not no_libraries
     assert not (tmp_path / "run" / RUN).exists()
+
+
+def test_what_is_learnt_from_is_never_in_the_folder_of_the_run(
+    no_libraries: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    write_yolo(tmp_path / "run/data", {"train": 2}, mitsplat=True)
+    (tmp_path / "run" / RUN).write_text(json.dumps({"settings": {}, "classes": ["a"], "masks": True}))
+    before = snapshot(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path / "run/data")
+    for dataset in (tmp_path / "run/data", tmp_path / "link"):
+        with pytest.raises(InputError, match="run: must not hold what is learnt from"):
+            train_detector([dataset], tmp_path / "run", TINY, overwrite=True)
+    assert {path: data for path, data in snapshot(tmp_path).items() if "/link/" not in path} == before
 
 
 def test_boxes_are_learnt_by_a_network_of_boxes(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
@@ -475,6 +505,32 @@ def test_what_cannot_be_judged_is_refused(data: Path, trained: Run, tmp_path: Pa
         with pytest.raises(InputError, match=message):
             evaluate_detector(trained.path, tmp_path / folder, tmp_path / "out", **options)  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
+
+
+@needs_ultralytics
+@pytest.mark.slow
+def test_weights_are_read_by_whatever_name_and_kept(
+    data: Path, trained: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError(f"a connection was asked for: {args}")
+
+    for name in ("getaddrinfo", "create_connection"):
+        monkeypatch.setattr(socket, name, refuse)
+    monkeypatch.chdir(tmp_path)
+    for name in ("yolo11n-seg.pt", "yolov5n.pt", "o'clock.pt"):  # of which Ultralytics downloads the first two
+        Path(name).write_bytes(b"torn" * 1000)
+        with pytest.raises(InputError, match="cannot be read as weights"):
+            load_weights(Path(name))
+        assert Path(name).read_bytes() == b"torn" * 1000
+        shutil.copy(trained.weights, name)
+        check_weights(Path(name), "yolo11n-seg.yaml", masks=True, classes=2)
+    shutil.copytree(trained.path, tmp_path / "bob's run")
+    found = evaluate_detector(tmp_path / "bob's run", data / "cell", device="cpu")
+    assert found.results["box"] == evaluate_detector(trained.path, data / "cell", device="cpu").results["box"]
+    (tmp_path / "bob's run" / trained.weights.name).write_bytes(b"torn")
+    with pytest.raises(InputError, match="cannot be read as weights"):
+        evaluate_detector(tmp_path / "bob's run", data / "cell", device="cpu")
 
 
 @needs_ultralytics

@@ -33,15 +33,14 @@ class PartialResultError(RuntimeError):
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the machine's memory has run out, or a GPU's, which Dr.Jit tells by a text.
+    """Whether the machine's memory has run out, or a GPU's, which Dr.Jit, PyTorch and OpenCV tell by a text.
 
     A `TypeError` is what that becomes where an array is made of values that do not fit.
     """
     if isinstance(error, MissingResourceError | PartialResultError):
         return False
-    return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError | TypeError) and bool(_OUT_OF_MEMORY.search(str(error)))
-    )
+    telling = isinstance(error, RuntimeError | TypeError) or type(error).__module__ == "cv2"
+    return isinstance(error, MemoryError) or (telling and bool(_OUT_OF_MEMORY.search(str(error))))
 
 
 def exit_status(error: BaseException) -> int | None:

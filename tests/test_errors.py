@@ -1,0 +1,34 @@
+"""What the command line makes of errors that are no bugs of mitsplat."""
+
+import cv2
+import numpy as np
+import pytest
+
+from mitsplat.errors import InputError, exit_status, sentence_of
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("jit_malloc(): out of memory! Could not allocate 4 GiB of device memory."),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: you tried to"),
+    ],
+)
+def test_memory_that_has_run_out_is_missing_on_the_machine(error: Exception) -> None:
+    assert exit_status(error) == 3
+    assert sentence_of(error).startswith("memory has run out")
+
+
+def test_opencv_tells_of_memory_too() -> None:
+    with pytest.raises(cv2.error) as told:
+        cv2.resize(np.zeros((9, 9, 3), np.uint8), (10**6, 10**6))
+    assert exit_status(told.value) == 3
+    with pytest.raises(cv2.error) as other:
+        cv2.resize(np.zeros((0, 0), np.uint8), (9, 9))
+    assert exit_status(other.value) is None
+
+
+def test_other_errors_are_none_of_memory() -> None:
+    assert exit_status(RuntimeError("out of ideas")) is None
+    assert exit_status(InputError("insufficient memory for jokes")) == 2

@@ -565,13 +565,15 @@ def _look(path: Path) -> tuple[int, int, ContentHash]:
 
 def _ends(jpeg: bytes) -> str:
     """What is wrong with a JPEG file that does not end with its end marker, which Ultralytics would write anew."""
+    ends = jpeg.rfind(_JPEG_ENDS)
     try:
-        with Image.open(io.BytesIO(jpeg)) as image:
+        with Image.open(io.BytesIO(jpeg[:ends] + _JPEG_ENDS)) as image:
             image.load()
     except IMAGE_ERRORS:
+        ends = -1
+    if ends < 0:
         return "is torn: a JPEG file must end with its end marker"
-    after = len(jpeg) - jpeg.rindex(_JPEG_ENDS) - len(_JPEG_ENDS)
-    return f"has {after} bytes after its end marker: cut them off, or save it anew"
+    return f"has {len(jpeg) - ends - len(_JPEG_ENDS)} bytes after its end marker: cut them off, or save it anew"
 
 
 def _below(root: Path, path: Path) -> str:

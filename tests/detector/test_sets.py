@@ -157,6 +157,12 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         ),
         r"000009.jpg: is torn",
     ),
+    "no end": (
+        lambda root: (root / "images/train/000009.jpg").write_bytes(
+            cv2.imencode(".jpg", paint(1)[0])[1].tobytes()[:-2]
+        ),
+        r"000009.jpg: is torn",
+    ),
     "trailer": (
         lambda root: (root / "images/train/000009.jpg").write_bytes(
             cv2.imencode(".jpg", paint(1)[0])[1].tobytes() + b"trailer"

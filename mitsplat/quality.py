@@ -108,7 +108,7 @@ class Quality:
 
 PRESETS: dict[PresetName, Quality] = {
     "fast": Quality(alpha_min=3e-3, transmittance_min=2e-2, extends=True, amends=True, sh_degree=2),
-    "balanced": Quality(tolerance=2e-2, alpha_min=1e-3, transmittance_min=5e-3, extends=True),
+    "balanced": Quality(tolerance=1.5e-2, alpha_min=1e-3, transmittance_min=5e-3, extends=True),
     "exact": Quality(tolerance=0.0, alpha_min=1e-5, transmittance_min=1e-6),
 }
 

@@ -24,8 +24,8 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     options = parser.parse_args()
     with recording("detector.hues", parser, options, ignore=("work",)):
+        scenes = read_arms()["arms"]["synthetic"]["scenes"]
         for camera, change in (("as scanned", "+no_hue"), ("as drawn", "")):
-            scenes = read_arms()["arms"]["synthetic"]["scenes"]
             datasets = [options.work / "data" / f"{scene}{change}" for scene in scenes]
             found = compare_with_photographs(datasets, options.work / "photos")
             turns = list(found.hues.values())

@@ -32,6 +32,7 @@ from mitsplat.detector.libraries import (
     versions,
 )
 from mitsplat.detector.losses import gains
+from mitsplat.detector.pictures import read_picture
 from mitsplat.detector.report import make_report
 from mitsplat.detector.scores import (
     CONFIDENCE,
@@ -42,7 +43,7 @@ from mitsplat.detector.scores import (
     DetectionMatches,
     confuse,
 )
-from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_picture, read_set
+from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_set
 from mitsplat.detector.training import open_run
 from mitsplat.errors import InputError
 from mitsplat.files import storage_errors, write_text

@@ -19,7 +19,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
-from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_picture, read_set
+from mitsplat.detector.pictures import read_picture
+from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress

@@ -11,8 +11,9 @@ import numpy as np
 from pycocotools import mask as coco_mask
 
 from mitsplat.detector.losses import KINDS
+from mitsplat.detector.pictures import read_picture
 from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePrecision, Confusion, Detection
-from mitsplat.detector.sets import LabelledSet, Sample, read_picture
+from mitsplat.detector.sets import LabelledSet, Sample
 from mitsplat.html import inline_image, make_page, mask_path
 from mitsplat.labels.overlay import class_colour
 from mitsplat.masks import Silhouette

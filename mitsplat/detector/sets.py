@@ -14,9 +14,7 @@ left out by whoever reads it later.
 
 from __future__ import annotations
 
-import io
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,38 +22,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
-from PIL import Image
 from pycocotools import mask as coco_mask
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from mitsplat.arrays import ByteImage, Float64Array
+from mitsplat.arrays import Float64Array
 from mitsplat.content_hash import ContentHash
+from mitsplat.detector.pictures import images_below, look_at_image
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS, SPLITS, is_inside
+from mitsplat.files import SPLITS, is_inside
 from mitsplat.labels.polygons import fill_polygon, outline
 from mitsplat.masks import encode_mask
 from mitsplat.progress import Progress
 
 Split = Literal["train", "val", "test", "all"]
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-"""Images that Ultralytics reads as well."""
-_WHOLE, _DECODED = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "TIFF")
-"""Formats of which Pillow tells whether a file is torn, and those of which only decoding it does."""
-
 STRIDE = 32
 """What Ultralytics' networks divide the sides of images by [px]."""
 
 _BEYOND = 0.01
 """How far positions may lie outside of the image, as a share of its sides; they are cut off there."""
-SMALLEST = 10
-"""Sides of images that Ultralytics takes [px]."""
-_JPEG_ENDS = b"\xff\xd9"
-_ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
-"""The EXIF tag by which OpenCV turns images as it reads them, and its values that swap width and height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +248,7 @@ def _yolo(
         raise InputError(f"{root}: there is no label of its images, such as {_label_of(images[0])}")
 
     def read(image: Path) -> Sample:
-        width, height, content = _look(image)
+        width, height, content = look_at_image(image)
         label = _label_of(image)
         if label.is_file():
             text = label.read_text(encoding="utf-8-sig", errors="replace")
@@ -298,7 +285,7 @@ def _images(root: Path, entry: str) -> list[Path]:
     """Images of a folder or of a list, by name; none if it is missing."""
     place = root / entry
     if place.is_dir():
-        return _images_below(place)
+        return images_below(place)
     if not place.is_file():
         return []
     try:
@@ -306,16 +293,6 @@ def _images(root: Path, entry: str) -> list[Path]:
     except UnicodeDecodeError as error:
         raise InputError(f"{place}: must be a folder of images, or a list of them in UTF-8 ({error.reason})") from error
     return [place.parent / line.strip() for line in lines if line.strip()]
-
-
-def _images_below(folder: Path) -> list[Path]:
-    """Images anywhere in a folder, and in folders that it links to, by name."""
-    found, seen = list[Path](), set[str]()
-    for place, folders, files in os.walk(folder, followlinks=True):
-        seen.add(os.path.realpath(place))
-        folders[:] = [name for name in folders if os.path.realpath(Path(place, name)) not in seen]
-        found += [Path(place, name) for name in files]
-    return sorted(path for path in found if path.suffix.lower() in SUFFIXES)
 
 
 def _label_of(image: Path) -> Path:
@@ -395,7 +372,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
 
     def read(image: dict[str, Any]) -> Sample:
         file = find(str(image.get("file_name")))
-        width, height, shown = _look(file)
+        width, height, shown = look_at_image(file)
         if (image.get("width"), image.get("height")) != (width, height):
             raise InputError(
                 f"{file}: must be as large as {path.name} says, {image.get('width')} x {image.get('height')} px, "
@@ -445,7 +422,7 @@ def _json(path: Path) -> Any:
 def _finder(root: Path, listing: Path) -> Callable[[str], Path]:
     """Finds the images that a file of annotations names."""
     below: dict[str, list[Path]] = {}
-    for path in _images_below(root):
+    for path in images_below(root):
         below.setdefault(path.name, []).append(path)
 
     def find(name: str) -> Path:
@@ -518,62 +495,6 @@ def _run_lengths(code: str) -> list[int]:
             lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))
             value = shift = 0
     return lengths
-
-
-def read_picture(path: Path) -> ByteImage:
-    """An image as it is shown, turned by its EXIF orientation: shape (H, W, 3), BGR.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
-    try:  # not by OpenCV, which takes names in UTF-8 alone
-        picture = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):
-        picture = None
-    if picture is None:
-        raise InputError(f"{path}: cannot be read as an image")
-    return np.asarray(picture, dtype=np.uint8)
-
-
-def _look(path: Path) -> tuple[int, int, ContentHash]:
-    """Width and height of an image as it is shown [px], and the hash of its content, which must be whole."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            image.verify()
-        with Image.open(io.BytesIO(data)) as image:
-            width, height = image.size
-            turned = image.getexif().get(_ORIENTATION) in _TURNED
-            form = image.format
-    except IMAGE_ERRORS as error:
-        raise InputError(f"{path}: cannot be read as an image ({error})") from error
-    if form in ("JPEG", "MPO") and not data.endswith(_JPEG_ENDS):
-        raise InputError(f"{path}: {_ends(data)}")
-    if form not in _WHOLE + _DECODED:
-        raise InputError(f"{path}: must be a JPEG, PNG, BMP, TIFF or WebP file (got {form})")
-    if turned:
-        width, height = height, width
-    if form in _DECODED and read_picture(path).shape[:2] != (height, width):
-        raise InputError(f"{path}: must be read by OpenCV as by others, {width} x {height} px: save it as PNG")
-    if min(width, height) < SMALLEST:
-        raise InputError(f"{path}: an image must have sides of {SMALLEST} px or more (got {width} x {height})")
-    return width, height, ContentHash(data)
-
-
-def _ends(jpeg: bytes) -> str:
-    """What is wrong with a JPEG file that does not end with its end marker, which Ultralytics would write anew."""
-    ends = jpeg.rfind(_JPEG_ENDS)
-    try:
-        with Image.open(io.BytesIO(jpeg[:ends] + _JPEG_ENDS)) as image:
-            image.load()
-    except IMAGE_ERRORS:
-        ends = -1
-    if ends < 0:
-        return "is torn: a JPEG file must end with its end marker"
-    return f"has {len(jpeg) - ends - len(_JPEG_ENDS)} bytes after its end marker: cut them off, or save it anew"
 
 
 def _below(root: Path, path: Path) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 import pycocotools.mask as coco_mask
 
 from mitsplat.arrays import BoolArray
-from mitsplat.detector.sets import SMALLEST, Instance, LabelledSet, read_picture
+from mitsplat.detector.pictures import SMALLEST, read_picture
+from mitsplat.detector.sets import Instance, LabelledSet
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import outline
 from mitsplat.masks import Silhouette

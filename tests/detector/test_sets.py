@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 from pycocotools import mask as coco_mask
 
-from mitsplat.detector.sets import LabelledSet, _run_lengths, check_masks, in_classes, read_picture, read_set
+from mitsplat.detector.pictures import read_picture
+from mitsplat.detector.sets import LabelledSet, _run_lengths, check_masks, in_classes, read_set
 from mitsplat.detector.training import read_sets, write_data
 from mitsplat.errors import InputError
 from tests.detector.painted import CLASSES, HEIGHT, WIDTH, paint, write_coco, write_yolo
@@ -265,7 +266,10 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
     "crowd": (lambda c: c["annotations"][0].update(iscrowd="0"), "iscrowd must be 0 or 1 \\(got '0'\\)"),
     "key": (lambda c: c["annotations"][0].pop("image_id"), "key 'image_id' is missing"),
     "names": (lambda c: c["categories"][0].update(name="box"), "names of categories, must differ"),
-    "ids": (lambda c: [one.update(id=1) for one in c["categories"]], "names of categories, must differ|category_id"),
+    "ids": (
+        lambda c: [one.update(id=1) for one in c["categories"]] + [a.update(category_id=1) for a in c["annotations"]],
+        "ids and names of categories, must differ",
+    ),
     "nothing": (lambda c: c.update(images=[], annotations=[]), "there is no image"),
 }
 
@@ -340,8 +344,11 @@ def test_pictures_are_read_by_any_name(tmp_path: Path) -> None:
     turned[274] = 6
     Image.fromarray(paint(0)[0]).save(path, exif=turned)
     assert read_picture(path).shape == (WIDTH, HEIGHT, 3)
-    with pytest.raises(InputError, match=r"none\.png: cannot be read as an image"):
+    with pytest.raises(InputError, match=r"none\.png: cannot be read \(No such file"):
         read_picture(tmp_path / "none.png")
+    (tmp_path / "empty.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"empty\.png: cannot be read as an image"):
+        read_picture(tmp_path / "empty.png")
 
 
 def test_a_digest_tells_of_every_change(tmp_path: Path) -> None:

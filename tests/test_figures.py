@@ -65,11 +65,16 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     assert real == f"| `real` | 1 | 0.250 | {interval} | 0.500 | `synthetic` | 0.150 to 0.170 |"
     assert synthetic.startswith("| `synthetic` | 2 | 0.410 | ") and synthetic.endswith("| 0.820 | – | – |")
     assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")  # of the same views
-    assert earlier.endswith("| – | – |")  # of other scenes
+    assert earlier.endswith("| – | – |")  # beside none
     results["detector.experiment-no_shadow-0"]["figures"]["scenes"] = ["of later ones", ""]
     results["detector.experiment-real-0"]["figures"]["scenes"] = ["", ""]
     *_, shadow, real, _, _ = experiment_table(results).splitlines()
     assert shadow.endswith("| – | – |") and real.endswith("| `synthetic` | 0.150 to 0.170 |")
+    results["detector.experiment-images_3087-0"] = run(0.38, list(draws - 0.02))
+    for seed in range(2):
+        results[f"detector.experiment-synthetic-{seed}"]["figures"]["scenes"] = ["of later ones", ""]
+    *_, before, _, _, _, _, _ = experiment_table(results).splitlines()
+    assert before.endswith("| `synthetic` | 0.020 to 0.040 |")  # although of other scenes
     *_, shadow, synthetic = experiment_table(results, "workshop").splitlines()
     assert shadow.endswith("| `synthetic` | 0.100 to 0.100 |") and synthetic.startswith("| `synthetic` | 1 | 0.300 | ")
 

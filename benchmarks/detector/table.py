@@ -5,27 +5,15 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.detector.experiment import read_arms
+
 REFERENCE = "synthetic"
 """The arm that others are compared with."""
-FIRST = "traced_shadow"
-"""The arm that those are compared with which learn from as few images as it does."""
-OF_FIRST = re.compile("(image|no)_.*|balanced|exact|aliased|layouts_.*|scattered|floating|meshes")
-EARLIER = frozenset({"hybrid", "images_250", "images_900", "images_1000", "images_3177"})
-"""Arms of ``arms.yaml`` that were recorded when its scenes drew other things; they are compared with nothing."""
-BEFORE = frozenset({"images_3087"})
-"""Those that are compared with what is drawn now, to tell what the scenes' change gave."""
-OF_ANOTHER = {
-    "traced_shadow": "images_3177",
-    "large": "images_3087",
-    "hybrid_cut": "images_3087",
-    "hybrid_more": "hybrid_cut",
-    "hybrid_large": "hybrid_cut",
-}
-"""Arms that are compared with the one that they are a variant of."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 
@@ -34,19 +22,20 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     """Precision of the arms of a plan that were recorded, or of some of them in their order, with intervals of 95 %.
 
     Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
-    drawn apart for each arm. An arm of one seed has only that of scenes.
+    drawn apart for each arm. An arm of one seed has only that of scenes. What arms stand beside, their plan says.
     """
     seeds, draws = _by_arm(results, plan, *arms), precision_draws(results, plan)
+    said = read_arms(Path(f"{plan}.yaml"))["arms"]
     lines = [
         "| learnt from | seeds | mAP50-95 | 95 % | mAP50 | compared with | less by, 95 % |",
         "| --- | ---: | ---: | --- | ---: | --- | --- |",
     ]
     for arm in arms or seeds:
         strict, loose = (_mean(seeds[arm], key) for key in ("map50_95", "map50"))
-        reference = FIRST if OF_FIRST.fullmatch(arm) and FIRST in draws else OF_ANOTHER.get(arm, REFERENCE)
-        compared = "– | –"
-        known = reference in seeds and (arm in BEFORE or _of_same_scenes(seeds[arm], seeds[reference]))
-        if arm != reference and known and not (arm in EARLIER and plan == "arms"):
+        reference, compared = said[arm].get("beside", REFERENCE), "– | –"
+        others = said[arm].get("other_scenes", False)
+        known = reference in seeds and (others or _of_same_scenes(seeds[arm], seeds[reference]))
+        if arm != reference and known:
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"
         count = len(seeds[arm])
         lines.append(f"| `{arm}` | {count} | {strict:.3f} | {_interval(draws[arm])} | {loose:.3f} | {compared} |")

@@ -164,8 +164,10 @@ def check_weights(weights: Path, network: str, *, masks: bool, classes: int | No
     kind = SegmentationModel if masks else DetectionModel
     if classes not in (None, len(found.names)):
         raise InputError(f"{weights}: must tell {classes} classes apart (got {len(found.names)})")
-    expected = kind(network, nc=len(found.names), verbose=False).state_dict()
-    own = found.state_dict()
+    model = kind(network, nc=len(found.names), verbose=False)
+    # The branch that tells classes is as wide as that of the weights a network began with, of any number of classes.
+    model.load(found, verbose=False)
+    expected, own = model.state_dict(), found.state_dict()
     for name in sorted(expected.keys() | own.keys()):
         shapes = [tuple(tensors[name].shape) if name in tensors else None for tensors in (own, expected)]
         if shapes[0] != shapes[1]:

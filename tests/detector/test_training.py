@@ -356,6 +356,24 @@ def test_the_same_command_gives_the_same_weights(data: Path, tmp_path: Path) -> 
 
 @needs_ultralytics
 @pytest.mark.slow
+def test_what_began_with_weights_of_many_classes_is_judged_and_learnt_on_from(
+    data: Path, torchvision: None, tmp_path: Path
+) -> None:
+    """As COCO's, of which Ultralytics keeps a branch that is wider than that of a few classes."""
+    import torch
+    from ultralytics.nn.tasks import SegmentationModel
+
+    many = SegmentationModel("yolo11n-seg.yaml", nc=80, verbose=False)
+    torch.save({"model": many}, tmp_path / "many.pt")
+    run = train_detector([data / "cell"], tmp_path / "run", _other(weights=tmp_path / "many.pt"))
+    assert tensors(run)["model.23.cv3.0.0.1.bn.bias"].shape == (80,)
+    onward = train_detector([data / "cell"], tmp_path / "onward", _other(weights=run.weights))
+    for each in (run, onward):
+        assert evaluate_detector(each.path, data / "cell", device="cpu").results["box"]
+
+
+@needs_ultralytics
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_number_of_steps(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

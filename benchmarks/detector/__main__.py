@@ -4,9 +4,10 @@
         [--render-devices cpu] [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
 Whole datasets are rendered first, on all devices that render; then a changed scene after the one that shows the same
-layouts unchanged, beside what trains: on the processor, if that is to take nothing from it. Arms are trained when what
-they learn from is there, in the order in which they are named, all of the first seed before the second, and folds of
-one side by side. What was recorded is not done again; what was interrupted goes on.
+layouts unchanged, beside what trains. On the processor they take only what is left by the processes that prepare images
+for trainings. Arms are trained when what they learn from is there, in the order in which they are named, all of the
+first seed before the second, and folds of one side by side. What was recorded is not done again; what was interrupted
+goes on.
 """
 
 from __future__ import annotations
@@ -141,6 +142,8 @@ def run_jobs(jobs: Sequence[Job], free: Mapping[str, list[str]], options: argpar
         kind, _, number = device.partition(":")
         environment = os.environ | ({"CUDA_VISIBLE_DEVICES": number} if number and job.hides else {})
         words = [*job.words, "--device", "cuda:all" if job.everywhere else kind if job.hides else device]
+        if kind == "cpu" and job.kind == "render":
+            words = ["nice", "-n", "19", *words]
         log = logs / f"{job.name}.log"
         with log.open("w") as file:
             limit = max(ends - time.monotonic(), 1)

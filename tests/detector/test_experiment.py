@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -158,6 +159,14 @@ def test_jobs_run_in_order_on_free_devices_after_what_they_need(tmp_path, capsys
         "not done, as time is up or what they need is not there: lost",
     ]
     assert free["train"] == ["cuda:1"]
+
+
+def test_what_renders_on_the_processor_leaves_it_to_trainings(tmp_path, capsys):
+    nice = [sys.executable, "-c", "import os; print(os.nice(0))"]
+    jobs = [side_by_side.Job(kind, kind, nice) for kind in ("render", "train")]
+    side_by_side.run_jobs(jobs, {"train": ["cpu"], "render": ["cpu"]}, argparse.Namespace(work=tmp_path, minutes=5))
+    said = dict(line.split("min  ")[-1].split(": ") for line in capsys.readouterr().out.splitlines())
+    assert said == {"render": "19", "train": str(os.nice(0))}
 
 
 def test_photographs_of_parts_are_labelled_by_what_is_seen(tmp_path, physics, monkeypatch):

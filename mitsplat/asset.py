@@ -13,11 +13,11 @@ A folder holds ``asset.yaml`` (:class:`AssetSpec` lists its keys) and the files 
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
 
 import numpy as np
@@ -29,12 +29,14 @@ from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.files import file_inside
+from mitsplat.files import MESH_ERRORS, file_inside, storage_errors
 from mitsplat.format_version import FORMAT_VERSIONS
 from mitsplat.splats import Splats
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
 Positive = Annotated[float, Field(gt=0)]
+Length = Annotated[float, Field(ge=1e-9, le=1e9)]
+"""No more than a number of 32 bits holds the cube of."""
 
 ASSET_FILE = "asset.yaml"
 _Z_UP_FROM = {
@@ -49,13 +51,6 @@ _Z_UP_FROM = {
 
 _SPZ_UNITS = 1e-3
 """Metres per unit of ``.spz`` assets: the format holds no scale below 4.5e-5 units, a coarse 45 um in metres."""
-
-_MESH_ERRORS = (
-    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, RuntimeError),
-    *(MemoryError, EOFError, ImportError, NameError, struct.error),
-)
-"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish,
-NameError where a branch that rubbish does not take sets a variable."""
 
 _OPAQUE = 0.5
 _OFF_BY = 0.05
@@ -74,10 +69,10 @@ class AssetSpec(BaseModel):
     splats: str = Field(description="Splat file.")
     mesh: str | None = Field(None, description="Mesh file, or 'hull': the convex hull of the opaque splats.")
     pieces: str | None = Field(None, description="Mesh file whose connected parts are convex pieces of the mesh.")
-    units: Positive | Literal["unknown"] | None = Field(
+    units: Length | Literal["unknown"] | None = Field(
         None, description="Metres per unit of the files, 1 if neither this nor size is given; or unknown."
     )
-    size: Positive | None = Field(None, description="Longest extent [m], instead of units.")
+    size: Length | None = Field(None, description="Longest extent [m], instead of units.")
     up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field("z", description="Axis of the files that points up.")
     density: Positive | None = Field(None, description="[kg/m^3]; 1000 if neither this nor mass is given.")
     mass: Positive | None = Field(None, description="[kg], instead of density.")
@@ -192,6 +187,7 @@ class Asset:
 
         Raises:
             InputError: If a value breaks a rule of :class:`AssetSpec` or the folder cannot be written.
+            MissingResourceError: If there is no room.
         """
         folder = Path(folder)
         units = _SPZ_UNITS if splats.lower().endswith(".spz") and self.units == "metre" else 1.0
@@ -219,18 +215,21 @@ class Asset:
             first = error.errors()[0]
             rule = ": ".join([*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")])
             raise InputError(f"asset {self.name!r} cannot be saved: {rule}") from error
-        try:
+        with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / ASSET_FILE).unlink(missing_ok=True)  # an earlier asset's is not of what is written now
-            stored.splats.save(folder / splats)
-            if stored.mesh is not None:
-                _joined([stored.mesh]).export(folder / "mesh.ply")
-            if stored.pieces:
-                _joined(stored.pieces).export(folder / "pieces.ply")
-            # Last, so that an interrupted save is not mistaken for an asset.
-            YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), folder / ASSET_FILE)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+            # Apart, so that an earlier asset is whole until all of this one is.
+            with TemporaryDirectory(prefix=".asset-", dir=folder) as apart:
+                new = Path(apart)
+                stored.splats.save(new / splats)
+                if stored.mesh is not None:
+                    _joined([stored.mesh]).export(new / "mesh.ply")
+                if stored.pieces:
+                    _joined(stored.pieces).export(new / "pieces.ply")
+                described = new / ASSET_FILE
+                YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), described)
+                (folder / ASSET_FILE).unlink(missing_ok=True)
+                for file in sorted(new.iterdir(), key=lambda file: file == described):
+                    file.replace(folder / file.name)
 
     def transformed(self, matrix: npt.ArrayLike) -> Asset:
         """The asset's splats, mesh and pieces after a similarity transform (4, 4); mass and density stay.
@@ -279,7 +278,8 @@ class Asset:
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
         if not extent > 0:
             raise InputError(
-                f"{self.folder}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent (got 0)"
+                f"{self.folder or self.name}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent "
+                "(got 0)"
             )
         return size / extent
 
@@ -340,10 +340,15 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
             mesh = trimesh.load_mesh(path, process=merge)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except _MESH_ERRORS as error:
+    except MESH_ERRORS as error:
         raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: a mesh must have triangles (got none)")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise InputError(
+            f"{path}: not a valid mesh file (a face has vertices {mesh.faces.min()} to {mesh.faces.max()} "
+            f"of {len(mesh.vertices)})"
+        )
     if not np.isfinite(mesh.vertices).all():
         row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
         raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from mitsplat.arrays import Float64Array
 
@@ -87,3 +88,10 @@ def _colour_science() -> Any:
         warnings.simplefilter("ignore")
         import colour  # takes a second, and warns as it is imported
     return colour
+
+
+def eight_bit(image: Image.Image) -> Image.Image:
+    """RGB with 8 bits a channel; transparent pixels keep their colour, 16-bit grey its upper byte."""
+    if image.mode.startswith("I"):
+        return Image.fromarray((np.asarray(image).astype(np.int64) // 256).clip(0, 255).astype(np.uint8)).convert("RGB")
+    return image.convert("RGB")

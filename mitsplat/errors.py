@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import re
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the system's errors where there is no room for a file."""
+
 _OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory|can.t allocate memory|insufficient memory", re.IGNORECASE)
 
 
@@ -43,15 +46,22 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (telling and bool(_OUT_OF_MEMORY.search(str(error))))
 
 
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether someone has interrupted, which Dr.Jit wraps in an error of its own where it was at work."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 def exit_status(error: BaseException) -> int | None:
     """Status with which the command line exits for an error that is no bug of ours, else None."""
     if isinstance(error, MissingResourceError) or is_out_of_memory(error):
         return 3
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if isinstance(error, OSError) and error.errno in FULL:
         return 3
     if isinstance(error, PartialResultError):
         return 4
-    if isinstance(error, KeyboardInterrupt):
+    if _is_interrupt(error):
         return 130
     return 2 if isinstance(error, InputError | OSError) else None
 

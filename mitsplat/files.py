@@ -14,7 +14,7 @@ from typing import Any
 from PIL import Image
 
 from mitsplat.content_hash import file_hash
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import FULL, InputError, MissingResourceError
 
 Record = dict[str, Any]
 """The line of one frame in ``manifest.jsonl``."""
@@ -31,7 +31,12 @@ def splits_of(output: Mapping[str, Any]) -> tuple[str, ...]:
 IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError)
 """What Pillow raises on damaged images, and on those of more pixels than a file should hold."""
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+MESH_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, RuntimeError),
+    *(MemoryError, EOFError, ImportError, NameError, struct.error),
+)
+"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish,
+NameError where a branch that rubbish does not take sets a variable."""
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> str:
@@ -42,11 +47,17 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    write(temporary)
-    with temporary.open("rb") as file:
-        digest = file_hash(file)
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        write(temporary)
+        with temporary.open("rb") as file:
+            digest = file_hash(file)
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
+            error.filename = str(path)
+        raise
     return digest
 
 
@@ -134,7 +145,7 @@ def file_inside(folder: Path, name: str) -> Path:
 
 def storage_error(path: Path, said: str) -> OSError:
     """The error of a library that puts the system's words, but not its number, into what it says."""
-    number = next((number for number in _FULL if os.strerror(number) in said), errno.EIO)
+    number = next((number for number in FULL if os.strerror(number) in said), errno.EIO)
     return OSError(number, os.strerror(number), str(path))
 
 
@@ -150,7 +161,7 @@ def storage_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         place = error.filename or folder
-        if error.errno in _FULL:
+        if error.errno in FULL:
             raise MissingResourceError(
                 f"{place}: {error.strerror}: make room and run again; what is finished is kept"
             ) from error

@@ -37,6 +37,7 @@ from scipy.special import expit, logit
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
+from mitsplat.files import storage_errors, write_file
 from mitsplat.spherical_harmonics import SH_C0
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -132,6 +133,7 @@ def write_splats(splats: SplatArrays, path: Path) -> None:
     Raises:
         InputError: If the suffix is not ``.ply``, ``.splat`` or ``.spz``, the format cannot hold the splats, or the
             file cannot be written.
+        MissingResourceError: If there is no room.
     """
     encoders = {".ply": _encode_ply, ".splat": _encode_splat, ".spz": _encode_spz}
     suffix = path.suffix.lower()
@@ -140,13 +142,8 @@ def write_splats(splats: SplatArrays, path: Path) -> None:
     if not len(splats.means) and suffix != ".ply":
         raise InputError(f"{path}: a {suffix} file must hold at least one Gaussian (got 0)")
     data = encoders[suffix](splats)
-    partial = path.with_name(path.name + ".part")
-    try:
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    with storage_errors(path):
+        write_file(path, lambda partial: partial.write_bytes(data))
 
 
 def _decode_ply(data: bytes) -> SplatArrays:

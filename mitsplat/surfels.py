@@ -203,7 +203,7 @@ def _uneven_faces(mesh: trimesh.Trimesh, spacing: Float64Array, creases: _Crease
 
 def _bend(tree: KDTree, normals: Float64Array, reach: Float64Array) -> Float64Array:
     """Angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of every point of ``tree``."""
-    distance, index = _query(tree, tree.data, k=min(10, tree.n))
+    distance, index = _query(tree, tree.data, k=range(1, 1 + min(10, tree.n)))
     cosine = np.einsum("pkd,pd->pk", normals[index], normals)
     return np.asarray(np.arccos(np.clip(np.where(distance < reach[:, None], cosine, 1.0).min(axis=1), -1.0, 1.0)))
 
@@ -333,7 +333,7 @@ def _closed(
     normals: Float64Array,
 ) -> Float64Array:
     """``scales`` (N, 3), grown up to ``widest`` (N, 2) until little light passes between discs at ``probes`` (P, 3)."""
-    _, index = _query(KDTree(centres), probes, k=min(12, len(centres)))
+    _, index = _query(KDTree(centres), probes, k=range(1, 1 + min(12, len(centres))))
     own = frames[index]
     local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], own[..., :2])
     facing = np.einsum("pkj,pj->pk", own[..., 2], normals) > 0.7

@@ -7,10 +7,13 @@ MTL without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +21,9 @@ from PIL import Image, ImageColor
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from mitsplat.arrays import Float64Array
-from mitsplat.colour import decode_srgb
+from mitsplat.colour import decode_srgb, eight_bit
 from mitsplat.errors import InputError
+from mitsplat.files import IMAGE_ERRORS
 
 DIELECTRIC_SPECULAR = 0.04
 """Reflectance at normal incidence of common plastics, lacquers and glass."""
@@ -192,33 +196,93 @@ def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
 def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.uint8] | None:
     if image is None:
         return None
-    if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
-        warnings.append("its texture has transparent places, which are baked opaque")
-    return np.array(image.convert("RGB"))
+    try:
+        if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
+            warnings.append("its texture has transparent places, which are baked opaque")
+        return np.array(eight_bit(image))
+    except IMAGE_ERRORS as error:
+        raise InputError(f"its texture cannot be read ({error})") from error
 
 
 def check_textures(mesh: Path) -> None:
-    """Refuse an OBJ whose material file or textures are missing: without them it would bake in grey.
+    """Refuse a mesh whose material file, materials or textures are missing: without them it would bake in grey.
 
     Raises:
-        InputError: If a file that the OBJ or its MTL names is missing or is no image.
+        InputError: If what an OBJ, its MTL, a glTF or a PLY names is missing, or is no image.
     """
-    if mesh.suffix.lower() != ".obj":
-        return
-    for library in _named(mesh, ("mtllib",)):
+    kind = mesh.suffix.lower()
+    if kind == ".obj":
+        _check_obj(mesh)
+    elif kind == ".gltf":
+        _check_gltf(mesh)
+    elif kind == ".ply":
+        header = mesh.read_bytes()[:_HEADER].partition(b"end_header")[0].decode("utf-8", errors="replace")
+        for texture in re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE):
+            _check_texture(mesh, texture)
+
+
+_HEADER = 1 << 16
+"""Bytes of a PLY file that its header is looked for in."""
+
+
+def _check_obj(mesh: Path) -> None:
+    libraries = _named(mesh, "mtllib")
+    known: list[str] = []
+    for library in libraries:
         path = mesh.parent / library
         if not path.is_file():
+            if all((mesh.parent / word).is_file() for word in library.split()):
+                raise InputError(f"{mesh}: must have one material file (got {library})")
             raise InputError(f"{mesh}: its material file {library} is missing; put it there, or give a colour")
-        for texture in _named(path, ("map_kd",)):
+        known += _named(path, "newmtl")
+        for texture in _named(path, "map_kd"):
+            if texture.startswith("-"):
+                raise InputError(f"{path}: options of a texture are not read: leave them out (got map_Kd {texture})")
+            _check_texture(path, texture)
+    missing = sorted(set(_named(mesh, "usemtl")) - set(known)) if libraries else []
+    if missing:
+        raise InputError(
+            f"{mesh}: its material {missing[0]} is not in {', '.join(libraries)}: add it, or give a colour"
+        )
+
+
+def _check_gltf(mesh: Path) -> None:
+    try:
+        said = json.loads(mesh.read_text("utf-8"))
+        images = [image.get("uri", "data:") for image in said.get("images", [])]
+        sources = [texture.get("source", 0) for texture in said.get("textures", [])]
+        for material in said.get("materials", []):
+            index = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}).get("index")
+            if index is not None and not (0 <= index < len(sources) and 0 <= sources[index] < len(images)):
+                raise InputError(f"{mesh}: a material's texture {index} is not there; give a colour")
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        return  # its reader says what is wrong
+    for uri in images:
+        if not uri.startswith("data:"):
+            _check_texture(mesh, unquote(uri))
+
+
+def _check_texture(path: Path, texture: str) -> None:
+    try:
+        with Image.open(path.parent / texture) as image:
+            image.load()
+    except IMAGE_ERRORS as error:
+        missing = not (path.parent / texture).is_file()
+        fault = "is missing" if missing else f"cannot be read ({error})"
+        raise InputError(f"{path}: its texture {texture} {fault}; put it there, or give a colour") from None
+
+
+def _named(path: Path, key: str) -> list[str]:
+    """What the lines of an OBJ or an MTL that begin with a key name."""
+    names = []
+    for line in path.read_bytes().splitlines():
+        word, _, rest = line.strip().partition(b" ")
+        if word.lower() == key.encode() and rest.strip():
             try:
-                with Image.open(path.parent / texture) as image:
-                    image.verify()
-            except (OSError, SyntaxError, ValueError) as error:
-                missing = not (path.parent / texture).is_file()
-                fault = "is missing" if missing else f"cannot be read ({error})"
-                raise InputError(f"{path}: its texture {texture} {fault}; put it there, or give a colour") from None
-
-
-def _named(path: Path, keys: tuple[str, ...]) -> list[str]:
-    lines = (line.strip().split(maxsplit=1) for line in path.read_text("utf-8", errors="replace").splitlines())
-    return [line[1].strip() for line in lines if len(line) == 2 and line[0].lower() in keys]
+                names.append(rest.strip().decode("utf-8"))
+            except UnicodeDecodeError:
+                name = rest.strip().decode("cp1252", errors="replace")
+                raise InputError(f"{path}: names must be UTF-8: save it so, or rename it (got {key} {name})") from None
+    return names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,8 +28,9 @@ from mitsplat.bake.materials import (
     read_material,
 )
 from mitsplat.colour import decode_srgb, encode_srgb
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.file_kinds import refuse_others
+from mitsplat.files import MESH_ERRORS
 from mitsplat.mesh_normals import corner_normals
 from mitsplat.plugins.device import ray_scene
 from mitsplat.render.emitters import emitter_dict, y_up_to_z_up
@@ -36,6 +38,8 @@ from mitsplat.spec.lights import LightSpec
 from mitsplat.variant import ensure_variant
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
+_BY_OTHERS = {".3mf": ("lxml", "lxml"), ".dae": ("collada", "pycollada")}
+"""Modules that trimesh reads some files by, and the packages that have them."""
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
 _DETAIL_CONTRAST = 0.12
@@ -114,6 +118,7 @@ def read_parts(
     Raises:
         InputError: If the file or its textures cannot be read, there are no faces, none has an area, or a position is
             not finite.
+        MissingResourceError: If what reads such files is not installed.
     """
     finish, linear = finish or Finish(), False
     source = "mesh"
@@ -127,7 +132,11 @@ def read_parts(
         linear = path.suffix.lower() in (".glb", ".gltf")
         try:
             mesh = trimesh.load_scene(mesh)
-        except (ValueError, TypeError, KeyError, OSError, ImportError, NotImplementedError) as error:
+        except (OSError, *MESH_ERRORS) as error:
+            if path.suffix.lower() in _BY_OTHERS:
+                needed = _BY_OTHERS[path.suffix.lower()]
+                if importlib.util.find_spec(needed[0]) is None:
+                    raise MissingResourceError(f"{source}: reading it needs `pip install {needed[1]}`") from error
             raise InputError(f"{source}: not a mesh that can be read ({error})") from error
     if not (metres_per_unit > 0 and np.isfinite(metres_per_unit)):
         raise InputError(f"{source}: metres_per_unit must be > 0 (got {metres_per_unit})")
@@ -138,11 +147,16 @@ def read_parts(
         transform, geometry_name = scene.graph[node]
         geometry = scene.geometry[geometry_name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
+                raise InputError(f"{source}: a face names a vertex that is not there (got {geometry.faces.max()})")
             if not np.isfinite(geometry.vertices).all():
                 row = int(np.flatnonzero(~np.isfinite(geometry.vertices).all(axis=1))[0])
                 place = np.asarray(geometry.vertices[row]).tolist()
                 raise InputError(f"{source}: vertex positions must be finite (got {place} at vertex {row})")
-            part = _read_part(str(geometry_name), geometry, to_world @ transform, finish, linear=linear)
+            try:
+                part = _read_part(str(geometry_name), geometry, to_world @ transform, finish, linear=linear)
+            except InputError as error:
+                raise InputError(f"{source}: part {geometry_name}: {error}") from error
             if len(part.mesh.faces):
                 parts.append(part)
     if not parts and any(len(getattr(g, "faces", ())) for g in scene.geometry.values()):

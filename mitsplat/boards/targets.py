@@ -28,6 +28,9 @@ _MARGIN = 0.008
 _SMALL = 1000
 """Longer edge of images below which they are enlarged to look for a board [px]."""
 
+LEAST_SQUARE = 0.001
+"""Smallest square of a board [m], of whose marker a module is two dots."""
+
 _MARKER = 0.75
 """Edge of a marker as a share of its square."""
 
@@ -52,8 +55,8 @@ class Board:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 12 <= self.columns * self.rows <= 500:
             raise InputError(f"a board must have 3x4 to 500 squares (got {self.columns}x{self.rows})")
-        if not 0 < self.square < np.inf:
-            raise InputError(f"a board's square must be > 0 m (got {self.square})")
+        if not LEAST_SQUARE <= self.square <= 10:
+            raise InputError(f"a board's square must be {LEAST_SQUARE} to 10 m (got {self.square:g})")
 
     @property
     def aruco(self) -> Any:

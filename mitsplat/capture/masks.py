@@ -147,7 +147,7 @@ def object_masks(
 
 
 def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
-    """Masks of the user: ``<photo>.png`` with or without the photo's own suffix, in the size of the photo.
+    """Masks of the user: ``<photo>.png`` with or without the photo's own suffix, in any case, in the size of the photo.
 
     White, or what is opaque in a picture with transparency, marks the object. A mask lies as viewers show the photo;
     one that lies on its side, as the camera held by EXIF's account, is turned.
@@ -157,17 +157,21 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of masks")
+    below = sorted(path for path in folder.rglob("*") if path.is_file())
+    by_name = {path.relative_to(folder).as_posix().lower(): path for path in below}
 
     def make(photo: Photo) -> BoolArray:
         name = Path(photo.name)
-        candidates = [folder / f"{photo.name}.png", folder / name.with_suffix(".png"), folder / photo.name]
-        path = next((path for path in candidates if path.is_file()), None)
+        candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
+        path = next((by_name[file.lower()] for file in candidates if file.lower() in by_name), None)
         if path is None:
-            raise InputError(f"{folder}: there must be a mask for every photo (got none named {candidates[1].name})")
+            raise InputError(f"{folder}: there must be a mask for every photo (got none named {candidates[1]})")
         try:
             with Image.open(path) as image:
                 upright = ImageOps.exif_transpose(image)
                 mask = upright.getchannel("A") if "A" in upright.getbands() else upright.convert("L")
+                if mask.getextrema() == (255, 255):  # opaque everywhere says nothing
+                    mask = upright.convert("L")
         except IMAGE_ERRORS as error:
             raise InputError(f"{path}: not a readable image ({error})") from error
         size = (photo.camera.width, photo.camera.height)

@@ -134,8 +134,10 @@ def find_metric_frame(
     if scale_from is not None and scale is None:
         one, other, metres = scale_from
         gap = float(np.linalg.norm(spot(model, one) - spot(model, other)))
-        if not (0 < metres < np.inf and gap > 0):
-            raise InputError(f"the distance of {one} and {other} must be > 0 m (got {metres}, {gap:.3g} in the model)")
+        if not (1e-6 <= metres <= 1e6 and gap > 0):
+            raise InputError(
+                f"the distance of {one} and {other} must be 1e-6 to 1e6 m (got {metres}, {gap:.3g} in the model)"
+            )
         scale, source = (metres / gap, None), f"the distance of {one} and {other}"
     if plane is None and (table := find_table(model)) is not None:
         plane = table

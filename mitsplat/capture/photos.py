@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import struct
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture.capture import Photo, stored_name
+from mitsplat.colour import eight_bit
 from mitsplat.cores import usable_cores
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, write_file
@@ -57,20 +61,48 @@ class _Judged:
     clipped: tuple[float, float]
 
 
-def find_photos(folder: Path) -> list[Path]:
-    """The photographs below a folder, sorted; hidden files are left out.
+def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
+    """The photographs below a folder and folders that it links to, sorted; hidden ones are left out.
+
+    Args:
+        folder: Where they are.
+        but: A folder whose pictures are none.
 
     Raises:
-        InputError: If the folder does not exist.
+        InputError: If the folder does not exist, or two photographs would have copies of one name.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of photographs, or video")
-    below = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES + _UNREAD and path.is_file())
-    return sorted(path for path in below if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+        said = (
+            "must be a folder of photographs, or a video"
+            if folder.exists()
+            else "no such folder of photographs, or video"
+        )
+        raise InputError(f"{folder}: {said}")
+    found: list[Path] = []
+    seen = {folder.resolve(), *([] if but is None else [but.resolve()])}
+    for place, folders, files in os.walk(folder, followlinks=True):
+        below = [Path(place, name) for name in folders if not name.startswith(".")]
+        kept = [path for path in below if path.resolve() not in seen]
+        seen |= {path.resolve() for path in kept}
+        folders[:] = [path.name for path in kept]
+        photos = (Path(place, name) for name in files if not name.startswith("."))
+        found += [path for path in photos if path.suffix.lower() in SUFFIXES + _UNREAD and path.is_file()]
+    names: dict[str, Path] = {}
+    for path in sorted(found):
+        other = names.setdefault(stored_name(path.relative_to(folder).as_posix(), path.suffix.lower()), path)
+        if other != path:
+            raise InputError(f"{path}: its copy would have the name of that of {other}: rename one of them")
+    return sorted(found)
 
 
 def prepare_photos(
-    folder: Path, out: Path, *, max_size: int, upright: bool = True, progress: Progress | None = None
+    folder: Path,
+    out: Path,
+    *,
+    but: Path | None = None,
+    max_size: int,
+    upright: bool = True,
+    progress: Progress | None = None,
 ) -> tuple[list[Prepared], dict[str, str]]:
     """Upright copies of the usable photographs below ``folder``, and why the others are not, by name.
 
@@ -79,15 +111,16 @@ def prepare_photos(
 
     Args:
         folder: Photographs in any depth.
+        but: A folder whose pictures are none.
         out: Folder of the copies; those that are there already are not made again.
         max_size: Longest edge of the copies [px].
         upright: Whether EXIF orientation is applied; cameras that are known already ignore it.
         progress: Told the photos done.
 
     Raises:
-        InputError: If the folder does not exist.
+        InputError: As :func:`find_photos`.
     """
-    files = find_photos(folder)
+    files = find_photos(folder, but=but)
     out.mkdir(parents=True, exist_ok=True)
     judged: list[_Judged] = []
     rejected: dict[str, str] = {}
@@ -129,7 +162,7 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
     kept &= max(turned.size) <= max_size and orientation == 1
     suffix = path.suffix if kept else ".jpg" if lossy else ".png"
     file = out / stored_name(name, suffix)
-    rgb = _eight_bit(turned)
+    rgb = eight_bit(turned)
     if max(rgb.size) > max_size:
         rgb.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
     if not file.exists():
@@ -139,20 +172,20 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
             # EXIF goes along for the focal length, which COLMAP starts from, without the orientation.
             exif = turned.getexif()
             exif.pop(ExifTags.Base.Orientation, None)
-            options = {"quality": 95, "subsampling": 0} if lossy else {}
-            write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", exif=exif, **options))
+            options: dict[str, Any] = {"quality": 95, "subsampling": 0} if lossy else {}
+
+            def save(part: Path, **more: Any) -> None:
+                rgb.save(part, "JPEG" if lossy else "PNG", **options, **more)
+
+            try:
+                write_file(file, lambda part: save(part, exif=exif))
+            except (ValueError, TypeError, AttributeError, struct.error):  # too long for a JPEG, or of wrong kinds
+                write_file(file, save)
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
     grey = np.asarray(rgb.convert("L"))
     clipped = (float(np.mean(grey <= 4)), float(np.mean(grey >= 251)))
     return _Judged(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), sharpness(grey), clipped)
-
-
-def _eight_bit(image: Image.Image) -> Image.Image:
-    """RGB with 8 bits a channel; transparent pixels keep their colour, 16-bit grey its upper byte."""
-    if image.mode.startswith("I"):
-        return Image.fromarray((np.asarray(image).astype(np.int64) // 256).clip(0, 255).astype(np.uint8)).convert("RGB")
-    return image.convert("RGB")
 
 
 def _fault(photo: _Judged, median_sharpness: float) -> str | None:

@@ -44,6 +44,8 @@ _MOST_HIDDEN = 0.5
 """Share of the object that is unknown in a photo up to which the rest of it is of use."""
 
 _INPUTS = "inputs.json"
+_PHOTOS = "sfm/photos.json"
+"""What the copies of photographs were made of, which is written first."""
 _RECORDED = ("source", "reprojection_error", "doubtful")
 """What this file holds of a result beside its inputs."""
 
@@ -188,7 +190,9 @@ def capture_photos(
             given lies where the capture is written.
         MissingResourceError: If COLMAP or the masks' model fails to run.
     """
-    _keep_apart(out, photos, settings.masks)
+    _keep_apart(out, photos, settings)
+    if settings.masks is not None and not settings.masks.is_dir():
+        raise InputError(f"{settings.masks}: no such folder of masks")
     if photos.is_file() and photos.suffix.lower() not in SUFFIXES:
         video = choose_frames(photos, out / "frames", most=settings.frames, least=MIN_PHOTOS, progress=progress)
         return replace(_capture(video.folder, out, settings, progress), video=video)
@@ -197,7 +201,7 @@ def capture_photos(
 
 def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progress | None) -> CaptureResult:
     """The capture of a folder of photographs."""
-    files = find_photos(photos)
+    files = find_photos(photos, but=settings.masks)
     if len(files) < MIN_PHOTOS:
         raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
     inputs = _inputs(photos, files, settings)
@@ -208,7 +212,12 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         (out / marker).unlink(missing_ok=True)
     _forget_other_photos(out, inputs, settings)
     prepared, rejected = prepare_photos(
-        photos, out / "images", max_size=settings.max_size, upright=settings.poses is None, progress=progress
+        photos,
+        out / "images",
+        but=settings.masks,
+        max_size=settings.max_size,
+        upright=settings.poses is None,
+        progress=progress,
     )
     if len(prepared) < MIN_PHOTOS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
@@ -259,14 +268,20 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     return result
 
 
-def _keep_apart(out: Path, photos: Path, masks: Path | None) -> None:
-    """Refuse to write among what was given: files of a capture that are no longer needed are removed."""
+def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
+    """Refuse to write among what was given, or is no capture's: files that are no longer needed are removed."""
     if out.resolve().is_relative_to(photos.resolve()):
         raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
-    for given in (photos, masks):
-        for made in ("frames", "images", "masks", "sfm"):
-            if given is not None and given.resolve().is_relative_to((out / made).resolve()):
-                raise InputError(f"{given}: must not lie in {out / made}, which is written anew")
+    if settings.masks is not None and settings.masks.resolve() == photos.resolve():
+        raise InputError(f"{settings.masks}: photographs cannot be their own masks")
+    known = any((out / file).is_file() for file in (_PHOTOS, _INPUTS, CAPTURE_FILE))
+    for made in ("frames", "images", "masks", "sfm"):
+        folder = out / made
+        for given in (photos, settings.masks, settings.poses, settings.mask_model):
+            if given is not None and given.resolve().is_relative_to(folder.resolve()):
+                raise InputError(f"{given}: must not lie in {folder}, which is written anew")
+        if folder.is_symlink() or (made != "frames" and not known and folder.exists() and any(folder.iterdir())):
+            raise InputError(f"{folder}: is there already, and not of a capture: choose another folder")
 
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
@@ -288,6 +303,8 @@ def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
         if record["inputs"] != inputs:
             return None
         capture = Capture.load(out)
+        if not (out / "capture.png").is_file():
+            return None
         return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
     except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
         return None
@@ -297,7 +314,7 @@ def _forget_other_photos(out: Path, inputs: dict[str, object], settings: Capture
     """Drop masks, and copies and matches that were made of other photographs or in another way."""
     way = settings.max_size, settings.poses is None, settings.undistorted
     marker = json.dumps([inputs["photos"], *way], sort_keys=True)
-    file = out / "sfm" / "photos.json"
+    file = out / _PHOTOS
     if not (file.exists() and file.read_text() == marker):
         shutil.rmtree(out / "sfm", ignore_errors=True)
         shutil.rmtree(out / "images", ignore_errors=True)

@@ -137,6 +137,8 @@ def _warp() -> Finding:
             devices = ", ".join(str(device) for device in warp.get_devices())
     except (ImportError, RuntimeError) as error:
         return Finding("warp", False, str(error), remedy)
+    except OSError as error:
+        return Finding("warp", False, str(error), "make its cache writable, or set XDG_CACHE_HOME")
     return Finding("warp", True, f"{version('warp-lang')} on {devices}")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset, opaque_core
@@ -144,7 +145,11 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
 
 
 def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
-    pieces = asset.pieces or (mesh.convex_hull,)
+    try:
+        pieces = asset.pieces or (mesh.convex_hull,)
+    except QhullError:
+        yield Finding("mass", False, "its mesh spans no volume", "give it another mesh, or another size")
+        return
     solid = solid_of(mesh, pieces)
     mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
     density = mass / abs(float(solid.volume)) if solid.volume else float("inf")

@@ -25,6 +25,10 @@ from mitsplat.cli.options import (
 )
 from mitsplat.errors import InputError
 
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the asset that is in the folder, with what was changed in it.")
+]
+
 
 def bake(
     mesh: Annotated[Path, typer.Argument(metavar="MESH", help="Textured or coloured mesh that trimesh reads.")],
@@ -52,6 +56,7 @@ def bake(
     any_size: Annotated[
         bool, typer.Option("--any-size", help="Bake an object of less than 1 mm or more than 5 m as well.")
     ] = False,
+    overwrite: Overwrite = False,
     device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
@@ -63,11 +68,11 @@ def bake(
     from mitsplat.bake.materials import Finish
     from mitsplat.bake.report import write_bake_report
 
-    _check_folder(out)
+    _check_folder(out, mesh, name, overwrite=overwrite)
     if not 0 < units < math.inf:
         raise InputError(f"--units must be finite and > 0 (got {units})")
-    if seed < 0:
-        raise InputError(f"--seed must be >= 0 (got {seed})")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"--seed must be 0 to {2**32 - 1} (got {seed})")
     settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
     finish = Finish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
     take_device(device)
@@ -130,6 +135,7 @@ def import_(
     scene: Annotated[
         Path | None, typer.Option(metavar="SCENE", help="Also write a scene file to begin with, that has it.")
     ] = None,
+    overwrite: Overwrite = False,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset of splats that were made elsewhere.
@@ -141,7 +147,7 @@ def import_(
     from mitsplat.importing.splat_import import ImportSettings, import_splats
     from mitsplat.reconstruct.surface import SurfaceSettings
 
-    _check_folder(out)
+    _check_folder(out, file, name, overwrite=overwrite)
     settings = ImportSettings(
         up=None if up == "auto" else up,
         units=units,
@@ -187,7 +193,18 @@ def import_(
         typer.echo(f"scene: {scene}")
 
 
-def _check_folder(out: Path) -> None:
-    """Refuse, before work starts, a file as the folder to write."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out must be a folder (got the file {out})")
+def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool) -> None:
+    """Refuse, before work starts, a folder that cannot be made, or in which something would be lost."""
+    for place in (out, *out.absolute().parents):
+        if place.exists() and not place.is_dir():
+            raise InputError(f"--out must be a folder (got {'' if place == out else f'{out} below '}the file {place})")
+    if not (name or out.resolve().name):
+        raise InputError(f"--out must be a folder with a name (got {out})")
+    if source.resolve() in [(out / file).resolve() for file in _WRITTEN]:
+        raise InputError(f"--out must not be a folder where {source} itself would be replaced (got {out})")
+    if not overwrite and (there := [file for file in _WRITTEN if (out / file).exists()]):
+        raise InputError(f"{out / there[0]}: is there already: choose another folder, or --overwrite replaces it")
+
+
+_WRITTEN = ("asset.yaml", "splats.ply", "mesh.ply", "pieces.ply", "report.html")
+"""Files of an asset's folder."""

@@ -353,6 +353,7 @@ def preview(
     from PIL import Image
 
     from mitsplat.dataset.prospects import count_faults, image_faults, layout_faults, refuse
+    from mitsplat.files import write_file
     from mitsplat.frames.frame import render_frame
     from mitsplat.frames.layer_sheet import layer_sheet
     from mitsplat.scene.scene import load_scene
@@ -361,7 +362,8 @@ def preview(
     refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
     take_device(device)
     rendered = render_frame(loaded, frame)
-    Image.fromarray(layer_sheet(rendered) if layers else rendered.image).save(out)
+    picture = Image.fromarray(layer_sheet(rendered) if layers else rendered.image)
+    write_file(out, lambda part: picture.save(part, "PNG" if out.suffix.lower() == ".png" else "JPEG"))
     typer.echo(f"picture: {out}")
 
 
@@ -454,12 +456,19 @@ def export(
     scene: SceneFile,
     frame: FrameIndex = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Mitsuba scene to write (.xml).")] = Path("scene.xml"),
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the file, with what was edited in it.")
+    ] = False,
     allow_outside: AllowOutside = False,
 ) -> None:
     """Write one frame of SCENE as a Mitsuba scene.
 
     It can be edited, and rendered by `mitsplat render`.
     """
+    if out.suffix.lower() != ".xml":
+        raise InputError(f"--out must end in .xml (got {out})")
+    if out.exists() and not (overwrite and out.is_file()):
+        raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
     from mitsplat.frames.mitsuba_xml import export_xml
     from mitsplat.scene.scene import load_scene
 

@@ -70,11 +70,20 @@ def lights(
     Lamps are cut out as area lights, which layouts may vary; what is left is an environment light. A level table gets
     the same light from both together as from the panorama. A picture beside the lines shows what was taken for a lamp.
     """
-    from mitsplat.lighting import BallView, LightSettings, estimate_light, read_ball, read_panorama, write_light
+    from mitsplat.lighting import (
+        BallView,
+        LightSettings,
+        estimate_light,
+        read_ball,
+        read_panorama,
+        refuse_to_replace,
+        write_light,
+    )
     from mitsplat.lighting.panorama import HDR_SUFFIXES
 
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"--out must end in .yaml (got {out})")
+    refuse_to_replace(out, images)
     photograph = None
     if camera is None:
         if len(images) > 1 or images[0].suffix.lower() not in HDR_SUFFIXES:

@@ -168,6 +168,18 @@ class FitFolder:
             f"{path}: belongs to a fit of other photos or settings, or by another version; --overwrite replaces it"
         )
 
+    def refuse_others(self) -> None:
+        """Refuse a folder that holds what a fit would replace, and no fit.
+
+        Raises:
+            InputError: Which names it.
+        """
+        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz")):
+            return
+        for there in (self.path / "splats.ply", self.held_out):
+            if there.exists():
+                raise InputError(f"{there}: is there already, and not of a fit; --overwrite replaces it")
+
     def begin(self, *, goes_on: bool) -> None:
         """Remove what another fit left, its record first; the checkpoint stays if the fit goes on from it."""
         (self.path / FIT_FILE).unlink(missing_ok=True)

@@ -117,6 +117,8 @@ class FitSettings:
                 raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
+        if self.target_psnr is not None and not np.isfinite(self.target_psnr):
+            raise InputError(f"target_psnr must be finite (got {self.target_psnr})")
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"budget must be > 0 s (got {self.budget})")
         for name, kinds in (
@@ -126,6 +128,8 @@ class FitSettings:
         ):
             if getattr(self, name) not in kinds:
                 raise InputError(f"{name} must be {', '.join(kinds[:-1])} or {kinds[-1]} (got {getattr(self, name)})")
+        if not 0 <= self.depth_weight < np.inf:
+            raise InputError(f"depth_weight must be a number of at least 0 (got {self.depth_weight})")
         for name in ("ssim_share", "coarse"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} must be in [0, 1] (got {getattr(self, name)})")
@@ -201,6 +205,8 @@ def fit_capture(
         training, validation = _set_aside(training)
     ensure_variant()
     folder = FitFolder(Path(out), _digest(capture, settings, depths))
+    if not overwrite:
+        folder.refuse_others()
     done = folder.finished(overwrite=overwrite)
     if done is not None:
         return done

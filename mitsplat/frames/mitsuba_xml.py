@@ -18,6 +18,7 @@ from mitsplat.colour import decode_srgb
 from mitsplat.device import Device
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError
+from mitsplat.files import storage_error, write_file
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
 from mitsplat.frames.untrusted_xml import check_xml
@@ -85,7 +86,10 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     }
     _teach_writer()
     state = mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), description)
-    mi.parser.write_file(state, str(path))
+    try:
+        write_file(path, lambda part: mi.parser.write_file(state, str(part)))
+    except RuntimeError as error:
+        raise storage_error(path, str(error)) from error
 
 
 def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
+import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,7 +134,8 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
             float(np.ptp(asset.splats.bounds, axis=0).max()) if asset.mesh is None else float(asset.mesh.extents.max())
         )
         text = _OBJECT_SCENE.format(
-            name=asset.name, asset=name, reach=_metres(1.1 * size), low=_metres(0.1 * size), top=_metres(2.5 * size),
+            title=asset.name, name=_quoted(asset.name), asset=_quoted(name),
+            reach=_metres(1.1 * size), low=_metres(0.1 * size), top=_metres(2.5 * size),
             table=_metres(max(1.2, 8 * size)), target=_metres(0.35 * size), near=_metres(2.8 * size),
             far=_metres(4.2 * size), room=_metres(max(4.0, 16 * size)), walls=_metres(max(7.0, 28 * size)),
             floor=_metres(-max(0.75, 4 * size)),
@@ -143,7 +146,8 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
         width, depth = imported.support.size
         reach = [min(0.35 * edge, 0.3) for edge in (width, depth)]
         text = _ENVIRONMENT_SCENE.format(
-            name=asset.name, asset=name, width=_metres(width), depth=_metres(depth), x=_metres(reach[0]),
+            title=asset.name, name=_quoted(asset.name), asset=_quoted(name),
+            width=_metres(width), depth=_metres(depth), x=_metres(reach[0]),
             y=_metres(reach[1]), near=_metres(1.8 * max(reach)), far=_metres(2.8 * max(reach)),
             proxy=", proxy: true" if asset.mesh is None else "",
         )  # fmt: skip
@@ -151,12 +155,22 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
     write_text(path, text)
 
 
+def _quoted(text: str) -> str:
+    """Text as a scene file has it: in quotes, unless it is a plain word or path."""
+    plain = re.fullmatch(r"[A-Za-z_./][\w./-]*", text, re.ASCII) and text.lower() not in _WORDS
+    return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+_WORDS = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null", "~"})
+"""What YAML takes for something else than text."""
+
+
 def _metres(length: float) -> str:
     return f"{length:.3g}"
 
 
 _OBJECT_SCENE = """\
-# {name} on a table, under the light of a room. `mitsplat render` makes images of it.
+# {title} on a table, under the light of a room. `mitsplat render` makes images of it.
 name: {name}
 
 shapes:
@@ -185,7 +199,7 @@ output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """
 
 _ENVIRONMENT_SCENE = """\
-# Solids of random materials dropped on {name}. Put assets of your own in their place.
+# Solids of random materials dropped on {title}. Put assets of your own in their place.
 name: {name}
 environment: {asset}
 

@@ -208,6 +208,8 @@ def import_splats(
     for key, value in (("density", density), ("mass", mass)):
         if value is not None and not 0 < value < np.inf:
             raise InputError(f"{key} must be finite and > 0 (got {value:g})")
+    if not 0 <= friction < np.inf:
+        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
     stages = iter(range(_STAGES))
 
     def tell(doing: str) -> None:

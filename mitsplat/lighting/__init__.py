@@ -13,6 +13,7 @@ from mitsplat.lighting.estimate import (
     LightSettings,
     estimate_light,
     read_ball,
+    refuse_to_replace,
     write_light,
 )
 from mitsplat.lighting.lamps import Lamp
@@ -29,5 +30,6 @@ __all__ = [
     "estimate_light",
     "read_ball",
     "read_panorama",
+    "refuse_to_replace",
     "write_light",
 ]

@@ -20,7 +20,7 @@ from scipy.sparse import coo_array, diags_array, vstack
 from scipy.sparse.linalg import spsolve
 
 from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
-from mitsplat.colour import decode_srgb
+from mitsplat.colour import decode_srgb, eight_bit
 from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS
 
@@ -67,7 +67,7 @@ def read_photograph(path: Path) -> Photograph:
             image.load()
             exif = image.getexif()
             known = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-            pixels = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+            pixels = np.asarray(eight_bit(ImageOps.exif_transpose(image)))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IMAGE_ERRORS as error:

@@ -225,9 +225,9 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
     Returns:
         The files.
     """
-    panorama, rest = (out.with_name(f"{out.stem}_{part}.exr") for part in ("panorama", "rest"))
+    picture_file, panorama, rest = _beside(out)
     image = panorama.name
-    files = [out, out.with_suffix(".png"), panorama]
+    files = [out, picture_file, panorama]
     write_exr(panorama, estimate.panorama)
     if estimate.lamps and estimate.settings.rest == "image":
         image = rest.name
@@ -244,11 +244,35 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
     return files
 
 
+def _beside(out: Path) -> tuple[Path, Path, Path]:
+    """The picture, and the images of all light and of what is no lamp, of a scene file's lines."""
+    panorama, rest = (out.with_name(f"{out.stem}_{part}.exr") for part in ("panorama", "rest"))
+    return out.with_suffix(".png"), panorama, rest
+
+
+def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
+    """Refuse to write where :func:`write_light` would replace what it was given, or what it has not written.
+
+    Raises:
+        InputError: Which names the file.
+    """
+    written, given = (out, *_beside(out)), {image.resolve() for image in images}
+    if lost := [file for file in written if file.resolve() in given]:
+        raise InputError(f"{lost[0]}: would be replaced: give another --out (got {out})")
+    there = [file for file in written if file.exists()]
+    if there and not (out.is_file() and out.read_bytes().startswith(_TITLE.encode())):
+        raise InputError(f"{there[0]}: is there already, and not of `mitsplat lights`: give another --out (got {out})")
+
+
+_TITLE = "# Captured light: "
+"""How a file of lights begins."""
+
+
 def light_lines(estimate: LightEstimate, image: str) -> str:
     """The key ``lights`` of a scene file; ``image`` is the file of what is no lamp."""
     settings = estimate.settings
     lines = [
-        f"# Captured light: {estimate.irradiance @ LUMINANCE:.4g} W/m^2 on a horizontal plane, "
+        f"{_TITLE}{estimate.irradiance @ LUMINANCE:.4g} W/m^2 on a horizontal plane, "
         f"{estimate.share(estimate.ambient):.1%} of it ambient.",
         "lights:",
     ]

@@ -7,6 +7,7 @@ own inputs. The last stage is kept by a hash of everything that decides it, in `
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,9 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline import CaptureSettings, capture_photos
-from mitsplat.content_hash import ContentHash
+from mitsplat.content_hash import ContentHash, file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_text
 from mitsplat.fit.folder import FIT_FILE, read_record
@@ -150,8 +152,10 @@ def read_fit(path: Path) -> tuple[Path, float | None]:
     try:
         psnr = read_record(record)["psnr"]
         known = None if psnr is None else float(psnr)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{record}: not the record of a fit ({error})") from error
+    if known is not None and not math.isfinite(known):
+        raise InputError(f"{record}: psnr must be finite (got {known})")
     return path / "splats.ply", known
 
 
@@ -190,7 +194,7 @@ def make_photo_asset(
 
     fit_capture(found, out / "fit", fit, overwrite=True, progress=fitting)
     done = make_asset(out / "capture", out / "fit", out, job, make=make, source=taken.source, progress=progress)
-    return replace(done, warnings=taken.warnings)
+    return replace(done, warnings=(*taken.warnings, *done.warnings))
 
 
 def make_asset(
@@ -223,17 +227,47 @@ def make_asset(
     done = _finished(out, inputs)
     if done is not None:
         return done
-    (out / VERDICT_FILE).unlink(missing_ok=True)
+    edited = _edited(out, splat_file)
     result = make(capture, Splats.load(splat_file), job, psnr, source, progress)
+    (out / VERDICT_FILE).unlink(missing_ok=True)
+    if edited:
+        (out / ASSET_FILE).replace(out / EDITED_FILE)
     result.asset.save(out)
     write_asset_report(out, capture, result)
     # Last, so that an interrupted run is not mistaken for a finished one.
     _save_verdict(out, result, inputs)
-    return AssetResult(out, result.verdict, kept=False)
+    warnings = (f"{ASSET_FILE} had been edited: as it was, it is {EDITED_FILE} now",) if edited else ()
+    return AssetResult(out, result.verdict, kept=False, warnings=warnings)
+
+
+EDITED_FILE = "asset.edited.yaml"
+"""What someone has made of an asset's ``asset.yaml``, once it is made anew."""
+
+
+def _edited(out: Path, splats: Path) -> bool:
+    """Whether the ``asset.yaml`` of an earlier run has been edited since.
+
+    Raises:
+        InputError: If files of the folder that are no earlier run's would be replaced, or the fit's own splats.
+    """
+    described, verdict = out / ASSET_FILE, out / VERDICT_FILE
+    for name in ("splats.ply", "mesh.ply", "pieces.ply"):
+        if (out / name).resolve() == splats.resolve() or ((out / name).exists() and not described.exists()):
+            raise InputError(f"{out / name}: would be replaced: choose another folder for the asset")
+    if not described.exists():
+        return False
+    try:
+        return bool(json.loads(verdict.read_text())[_DESCRIBED] != file_hash(described))
+    except (OSError, ValueError, KeyError, TypeError):  # by another version, or by hand
+        return True
+
+
+_DESCRIBED = "asset.yaml"
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict), **result.record}
+    record[_DESCRIBED] = file_hash(out / ASSET_FILE)
     record["asset_from_capture"] = result.asset_from_capture.tolist()
     if result.isolation is not None:
         record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}
@@ -277,9 +311,12 @@ def _files(folder: Path, capture: Capture) -> list[Path]:
 
 def _finished(out: Path, inputs: str) -> AssetResult | None:
     """What an earlier run of the same inputs left, if it is whole."""
-    if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, "asset.yaml")):
+    if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, ASSET_FILE)):
         return None
     try:
+        spec = read_spec(out)
+        if not all((out / file).is_file() for file in (spec.splats, spec.mesh, spec.pieces) if file is not None):
+            return None
         record = json.loads((out / VERDICT_FILE).read_text())
         if record.pop("inputs") != inputs:
             return None

@@ -45,6 +45,10 @@ class ReconstructSettings:
     size: float | None = None
     refine: MeshRefineSettings | None = None
 
+    def __post_init__(self) -> None:
+        if self.size is not None and not 1e-4 <= self.size <= 1e4:
+            raise InputError(f"size must be 0.0001 to 10000 m (got {self.size:g})")
+
 
 @dataclass(frozen=True, eq=False)
 class ImportedMesh:
@@ -59,6 +63,10 @@ class ImportedMesh:
     mesh: trimesh.Trimesh
     capture_from_mesh: Float64Array | None = None
     metres_per_unit: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
+            raise InputError(f"units must be 1e-9 to 1e9 m (got {self.metres_per_unit:g})")
 
 
 @dataclass(frozen=True, eq=False)

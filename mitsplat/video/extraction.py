@@ -73,17 +73,24 @@ def choose_frames(
         progress: Told frames done, of how many, and what is being done.
 
     Raises:
-        InputError: If the file is no video, ends too early, or has too few or too many different views.
+        InputError: If the file is no video, ends too early, or has too few or too many different views, or the folder
+            holds something else.
     """
     if most < least:
         raise InputError(f"at least {least} frames must be taken of a video (got {most})")
     inputs = {"video": file_hash(video), "most": most, "method": _METHOD}
     if (kept := _kept(video, folder, inputs)) is not None:
         return kept
+    if folder.exists() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
+        raise InputError(f"{folder}: is there already, and not of frames of a video: choose another folder")
+    # Apart, so that earlier frames are there until all of these are.
+    made = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    found = _run(video, made, most, least, progress)
+    write_text(made / _RECORD, json.dumps({"inputs": inputs, **found}, indent=1))
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    found = _run(video, folder, most, least, progress)
-    write_text(folder / _RECORD, json.dumps({"inputs": inputs, **found}, indent=1))
+    made.rename(folder)
     return _chosen(video, folder, found)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from mitsplat.bake.materials import Finish, read_material
 from mitsplat.bake.parts import Part, read_parts
 from mitsplat.bake.report import write_bake_report
 from mitsplat.colour import decode_srgb
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
 
 COLOUR = (200, 120, 40)
@@ -206,3 +208,69 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
     (tmp_path / "box.mtl").unlink()
     with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing"):
         read_parts(path)
+
+
+def test_grey_of_sixteen_bits_is_as_dark_as_it_is(tmp_path: Path) -> None:
+    path = write_obj(tmp_path, "map_Kd colour.png")
+    Image.fromarray(np.full((8, 8), 0x4080, dtype=np.uint16)).save(tmp_path / "colour.png")
+    (part,) = read_parts(path)
+    np.testing.assert_allclose(colour_of(part), decode_srgb(np.full(3, 0x40 / 255)), atol=1e-3)
+
+
+def test_colours_that_are_not_there_are_missed(tmp_path: Path) -> None:
+    path = write_obj(tmp_path, "map_Kd colour.png")
+    cut = (tmp_path / "colour.png").read_bytes()[:-30]
+
+    def refused(path: Path, match: str) -> None:
+        with pytest.raises(InputError, match=match) as told:
+            read_parts(path)
+        assert str(told.value).startswith(str(path.parent))
+
+    (tmp_path / "colour.png").write_bytes(cut)
+    refused(path, r"box\.mtl: its texture colour\.png cannot be read")
+    for lines, match in (
+        ("map_Kd -s 1 1 1 colour.png", "options of a texture are not read"),
+        ("newmtl other", r"its material paint is not in box\.mtl"),
+    ):
+        text = (lines + "\n") if lines.startswith("newmtl") else f"newmtl paint\n{lines}\n"
+        (tmp_path / "box.mtl").write_text(text)
+        refused(path, match)
+    (tmp_path / "box.mtl").write_bytes("newmtl gr\u00fcn\n".encode("cp1252"))
+    refused(path, "names must be UTF-8: save it so, or rename it .got newmtl gr\u00fcn.")
+    (tmp_path / "other.mtl").write_text("newmtl other\n")
+    path.write_text(path.read_text().replace("mtllib box.mtl", "mtllib box.mtl other.mtl"))
+    refused(path, r"must have one material file .got box\.mtl other\.mtl.")
+    box().export(tmp_path / "plain.ply", encoding="ascii")
+    text = (tmp_path / "plain.ply").read_text()
+    (tmp_path / "plain.ply").write_text(text.replace("comment", "comment TextureFile absent.png\ncomment", 1))
+    refused(tmp_path / "plain.ply", r"its texture absent\.png is missing")
+    trimesh.Scene(box(TextureVisuals(np.zeros((36, 2)), material=PBRMaterial()))).export(tmp_path / "model.gltf")
+    said = json.loads((tmp_path / "model.gltf").read_text())
+    said["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    said |= {"textures": [{"source": 0}], "images": [{"uri": "not%20there.png"}]}
+    (tmp_path / "model.gltf").write_text(json.dumps(said))
+    refused(tmp_path / "model.gltf", r"its texture not there\.png is missing")
+    said["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"] = 7
+    (tmp_path / "model.gltf").write_text(json.dumps(said))
+    refused(tmp_path / "model.gltf", "a material's texture 7 is not there")
+
+
+def test_meshes_of_impossible_faces_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "far.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+    (tmp_path / "empty.glb").write_bytes(b"")
+    for name in ("far.obj", "empty.glb"):
+        with pytest.raises(InputError, match=name):
+            read_parts(tmp_path / name)
+
+
+def test_what_reads_a_file_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "box.dae").write_text("<COLLADA/>")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(MissingResourceError, match=r"box\.dae: reading it needs `pip install pycollada`"):
+        read_parts(tmp_path / "box.dae")
+
+
+@pytest.mark.parametrize("gaussians", [1, 2])
+def test_few_gaussians_are_enough(gaussians: int) -> None:
+    result = bake_asset(box(), name="box", settings=replace(QUICK, gaussians=gaussians))
+    assert 0 < len(result.asset.splats) <= 12

@@ -105,7 +105,10 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     for photo in result.capture.photos:
         mask = Image.new("L", rendered.SIZE)
         mask.paste(255, (100, 80, 300, 250))
-        mask.save(tmp_path / "masks" / f"{Path(photo.name).stem}.png")
+        kind = int(photo.name[5:7]) % 3
+        # In any case, and with a transparency that says nothing.
+        shown = mask.convert("RGB").convert("RGBA") if kind == 1 else mask
+        shown.save(tmp_path / "masks" / f"{Path(photo.name).stem}{'.PNG' if kind == 2 else '.png'}")
     Image.new("L", rendered.SIZE).save(tmp_path / "masks/photo03.png")
     settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
     capture = capture_photos(given, tmp_path / "out", settings).capture
@@ -114,7 +117,7 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     alpha = capture.photos[0].picture()[1]
     assert alpha is not None
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
-    (tmp_path / "masks/photo05.png").unlink()
+    (tmp_path / "masks/photo05.PNG").unlink()
     with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
         capture_photos(given, tmp_path / "out", settings)
     Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")

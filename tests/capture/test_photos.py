@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
-from mitsplat.capture.photos import Prepared, prepare_photos, undistort
+from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
 from mitsplat.errors import InputError
 
 
@@ -121,3 +121,38 @@ def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:
     slopes = photo.camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()])).reshape(120, 160, 2)
     assert np.abs(shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].max() < 1.2  # a pixel is 1.15 of code
     assert np.abs((shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].mean()) < 0.05
+
+
+def test_photographs_are_found_through_links_and_masks_are_none(folder: Path) -> None:
+    ring = folder.parent / "ring"
+    ring.mkdir()
+    Image.fromarray(texture(7)).save(ring / "7.PNG")
+    (folder / "linked").symlink_to(ring)
+    (folder / "around").symlink_to(folder)
+    (folder / "masks").mkdir()
+    Image.new("L", (80, 60)).save(folder / "masks/0.png")
+    found = find_photos(folder, but=folder / "masks")
+    assert [path.relative_to(folder).as_posix() for path in found] == ["0.png", "1.png", "2.png", "linked/7.PNG"]
+
+
+def test_two_photographs_of_one_name_are_refused(folder: Path) -> None:
+    (folder / "a").mkdir()
+    for name in ("a/b.png", "a__b.png"):
+        Image.fromarray(texture(8)).save(folder / name)
+    with pytest.raises(InputError, match=r"its copy would have the name of that of .*: rename one of them"):
+        prepare(folder)
+
+
+def test_a_photograph_alone_is_no_folder(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"0\.png: must be a folder of photographs, or a video"):
+        find_photos(folder / "0.png")
+
+
+def test_exif_that_no_file_can_hold_is_left_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    exif[ExifTags.Base.ImageDescription] = "x" * 70_000
+    Image.fromarray(texture(9)).save(folder / "long.webp", exif=exif)
+    photo = prepare(folder)[0]["long.webp"]
+    with Image.open(photo.file) as copy:
+        assert copy.size == photo.size and not copy.getexif()

@@ -45,7 +45,8 @@ def test_bake_takes_every_option(
     [
         (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
         (["--density", "nan"], "density must be a number > 0 in kg/m^3 (got nan)"),
-        (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
+        (["--seed", "-1"], "--seed must be 0 to 4294967295 (got -1)"),
+        (["--seed", "4294967296"], "--seed must be 0 to 4294967295 (got 4294967296)"),
         (["--gaussians", "0"], "gaussians must be at least 1 (got 0)"),
     ],
 )

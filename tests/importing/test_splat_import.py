@@ -152,6 +152,12 @@ def test_the_asset_its_report_and_its_scene_are_whole(imported: Imported, tmp_pa
     assert "as is usual for such files" in page
     write_scene(tmp_path / "table.yaml", folder, imported)
     assert [asset.name for asset in load_scene(tmp_path / "table.yaml").assets] == ["pin"]
+    for name in ("1001", "bolt: M8", "a, b", "#5", "yes", "-", "größe 'x\""):
+        named = replace(imported, asset=replace(imported.asset, name=name))
+        named.asset.save(folder.parent / name)
+        write_scene(tmp_path / f"{name}.yaml", folder.parent / name, named)
+        scene = load_scene(tmp_path / f"{name}.yaml")
+        assert [asset.name for asset in scene.assets] == [scene.spec.name] == [name]
     with pytest.raises(InputError, match="is there already"):
         write_scene(tmp_path / "table.yaml", folder, imported)
     with pytest.raises(InputError, match="below its own folder"):

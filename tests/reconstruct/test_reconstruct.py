@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -130,6 +131,38 @@ def test_the_same_inputs_are_kept_and_others_are_not(
     (folder / "asset" / "verdict.json").write_bytes(record[:50])
     with pytest.raises(InputError, match="made anew"):
         make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+    (folder / "asset" / "verdict.json").write_bytes(record)
+
+
+def test_what_was_edited_is_kept_and_what_is_gone_is_made_anew(
+    made: tuple[Path, AssetResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder, _ = made
+    given, out = (folder / "capture", folder / "fit"), tmp_path / "asset"
+    job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
+    shutil.copytree(folder / "asset", out)
+    described = out / "asset.yaml"
+    described.write_text(described.read_text().replace("friction: 0.5", "friction: 0.31"))
+    assert make_asset(*given, out, job).kept
+    result = make_asset(*given, out, replace(job, name="other"))
+    assert result.warnings == ("asset.yaml had been edited: as it was, it is asset.edited.yaml now",)
+    assert "friction: 0.31" in (out / "asset.edited.yaml").read_text() and "friction: 0.5" in described.read_text()
+    assert make_asset(*given, out, job).warnings == ()
+    (out / "mesh.ply").unlink()
+    assert not make_asset(*given, out, job).kept and (out / "mesh.ply").is_file()
+    for name in ("splats.ply", "mesh.ply"):
+        mine = tmp_path / name[:5] / name
+        mine.parent.mkdir()
+        shutil.copy(folder / "fit/splats.ply", mine)
+        with pytest.raises(InputError, match=f"{name}: would be replaced"):
+            make_asset(given[0], mine if name == "splats.ply" else given[1], mine.parent, job)
+
+
+@pytest.mark.parametrize("psnr", ['"abc"', "NaN", "[]"])
+def test_a_fit_s_record_has_a_number(tmp_path: Path, psnr: str) -> None:
+    (tmp_path / "fit.json").write_text(f'{{"psnr": {psnr}}}')
+    with pytest.raises(InputError, match=r"fit\.json: "):
+        read_fit(tmp_path)
 
 
 def test_a_drawing_gives_a_capture_its_scale(known_object: KnownObject) -> None:

@@ -216,7 +216,8 @@ def check_textures(mesh: Path) -> None:
     elif kind == ".gltf":
         _check_gltf(mesh)
     elif kind == ".ply":
-        header = mesh.read_bytes()[:_HEADER].partition(b"end_header")[0].decode("utf-8", errors="replace")
+        with mesh.open("rb") as file:
+            header = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", errors="replace")
         for texture in re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE):
             _check_texture(mesh, texture)
 
@@ -278,11 +279,11 @@ def _named(path: Path, key: str) -> list[str]:
     """What the lines of an OBJ or an MTL that begin with a key name."""
     names = []
     for line in path.read_bytes().splitlines():
-        word, _, rest = line.strip().partition(b" ")
-        if word.lower() == key.encode() and rest.strip():
+        words = line.split(maxsplit=1)
+        if len(words) == 2 and words[0].lower() == key.encode():
             try:
-                names.append(rest.strip().decode("utf-8"))
+                names.append(words[1].strip().decode("utf-8"))
             except UnicodeDecodeError:
-                name = rest.strip().decode("cp1252", errors="replace")
+                name = words[1].strip().decode("cp1252", errors="replace")
                 raise InputError(f"{path}: names must be UTF-8: save it so, or rename it (got {key} {name})") from None
     return names

@@ -223,6 +223,20 @@ class Camera:
             pixels[front] = projected.reshape(-1, 2)
         return pixels, depth
 
+    def undistorted(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], Camera]:
+        """An image of this camera as a pinhole sees it that sees nothing beyond its border, and that pinhole.
+
+        Args:
+            image: Shape (H, W, C).
+        """
+        half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
+        lens, size = (self.intrinsics - half, np.array(self.distortion)), (self.width, self.height)
+        pinhole = np.asarray(cv2.getOptimalNewCameraMatrix(*lens, size, 0)[0])
+        x, y = cv2.initUndistortRectifyMap(*lens, np.eye(3), pinhole, size, cv2.CV_32FC1)
+        pixels = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        (fx, _, cx), (_, fy, cy), _ = (pinhole + half).tolist()
+        return np.asarray(pixels, dtype=np.uint8), replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=())
+
     def ray_slopes(self, pixels: npt.ArrayLike) -> Float64Array:
         """Undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)

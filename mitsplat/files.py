@@ -117,6 +117,16 @@ def write_text(path: Path, text: str) -> str:
     return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))
 
 
+def files_below(folder: Path, *, but: Path | None = None) -> list[Path]:
+    """Files anywhere in a folder, and in folders that it links to, each of them once; not in ``but``; by name."""
+    found, seen = list[Path](), set[str]() if but is None else {os.path.realpath(but)}
+    for place, folders, files in os.walk(folder, followlinks=True):
+        seen.add(os.path.realpath(place))
+        folders[:] = [name for name in folders if os.path.realpath(Path(place, name)) not in seen]
+        found += [Path(place, name) for name in files]
+    return sorted(found)
+
+
 def is_inside(folder: Path, name: str) -> bool:
     """Whether a path, relative to ``folder`` or absolute, is in it also after links and ``..`` are followed."""
     try:
@@ -166,6 +176,13 @@ def storage_errors(folder: Path) -> Iterator[None]:
                 f"{place}: {error.strerror}: make room and run again; what is finished is kept"
             ) from error
         raise InputError(f"{place}: cannot be written or read ({error.strerror or error})") from error
+
+
+def copied(source: Path, target: Path) -> Path:
+    """``target``, made a copy of ``source`` unless it is that already."""
+    if not (target.exists() and target.samefile(source)):
+        write_file(target, lambda temporary: shutil.copyfile(source, temporary))
+    return target
 
 
 def link_file(source: Path, target: Path) -> None:

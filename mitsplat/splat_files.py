@@ -141,6 +141,8 @@ def write_splats(splats: SplatArrays, path: Path) -> None:
         raise InputError(f"{path}: splats are written as .ply, .splat or .spz (got {path.name!r})")
     if not len(splats.means) and suffix != ".ply":
         raise InputError(f"{path}: a {suffix} file must hold at least one Gaussian (got 0)")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: cannot be written (there is no such folder)")
     data = encoders[suffix](splats)
     with storage_errors(path):
         write_file(path, lambda partial: partial.write_bytes(data))

@@ -8,7 +8,6 @@ Cameras and points share the frame of the asset that is to be made of them; conv
 from __future__ import annotations
 
 import json
-import shutil
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.camera import Camera, Lens
 from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS, file_inside, write_file, write_text
+from mitsplat.files import IMAGE_ERRORS, copied, file_inside, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSIONS
 from mitsplat.yaml_input import load_yaml
 
@@ -286,8 +285,8 @@ class Capture:
         try:
             (folder / CAPTURE_FILE).unlink(missing_ok=True)  # an earlier capture's is not of these photos
             for photo in self.photos:
-                file = _kept(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
-                mask = None if photo.mask is None else _kept(photo.mask, folder / "masks" / mask_name(photo.name))
+                file = copied(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
+                mask = None if photo.mask is None else copied(photo.mask, folder / "masks" / mask_name(photo.name))
                 photos.append(replace(photo, file=file, mask=mask))
             files = {path for photo in photos for path in (photo.file, photo.mask) if path is not None}
             if len(files) < sum(1 + (photo.mask is not None) for photo in photos):
@@ -367,13 +366,6 @@ def stored_name(name: str, suffix: str) -> str:
 def mask_name(name: str) -> str:
     """File name of a photo's mask, as COLMAP has it."""
     return f"{name.replace('/', '__')}.png"
-
-
-def _kept(source: Path, target: Path) -> Path:
-    """``target``, made a copy of ``source`` unless it is that already."""
-    if not (target.exists() and target.samefile(source)):
-        write_file(target, lambda temporary: shutil.copyfile(source, temporary))
-    return target
 
 
 def _named_file(folder: Path, name: str) -> Path:

@@ -153,10 +153,8 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
     one that lies on its side, as the camera held by EXIF's account, is turned.
 
     Raises:
-        InputError: If the folder does not exist; the maker, if a mask is missing or of another shape.
+        InputError: The maker, if a mask is missing or of another shape.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of masks")
     below = sorted(path for path in folder.rglob("*") if path.is_file())
     by_name = {path.relative_to(folder).as_posix().lower(): path for path in below}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import struct
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
@@ -19,7 +17,7 @@ from mitsplat.capture.capture import Photo, stored_name
 from mitsplat.colour import eight_bit
 from mitsplat.cores import usable_cores
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS, write_file
+from mitsplat.files import IMAGE_ERRORS, files_below, write_file
 from mitsplat.progress import Progress
 from mitsplat.video.sharpness import sharpness
 
@@ -72,27 +70,16 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
         InputError: If the folder does not exist, or two photographs would have copies of one name.
     """
     if not folder.is_dir():
-        said = (
-            "must be a folder of photographs, or a video"
-            if folder.exists()
-            else "no such folder of photographs, or video"
-        )
-        raise InputError(f"{folder}: {said}")
-    found: list[Path] = []
-    seen = {folder.resolve(), *([] if but is None else [but.resolve()])}
-    for place, folders, files in os.walk(folder, followlinks=True):
-        below = [Path(place, name) for name in folders if not name.startswith(".")]
-        kept = [path for path in below if path.resolve() not in seen]
-        seen |= {path.resolve() for path in kept}
-        folders[:] = [path.name for path in kept]
-        photos = (Path(place, name) for name in files if not name.startswith("."))
-        found += [path for path in photos if path.suffix.lower() in SUFFIXES + _UNREAD and path.is_file()]
-    names: dict[str, Path] = {}
-    for path in sorted(found):
-        other = names.setdefault(stored_name(path.relative_to(folder).as_posix(), path.suffix.lower()), path)
+        raise InputError(f"{folder}: must be a folder of photographs, or a video, that is there")
+    found: dict[str, Path] = {}
+    for path in files_below(folder, but=but):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix.lower() not in SUFFIXES + _UNREAD or not path.is_file() or "/." in f"/{name}":
+            continue
+        other = found.setdefault(stored_name(name, path.suffix.lower()), path)
         if other != path:
             raise InputError(f"{path}: its copy would have the name of that of {other}: rename one of them")
-    return sorted(found)
+    return list(found.values())
 
 
 def prepare_photos(
@@ -172,15 +159,13 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
             # EXIF goes along for the focal length, which COLMAP starts from, without the orientation.
             exif = turned.getexif()
             exif.pop(ExifTags.Base.Orientation, None)
-            options: dict[str, Any] = {"quality": 95, "subsampling": 0} if lossy else {}
-
-            def save(part: Path, **more: Any) -> None:
-                rgb.save(part, "JPEG" if lossy else "PNG", **options, **more)
-
             try:
-                write_file(file, lambda part: save(part, exif=exif))
-            except (ValueError, TypeError, AttributeError, struct.error):  # too long for a JPEG, or of wrong kinds
-                write_file(file, save)
+                kept_exif = exif.tobytes()
+            except (ValueError, TypeError, AttributeError, struct.error):  # of kinds that no file can hold
+                kept_exif = b""
+            options: dict[str, Any] = {"quality": 95, "subsampling": 0} if lossy else {}
+            options["exif"] = kept_exif if len(kept_exif) < 65_000 else b""  # for which a JPEG has room
+            write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
     grey = np.asarray(rgb.convert("L"))
@@ -204,14 +189,7 @@ def undistort(photo: Photo) -> Photo:
     camera = photo.camera
     if not camera.distortion:
         return photo
-    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
-    lens, size = (camera.intrinsics - half, np.array(camera.distortion)), (camera.width, camera.height)
-    pinhole, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 0)
-    pinhole = np.asarray(pinhole)
-    x, y = cv2.initUndistortRectifyMap(*lens, np.eye(3), pinhole, size, cv2.CV_32FC1)
-    rgb, _ = photo.picture()
-    pixels = cv2.remap(np.rint(255 * rgb).astype(np.uint8), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    pixels, pinhole = camera.undistorted(np.rint(255 * photo.picture()[0]).astype(np.uint8))
     file = photo.file.with_name(f"{photo.file.name}.undistorted.png")
-    write_file(file, lambda part: Image.fromarray(np.asarray(pixels)).save(part, "PNG"))
-    (fx, _, cx), (_, fy, cy), _ = (pinhole + half).tolist()
-    return replace(photo, file=file, camera=replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=()))
+    write_file(file, lambda part: Image.fromarray(pixels).save(part, "PNG"))
+    return replace(photo, file=file, camera=pinhole)

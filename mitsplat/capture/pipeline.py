@@ -274,13 +274,14 @@ def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
         raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
     if settings.masks is not None and settings.masks.resolve() == photos.resolve():
         raise InputError(f"{settings.masks}: photographs cannot be their own masks")
-    known = any((out / file).is_file() for file in (_PHOTOS, _INPUTS, CAPTURE_FILE))
-    for made in ("frames", "images", "masks", "sfm"):
-        folder = out / made
-        for given in (photos, settings.masks, settings.poses, settings.mask_model):
+    folders = [out / made for made in ("frames", "images", "masks", "sfm")]
+    for given in (photos, settings.masks, settings.poses, settings.mask_model):
+        for folder in folders:
             if given is not None and given.resolve().is_relative_to(folder.resolve()):
                 raise InputError(f"{given}: must not lie in {folder}, which is written anew")
-        if folder.is_symlink() or (made != "frames" and not known and folder.exists() and any(folder.iterdir())):
+    known = any((out / file).is_file() for file in (_PHOTOS, _INPUTS, CAPTURE_FILE))
+    for folder in folders:
+        if folder.is_symlink() or (folder.name != "frames" and not known and folder.exists() and any(folder.iterdir())):
             raise InputError(f"{folder}: is there already, and not of a capture: choose another folder")
 
 
@@ -300,11 +301,9 @@ def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
     """The result that ``out`` holds already, if it is of the same inputs."""
     try:
         record = json.loads((out / _INPUTS).read_text())
-        if record["inputs"] != inputs:
+        if record["inputs"] != inputs or not (out / "capture.png").is_file():
             return None
         capture = Capture.load(out)
-        if not (out / "capture.png").is_file():
-            return None
         return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
     except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 
 import cv2
@@ -13,7 +12,7 @@ from PIL import Image
 from mitsplat.arrays import ByteImage
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS
+from mitsplat.files import IMAGE_ERRORS, files_below
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Images that Ultralytics reads as well."""
@@ -28,12 +27,7 @@ _ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
 
 def images_below(folder: Path) -> list[Path]:
     """Images anywhere in a folder, and in folders that it links to, by name."""
-    found, seen = list[Path](), set[str]()
-    for place, folders, files in os.walk(folder, followlinks=True):
-        seen.add(os.path.realpath(place))
-        folders[:] = [name for name in folders if os.path.realpath(Path(place, name)) not in seen]
-        found += [Path(place, name) for name in files]
-    return sorted(path for path in found if path.suffix.lower() in SUFFIXES)
+    return [path for path in files_below(folder) if path.suffix.lower() in SUFFIXES]
 
 
 def read_picture(path: Path) -> ByteImage:

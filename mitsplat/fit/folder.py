@@ -25,6 +25,8 @@ from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_forma
 from mitsplat.splats import Splats
 
 FIT_FILE = "fit.json"
+_UNFINISHED = ".unfinished"
+"""A file that is there while a fit is, and after it if it was interrupted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,8 @@ class FitFolder:
             if overwrite:
                 return None
             raise InputError(f"{error}; --overwrite replaces it") from error
-        (self.path / "checkpoint.npz").unlink(missing_ok=True)  # of a run that was interrupted after its last step
+        for name in ("checkpoint.npz", _UNFINISHED):  # of a run that was interrupted after its last step
+            (self.path / name).unlink(missing_ok=True)
         return result
 
     def _read(self, path: Path) -> FitResult:
@@ -174,7 +177,7 @@ class FitFolder:
         Raises:
             InputError: Which names it.
         """
-        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz")):
+        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz", _UNFINISHED)):
             return
         for there in (self.path / "splats.ply", self.held_out):
             if there.exists():
@@ -182,12 +185,13 @@ class FitFolder:
 
     def begin(self, *, goes_on: bool) -> None:
         """Remove what another fit left, its record first; the checkpoint stays if the fit goes on from it."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        (self.path / _UNFINISHED).touch()
         (self.path / FIT_FILE).unlink(missing_ok=True)
         if not goes_on:
             (self.path / "checkpoint.npz").unlink(missing_ok=True)
         (self.path / "splats.ply").unlink(missing_ok=True)
         shutil.rmtree(self.held_out, ignore_errors=True)
-        self.path.mkdir(parents=True, exist_ok=True)
         for part in self.path.glob(".*.part"):  # of a run that was killed while it wrote
             part.unlink()
 
@@ -208,4 +212,5 @@ class FitFolder:
         record |= {"gaussians": len(result.splats)} | dict(known)
         record |= {name: [asdict(p) for p in getattr(result, name)] for name in ("held_out", "validation")}
         write_text(self.path / FIT_FILE, json.dumps(record, indent=1) + "\n")
-        (self.path / "checkpoint.npz").unlink(missing_ok=True)
+        for name in ("checkpoint.npz", _UNFINISHED):
+            (self.path / name).unlink(missing_ok=True)

@@ -249,8 +249,8 @@ def test_a_distance_gives_metres_and_the_table_the_vertical(blank: dict[str, Pat
         (("gone.png", "04.png", 1.0), "gone.png: no such registered photo"),
         (("00.png:1", "04.png", 1.0), "00.png:1: a pixel must be given as x,y (got 1)"),
         (("00.png:0,0", "04.png", 1.0), "00.png:0,0: the photo observes no point within 19 px of this pixel"),
-        (("00.png", "04.png", -1.0), "the distance of 00.png and 04.png must be > 0 m (got -1.0"),
-        (("00.png", "00.png", 1.0), "the distance of 00.png and 00.png must be > 0 m"),
+        (("00.png", "04.png", -1.0), "the distance of 00.png and 04.png must be 1e-6 to 1e6 m (got -1.0"),
+        (("00.png", "00.png", 1.0), "the distance of 00.png and 00.png must be 1e-6 to 1e6 m"),
     ],
 )
 def test_a_wrong_distance_is_one_sentence(blank: dict[str, Path], spots: tuple[str, str, float], sentence: str) -> None:
@@ -356,7 +356,7 @@ def test_the_printed_board_is_true_to_size(tmp_path: Path) -> None:
     [
         (lambda path: Board(2, 6), "a board must have 3x4 to 500 squares (got 2x6)"),
         (lambda path: Board(3, 3), "a board must have 3x4 to 500 squares (got 3x3)"),
-        (lambda path: Board(square=0), "a board's square must be > 0 m (got 0)"),
+        (lambda path: Board(square=0), "a board's square must be 0.001 to 10 m (got 0)"),
         (lambda path: Board(9, 5).write_pdf(path / "a.pdf", "a4"), "does not fit on a4 with a margin of 0.008 m"),
         (lambda path: Board().write_pdf(path, "a4"), "cannot be written"),
     ],

@@ -104,7 +104,7 @@ def test_useless_photos_are_named_with_a_reason(folder: Path) -> None:
 
 
 def test_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="gone: no such folder of photographs"):
+    with pytest.raises(InputError, match="gone: must be a folder of photographs, or a video, that is there"):
         prepare_photos(tmp_path / "gone", tmp_path / "out", max_size=100)
 
 

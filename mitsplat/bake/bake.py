@@ -47,6 +47,8 @@ _DETAIL = 7.0
 _MOST_GAUSSIANS = 2_000_000
 _SMALLEST, _LARGEST = 0.001, 5.0
 """Size of objects [m] outside of which units are wrong rather than objects unusual."""
+_LEAST, _MOST = 1e-5, 1e5
+"""Size of anything [m] outside of which 32 bits are too few."""
 _STAGES = {
     "placing Gaussians": 14,
     "tracing their radiance": 16,
@@ -186,6 +188,10 @@ def bake_asset(
     surface = trimesh.util.concatenate([part.mesh for part in parts])
     if kind == "object" and not any_size:
         _check_size(str(mesh) if isinstance(mesh, str | Path) else name, surface, metres_per_unit)
+    size = float(surface.extents.max())
+    if not _LEAST <= size <= _MOST:
+        source = mesh if isinstance(mesh, str | Path) else name
+        raise InputError(f"{source}: a mesh must be {_LEAST:g} to {_MOST:g} m across (got {size:.3g} m)")
     scene = mitsuba_scene(parts, lights)
     stages("placing Gaussians")
     rng = np.random.default_rng(settings.seed)

@@ -44,6 +44,8 @@ def test_bake_takes_every_option(
     ("options", "sentence"),
     [
         (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
+        (["--units", "1e-6", "--any-size"], "{mesh}: a mesh must be 1e-05 to 100000 m across (got 3e-08 m)"),
+        (["--units", "1e30", "--any-size"], "{mesh}: a mesh must be 1e-05 to 100000 m across (got 3e+28 m)"),
         (["--density", "nan"], "density must be a number > 0 in kg/m^3 (got nan)"),
         (["--seed", "-1"], "--seed must be 0 to 4294967295 (got -1)"),
         (["--seed", "4294967296"], "--seed must be 0 to 4294967295 (got 4294967296)"),
@@ -55,4 +57,4 @@ def test_bad_option_of_bake_is_one_sentence(
 ) -> None:
     box_asset("gear").mesh.export(tmp_path / "gear.stl")
     assert run("bake", tmp_path / "gear.stl", "-o", tmp_path / "gear", *options) == 2
-    assert capsys.readouterr().err == f"mitsplat: {sentence}\n"
+    assert capsys.readouterr().err.splitlines()[-1] == f"mitsplat: {sentence.format(mesh=tmp_path / 'gear.stl')}"

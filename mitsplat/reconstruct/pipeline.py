@@ -6,6 +6,7 @@ own inputs. The last stage is kept by a hash of everything that decides it, in `
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable
@@ -227,47 +228,48 @@ def make_asset(
     done = _finished(out, inputs)
     if done is not None:
         return done
-    edited = _edited(out, splat_file)
+    refuse_to_replace(out, splat_file)
+    edited = _edited(out)
     result = make(capture, Splats.load(splat_file), job, psnr, source, progress)
     (out / VERDICT_FILE).unlink(missing_ok=True)
-    if edited:
-        (out / ASSET_FILE).replace(out / EDITED_FILE)
+    if edited is not None:
+        (out / ASSET_FILE).replace(edited)
     result.asset.save(out)
     write_asset_report(out, capture, result)
     # Last, so that an interrupted run is not mistaken for a finished one.
     _save_verdict(out, result, inputs)
-    warnings = (f"{ASSET_FILE} had been edited: as it was, it is {EDITED_FILE} now",) if edited else ()
+    warnings = () if edited is None else (f"{ASSET_FILE} had been edited: as it was, it is {edited.name} now",)
     return AssetResult(out, result.verdict, kept=False, warnings=warnings)
 
 
-EDITED_FILE = "asset.edited.yaml"
-"""What someone has made of an asset's ``asset.yaml``, once it is made anew."""
-
-
-def _edited(out: Path, splats: Path) -> bool:
-    """Whether the ``asset.yaml`` of an earlier run has been edited since.
+def refuse_to_replace(out: Path, splats: Path) -> None:
+    """Refuse a folder in which an asset would replace the splats that it is made of, or files of no asset.
 
     Raises:
-        InputError: If files of the folder that are no earlier run's would be replaced, or the fit's own splats.
+        InputError: Which names the file.
     """
-    described, verdict = out / ASSET_FILE, out / VERDICT_FILE
+    known = any((out / name).exists() for name in (ASSET_FILE, REPORT_FILE))
     for name in ("splats.ply", "mesh.ply", "pieces.ply"):
-        if (out / name).resolve() == splats.resolve() or ((out / name).exists() and not described.exists()):
+        if (out / name).resolve() == splats.resolve() or ((out / name).exists() and not known):
             raise InputError(f"{out / name}: would be replaced: choose another folder for the asset")
-    if not described.exists():
-        return False
+
+
+def _edited(out: Path) -> Path | None:
+    """What to call the ``asset.yaml`` of an earlier run from now on, if it has been edited since."""
+    described = out / ASSET_FILE
     try:
-        return bool(json.loads(verdict.read_text())[_DESCRIBED] != file_hash(described))
+        if json.loads((out / VERDICT_FILE).read_text())[ASSET_FILE] == file_hash(described):
+            return None
     except (OSError, ValueError, KeyError, TypeError):  # by another version, or by hand
-        return True
-
-
-_DESCRIBED = "asset.yaml"
+        if not described.exists():
+            return None
+    names = (out / f"asset.edited{number if number > 1 else ''}.yaml" for number in itertools.count(1))
+    return next(path for path in names if not path.exists())
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict), **result.record}
-    record[_DESCRIBED] = file_hash(out / ASSET_FILE)
+    record[ASSET_FILE] = file_hash(out / ASSET_FILE)
     record["asset_from_capture"] = result.asset_from_capture.tolist()
     if result.isolation is not None:
         record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}

@@ -87,10 +87,14 @@ def choose_frames(
     made = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir(parents=True)
-    found = _run(video, made, most, least, progress)
-    write_text(made / _RECORD, json.dumps({"inputs": inputs, **found}, indent=1))
-    shutil.rmtree(folder, ignore_errors=True)
-    made.rename(folder)
+    try:
+        found = _run(video, made, most, least, progress)
+        write_text(made / _RECORD, json.dumps({"inputs": inputs, **found}, indent=1))
+        shutil.rmtree(folder, ignore_errors=True)
+        made.rename(folder)
+    except BaseException:
+        shutil.rmtree(made, ignore_errors=True)
+        raise
     return _chosen(video, folder, found)
 
 

@@ -148,6 +148,7 @@ def test_frames_are_there_until_others_are(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="video"):
         choose_frames(tmp_path / "torn.mp4", frames, most=8, least=3)
     assert (frames / "000001.jpg").read_text() == "a frame"
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "torn.mp4"}
 
 
 @pytest.mark.parametrize("there", ["splats.ply", "held_out/photo.png"])

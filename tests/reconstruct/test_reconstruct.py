@@ -148,6 +148,10 @@ def test_what_was_edited_is_kept_and_what_is_gone_is_made_anew(
     assert result.warnings == ("asset.yaml had been edited: as it was, it is asset.edited.yaml now",)
     assert "friction: 0.31" in (out / "asset.edited.yaml").read_text() and "friction: 0.5" in described.read_text()
     assert make_asset(*given, out, job).warnings == ()
+    described.write_text(described.read_text().replace("friction: 0.5", "friction: 0.4"))
+    make_asset(*given, out, replace(job, name="third"))
+    assert "friction: 0.4" in (out / "asset.edited2.yaml").read_text()
+    make_asset(*given, out, job)
     (out / "mesh.ply").unlink()
     assert not make_asset(*given, out, job).kept and (out / "mesh.ply").is_file()
     for name in ("splats.ply", "mesh.ply"):

@@ -150,8 +150,9 @@ def read_fit(path: Path) -> tuple[Path, float | None]:
     if not path.is_dir():
         return path, None
     record = path / FIT_FILE
+    stored = read_record(record)
     try:
-        psnr = read_record(record)["psnr"]
+        psnr = stored["psnr"]
         known = None if psnr is None else float(psnr)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{record}: not the record of a fit ({error})") from error

@@ -114,7 +114,8 @@ class FitSettings:
     def __post_init__(self) -> None:
         for name, least in (("gaussians", 2), ("iterations", 1), ("size", 64), ("refine_every", 1), ("seed", 0)):
             if getattr(self, name) < least:
-                raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
+                said = "the longest edge of pictures" if name == "size" else name
+                raise InputError(f"{said} must be at least {least} (got {getattr(self, name)})")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
         if self.target_psnr is not None and not np.isfinite(self.target_psnr):

@@ -187,7 +187,8 @@ class Verdict:
                 value, limit = getattr(self, name), getattr(thresholds, name)
                 if value is not None and sign * value < sign * limit:
                     rule = "at least" if sign > 0 else "at most"
-                    found.append(f"{sentence} ({rule} {limit:g} is wanted): {self._advice(name)}")
+                    wanted = f"{100 * limit:g}%" if "%" in sentence else f"{limit:g}"
+                    found.append(f"{sentence} ({rule} {wanted} is wanted): {self._advice(name)}")
         if self.surface_faults:
             found.append(
                 f"the mesh is only the {self.surface}, because {', and '.join(self.surface_faults)}: "

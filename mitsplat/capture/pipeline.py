@@ -286,14 +286,14 @@ def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
 
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
-    """What decides a capture, in JSON."""
-    given = [path for path in (settings.poses, settings.masks, settings.mask_model) if path is not None]
-    kept = {name: value for name, value in asdict(settings).items() if name != "frames"}  # the photos are those frames
-    others = [path for place in given for path in (sorted(place.rglob("*")) if place.is_dir() else [place])]
+    """What decides a capture, in JSON: what files hold, and not where they lie."""
+    given = {name: getattr(settings, name) for name in ("poses", "masks", "mask_model")}
+    kept = {name: value for name, value in asdict(settings).items() if name not in ("frames", *given)}
+    others = [(name, at, path) for name, at in given.items() if at is not None for path in [at, *sorted(at.rglob("*"))]]
     return {
-        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},
+        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},  # or frames of a video
         "settings": json.loads(json.dumps(kept, default=str)),
-        "files": {str(path): file_hash(path) for path in others if path.is_file()},
+        "files": {f"{name}/{path.relative_to(at)}": file_hash(path) for name, at, path in others if path.is_file()},
     }
 
 

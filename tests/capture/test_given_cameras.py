@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,9 @@ def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, C
         read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
 
 
-def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+def test_given_masks_are_taken(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     given, _, result = captured
     write_colmap_text(tmp_path / "model", result.capture)
     (tmp_path / "masks").mkdir()
@@ -117,6 +120,11 @@ def test_given_masks_are_taken(captured: tuple[Path, Path, CaptureResult], tmp_p
     alpha = capture.photos[0].picture()[1]
     assert alpha is not None
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
+    with monkeypatch.context() as elsewhere:
+        elsewhere.chdir(tmp_path / "masks")
+        elsewhere.setattr("mitsplat.capture.pipeline.prepare_photos", None)  # would be made anew
+        there = replace(settings, poses=Path("../model"), masks=Path())
+        assert len(capture_photos(given, Path("../out"), there).capture.photos) == 15
     (tmp_path / "masks/photo05.PNG").unlink()
     with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
         capture_photos(given, tmp_path / "out", settings)

@@ -153,10 +153,18 @@ def file_inside(folder: Path, name: str) -> Path:
     return path
 
 
-def storage_error(path: Path, said: str) -> OSError:
-    """The error of a library that puts the system's words, but not its number, into what it says."""
-    number = next((number for number in FULL if os.strerror(number) in said), errno.EIO)
-    return OSError(number, os.strerror(number), str(path))
+@contextmanager
+def library_errors(path: Path) -> Iterator[None]:
+    """Make the system's errors of those of a library, which puts their words, but not their numbers, into what it says.
+
+    Raises:
+        OSError: For any ``RuntimeError``.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        number = next((number for number in FULL if os.strerror(number) in str(error)), errno.EIO)
+        raise OSError(number, os.strerror(number), str(path)) from error
 
 
 @contextmanager

@@ -186,11 +186,10 @@ def bake_asset(
     lights = bake_lights(light)
     parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
     surface = trimesh.util.concatenate([part.mesh for part in parts])
+    source, size = str(mesh) if isinstance(mesh, str | Path) else name, float(surface.extents.max())
     if kind == "object" and not any_size:
-        _check_size(str(mesh) if isinstance(mesh, str | Path) else name, surface, metres_per_unit)
-    size = float(surface.extents.max())
+        _check_size(source, size, metres_per_unit)
     if not _LEAST <= size <= _MOST:
-        source = mesh if isinstance(mesh, str | Path) else name
         raise InputError(f"{source}: a mesh must be {_LEAST:g} to {_MOST:g} m across (got {size:.3g} m)")
     scene = mitsuba_scene(parts, lights)
     stages("placing Gaussians")
@@ -282,9 +281,8 @@ class _Stages:
             self._tell(100, 100, "done")
 
 
-def _check_size(source: str, surface: trimesh.Trimesh, metres_per_unit: float) -> None:
-    """Refuse objects whose size tells of wrong units."""
-    size = float(surface.extents.max())
+def _check_size(source: str, size: float, metres_per_unit: float) -> None:
+    """Refuse objects whose size [m] tells of wrong units."""
     if _SMALLEST <= size <= _LARGEST:
         return
     factor, unit = (0.001, "millimetres") if size > _LARGEST else (1000.0, "metres")

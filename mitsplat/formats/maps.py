@@ -15,7 +15,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float32Array
-from mitsplat.files import storage_error
+from mitsplat.files import library_errors
 from mitsplat.frames.depth_sensor import sensed_depth
 from mitsplat.labels.labels import Labels
 from mitsplat.masks import Box
@@ -82,11 +82,8 @@ def save_exr(path: Path, frame: Frame) -> None:
     kinds = {"f": np.float32, "u": np.uint32, "i": np.uint32, "b": np.uint32}
     contiguous = {name: np.ascontiguousarray(c, dtype=kinds[c.dtype.kind]) for name, c in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, contiguous) as file:
-        try:
-            file.write(str(path))
-        except RuntimeError as error:
-            raise storage_error(path, str(error)) from error
+    with OpenEXR.File(header, contiguous) as file, library_errors(path):
+        file.write(str(path))
 
 
 def encode_png(picture: npt.NDArray[Any]) -> bytes:

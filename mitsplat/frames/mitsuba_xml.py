@@ -18,7 +18,7 @@ from mitsplat.colour import decode_srgb
 from mitsplat.device import Device
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError
-from mitsplat.files import storage_error, write_file
+from mitsplat.files import library_errors, write_file
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
 from mitsplat.frames.untrusted_xml import check_xml
@@ -86,10 +86,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     }
     _teach_writer()
     state = mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), description)
-    try:
+    with library_errors(path):
         write_file(path, lambda part: mi.parser.write_file(state, str(part)))
-    except RuntimeError as error:
-        raise storage_error(path, str(error)) from error
 
 
 def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:

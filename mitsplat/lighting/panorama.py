@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.files import storage_error, write_file
+from mitsplat.files import library_errors, write_file
 from mitsplat.untrusted_images import check_images
 from mitsplat.variant import ensure_variant
 
@@ -119,7 +119,5 @@ def write_exr(path: Path, radiance: Float32Array) -> None:
     """Write linear RGB, shape (H, W, 3), as 32-bit OpenEXR."""
     ensure_variant()
     bitmap = mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32))
-    try:
+    with library_errors(path):
         write_file(path, lambda part: bitmap.write(str(part), mi.Bitmap.FileFormat.OpenEXR))
-    except RuntimeError as error:
-        raise storage_error(path, str(error)) from error

@@ -31,6 +31,7 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.files import MESH_ERRORS, file_inside, storage_errors
 from mitsplat.format_version import FORMAT_VERSIONS
+from mitsplat.mesh import check_faces
 from mitsplat.splats import Splats
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
@@ -344,11 +345,7 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
         raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: a mesh must have triangles (got none)")
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise InputError(
-            f"{path}: not a valid mesh file (a face has vertices {mesh.faces.min()} to {mesh.faces.max()} "
-            f"of {len(mesh.vertices)})"
-        )
+    check_faces(mesh, path)
     if not np.isfinite(mesh.vertices).all():
         row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
         raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")

@@ -138,3 +138,16 @@ def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:
     mesh = manifold3d.Manifold(manifold3d.Mesh(vertices, faces)).simplify(tolerance).to_mesh()
     simple = trimesh.Trimesh(mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts, process=False)
     return simple if simple.is_volume else solid
+
+
+def check_faces(mesh: trimesh.Trimesh, source: object) -> None:
+    """Refuse faces of vertices that are not there, which readers of files let pass.
+
+    Raises:
+        InputError: Which begins with the ``source`` of the mesh.
+    """
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise InputError(
+            f"{source}: not a valid mesh file (a face has vertices {mesh.faces.min()} to {mesh.faces.max()} "
+            f"of {len(mesh.vertices)})"
+        )

@@ -31,6 +31,7 @@ from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.file_kinds import refuse_others
 from mitsplat.files import MESH_ERRORS
+from mitsplat.mesh import check_faces
 from mitsplat.mesh_normals import corner_normals
 from mitsplat.plugins.device import ray_scene
 from mitsplat.render.emitters import emitter_dict, y_up_to_z_up
@@ -147,8 +148,7 @@ def read_parts(
         transform, geometry_name = scene.graph[node]
         geometry = scene.geometry[geometry_name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
-                raise InputError(f"{source}: a face names a vertex that is not there (got {geometry.faces.max()})")
+            check_faces(geometry, source)
             if not np.isfinite(geometry.vertices).all():
                 row = int(np.flatnonzero(~np.isfinite(geometry.vertices).all(axis=1))[0])
                 place = np.asarray(geometry.vertices[row]).tolist()

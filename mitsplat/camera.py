@@ -24,6 +24,10 @@ FISHEYE_MAX = float(np.radians(85.0))
 """Widest angle to the optical axis that a fisheye may show [rad]: rays are held as slopes, which grow beyond bounds."""
 
 
+MOST_PIXELS = 16384
+"""Longest side of an image [px]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """OpenCV camera: intrinsics [px], lens distortion and pose.
@@ -60,8 +64,9 @@ class Camera:
     focus_distance: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera size must be at least 1x1 (got {self.width}x{self.height})")
+        sides = self.width, self.height
+        if not all(isinstance(side, int | np.integer) and 1 <= side <= MOST_PIXELS for side in sides):
+            raise ValueError(f"camera size must be whole numbers of 1 to {MOST_PIXELS} px (got {sides[0]}x{sides[1]})")
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
             raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
         if not self.near > 0:
@@ -295,6 +300,8 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     forward = target - eye
     distance = np.linalg.norm(forward)
+    if not np.isfinite(distance):
+        raise ValueError(f"a camera must have finite places (got {eye.tolist()} and {target.tolist()})")
     if not distance > 0:
         raise ValueError(f"a camera must look at a point other than its own position (got {eye.tolist()} twice)")
     forward = forward / distance

@@ -9,6 +9,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
@@ -105,7 +106,7 @@ def load_yaml(
     overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
     data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
-        _set(data, keys, value)
+        _set(data, keys, _of_numpy(value))
     if newest is not None:  # first: whatever else is wrong with a newer file may be right for newer code
         check_format_version(data, newest, _place(path, _line(tree, (FORMAT_VERSION,)), ()))
     try:
@@ -138,6 +139,15 @@ def _as_written(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): _as_written(inner) for key, inner in value.items()}
     return [_as_written(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def _of_numpy(value: Any) -> Any:
+    """The same with NumPy's numbers and arrays as Python's."""
+    if isinstance(value, Mapping):
+        return {key: _of_numpy(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_of_numpy(inner) for inner in value]
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _parse(path: Path) -> CommentedMap:

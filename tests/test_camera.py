@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.camera import Camera
+from mitsplat.camera import Camera, look_at_pose
 from mitsplat.errors import InputError
 from mitsplat.formats.colmap import camera_model
 from mitsplat.render.layers import describe_sensor, ensure_variant
@@ -53,6 +53,17 @@ def test_rays_of_a_fisheye_come_back_to_their_pixels(distortion: tuple[float, ..
 def test_fisheye_that_cannot_be_is_refused(changes: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         replace(FISHEYE, **changes)
+
+
+@pytest.mark.parametrize("width", [0, 10.5, 200_000])
+def test_size_that_cannot_be_is_refused(width: float) -> None:
+    with pytest.raises(ValueError, match=rf"whole numbers of 1 to 16384 px \(got {width}x480\)"):
+        Camera(width, 480, 100.0, 100.0, 5.0, 240.0, np.eye(4))  # type: ignore[arg-type]
+
+
+def test_places_must_be_finite() -> None:
+    with pytest.raises(ValueError, match=r"must have finite places \(got \[0.0, 0.0, nan\]"):
+        look_at_pose((0, 0, np.nan), (0, 0, 0))
 
 
 def test_sensor_plugin_sends_the_same_rays() -> None:

@@ -107,7 +107,7 @@ class YoloReader:
         if data.get("names") != dict(enumerate(self._content["classes"])):
             yield f"names are {str(data.get('names'))[:80]}, not {dict(enumerate(self._content['classes']))}"
         for split in SPLITS[:2]:
-            shown = split if split in self._splits else next(iter(sorted(self._splits)), split)
+            shown = split if split in self._splits else next((one for one in SPLITS if one in self._splits), split)
             if data.get(split) != f"images/{shown}":
                 yield f"{split} is {data.get(split)}, not images/{shown}"
         if data.get("test") != ("images/test" if "test" in self._splits else None):

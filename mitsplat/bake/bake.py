@@ -178,6 +178,9 @@ def bake_asset(
     """
     ensure_variant()
     settings = settings or BakeSettings()
+    for key, value, allowed in (("kind", kind, ("object", "environment")), ("up", up, ("y", "z"))):
+        if value not in allowed:
+            raise InputError(f"{key} must be {' or '.join(allowed)} (got {value!r})")
     if not (density > 0 and np.isfinite(density)):
         raise InputError(f"density must be a number > 0 in kg/m^3 (got {density:g})")
     if not (friction >= 0 and np.isfinite(friction)):

@@ -326,6 +326,8 @@ def report(
     """
     from mitsplat.report.report import write_report
 
+    if out is not None and out.suffix.lower() != ".html":
+        raise InputError(f"--out must end in .html (got {out})")
     page, found, warnings = write_report(dataset, out)
     for warning in warnings:
         typer.echo(f"look  {warning}")
@@ -469,6 +471,9 @@ def export(
         raise InputError(f"--out must end in .xml (got {out})")
     if out.exists() and not (overwrite and out.is_file()):
         raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
+    files = out.with_name(f"{out.stem}_files")
+    if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
+        raise InputError(f"--out needs a new folder beside it, {files} (it is there); --overwrite replaces its files")
     from mitsplat.frames.mitsuba_xml import export_xml
     from mitsplat.scene.scene import load_scene
 

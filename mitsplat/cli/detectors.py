@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from mitsplat.cli.options import JsonLog, Seed, command_log
+from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
     from mitsplat.detector.likeness import Trait
@@ -153,6 +154,8 @@ def compare(
     from mitsplat.detector.likeness import compare_with_photographs
     from mitsplat.files import write_text
 
+    if out is not None and out.suffix.lower() != ".json":
+        raise InputError(f"--out must end in .json (got {out})")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
         found = compare_with_photographs(datasets, photographs, split=split, size=size, most=images, progress=progress)
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")

@@ -28,6 +28,7 @@ from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, storage_errors, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 from mitsplat.formats.registry import TABLE, Catalogue, CollectionWriter
+from mitsplat.formats.yolo import TASKS
 from mitsplat.version import __version__
 
 if TYPE_CHECKING:
@@ -45,10 +46,9 @@ SHARD = "shard.json"
 LOCK = ".lock"
 _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
 """Names of what may be in a folder before ``dataset.json`` is."""
-_ENTRIES = (
-    *(entry for format in TABLE.values() for entry in format.entries),
-    *("images", "layouts", "scene", "folds", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK),
-)
+_PARTIAL = re.compile(r"\..+\.\d+\.part")
+"""Of what :func:`mitsplat.files.write_file` has not finished."""
+_ENTRIES = ("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK)
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,10 @@ def _check_resumable(
         )
     stored = read_shard(out)
     if stored != shard:
-        before, now = (f"shard {part['shard']}/{part['of']}" if part else "a whole dataset" for part in (stored, shard))
+        before, now = (
+            f"shard {part['shard']}/{part['of']} of {part['frames']} images" if part else "a whole dataset"
+            for part in (stored, shard)
+        )
         raise InputError(f"{out} cannot be resumed: it was {before} and is {now}; overwrite it or choose another")
 
 
@@ -300,11 +303,8 @@ def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
 
 def _remove_dataset(out: Path) -> None:
     """Remove what mitsplat writes and nothing else; its mark last, so that an interruption can be repeated."""
-    for entry in (
-        *(out / name for name in _ENTRIES),
-        *out.glob("fold[0-9]*_train.txt"),
-        *out.glob("fold[0-9]*_val.txt"),
-    ):
+    remove_folds(out)
+    for entry in (out / name for name in (*_entries(out), *_ENTRIES)):
         name = entry.name
         if entry.is_dir() and not entry.is_symlink():
             shutil.rmtree(entry)
@@ -313,10 +313,31 @@ def _remove_dataset(out: Path) -> None:
     (out / CONTENT).unlink(missing_ok=True)
 
 
+def _entries(out: Path) -> list[str]:
+    """What the formats of a dataset have in its folder, or all formats where it does not say which it has."""
+    try:
+        formats = json.loads((out / CONTENT).read_bytes())["scene"]["output"]["formats"]
+        return [entry for name in formats for entry in TABLE[name].entries]
+    except (OSError, ValueError, KeyError, TypeError):
+        return [entry for format in TABLE.values() for entry in format.entries]
+
+
+def remove_folds(out: Path) -> bool:
+    """Remove the lists of a division for cross-validation; whether there were any."""
+    found = False
+    for folder in {out / task.folder for task in TASKS.values()}:
+        for split in ("train", "val"):
+            for file in folder.glob(f"fold[0-9]*_{split}.txt"):
+                file.unlink()
+                found = True
+        shutil.rmtree(folder / "folds", ignore_errors=True)
+    return found
+
+
 def _remove_partial(out: Path) -> None:
     for folder, _, names in os.walk(out):
         for name in names:
-            if name.startswith(".") and name.endswith(".part"):
+            if _PARTIAL.fullmatch(name):
                 (Path(folder) / name).unlink(missing_ok=True)
 
 

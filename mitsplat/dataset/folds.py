@@ -18,7 +18,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsplat.dataset.folder import open_finished
+from mitsplat.dataset.folder import open_finished, remove_folds
 from mitsplat.dataset.schema import read_content
 from mitsplat.errors import InputError
 from mitsplat.files import GrowingFile, storage_errors, write_text
@@ -67,6 +67,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
         if not 2 <= folds <= len(layouts):
             raise InputError(f"folds must be 2 to {len(layouts)}, the layouts of {root} (got {folds})")
         fold_of = assign_folds(layouts, folds)
+        remove_folds(root)
         names = [f"fold{fold + 1}" for fold in range(folds)]
         folders = [TASKS[task].folder for task in tasks if TASKS[task].folder]
         lists = {

@@ -8,14 +8,15 @@ import shutil
 import tempfile
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mitsplat.dataset.folder import LOCK
-from mitsplat.errors import PartialResultError
+from mitsplat.errors import InputError, PartialResultError
 from mitsplat.files import Record, link_file, storage_errors, write_file, write_text
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
@@ -77,7 +78,8 @@ class FrameMaker:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; freed with the file or the process
             if not path.exists():
                 write_text(path, self.settled(index, note))
-            return self.keep(path.read_bytes())
+            with layout_errors(path):
+                return self.keep(path.read_bytes())
 
     def keep(self, text: str | bytes) -> Layout:
         """The layout that JSON describes, the same object as before if it is the same.
@@ -89,6 +91,15 @@ class FrameMaker:
         if self._kept is None or self._kept.index != stored["index"]:
             self._kept = Layout.from_json(stored)
         return self._kept
+
+
+@contextmanager
+def layout_errors(path: Path) -> Iterator[None]:
+    """Raise what is wrong with the file of a layout as an InputError."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: must be a layout as it settled ({error!r}); remove it and run again") from error
 
 
 @dataclass(frozen=True)

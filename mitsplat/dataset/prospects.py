@@ -18,8 +18,9 @@ import trimesh
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
 from mitsplat.engine.resources import unused_memory
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding
+from mitsplat.mesh import prepare_mesh
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
@@ -50,9 +51,11 @@ def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
 
     Raises:
         InputError: If there is one.
+        MissingResourceError: If it is that of the machine.
     """
     for fault in faults:
-        raise InputError(f"{scene.path}: {fault.text}; {fault.remedy}")
+        kind = MissingResourceError if fault.name in ("memory", "disk") else InputError
+        raise kind(f"{scene.path}: {fault.text}; {fault.remedy}")
 
 
 def run_faults(
@@ -106,6 +109,13 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
     dropped = [i for i, entry in enumerate(scene.spec.objects) if not entry.poses]
     if not dropped:
         return
+    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
+        if shape.collider:
+            try:
+                prepare_mesh(mesh, f"shapes[{number}]")
+            except InputError as error:
+                yield Finding("shape", False, str(error), "correct it, or let it be no collider")
+                return
     for number, (region, arrangement) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"
         here = [i for i in dropped if scene.spec.regions_of(scene.spec.objects[i]) == (number,)]
@@ -185,10 +195,13 @@ def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
         place = place.parent
     free, need = shutil.disk_usage(place).free, frames * FRAME_BYTES
     if need > free:
-        text = (
-            f"output: {frames} images take at least {need / 2**30:.1f} GiB ({free / 2**30:.1f} GiB are free at {place})"
-        )
+        text = f"output: {frames} images take at least {_amount(need)} ({_amount(free)} are free at {place})"
         yield Finding("disk", False, text, "lower output.layouts or views, give --frames, or write to another disk")
+
+
+def _amount(size: int) -> str:
+    """Bytes as one reads them."""
+    return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.3g} MiB"
 
 
 def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:

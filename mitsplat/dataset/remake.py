@@ -87,6 +87,7 @@ def remake_frame(
     maker = FrameMaker(scene, catalogue, out, render, settle)
     with storage_errors(out):
         text = maker.settled(layout, lambda said: None)
+        _remove_frame(out)
         write_text(out / place, text)
         record, _ = maker.write(index, maker.keep(text))
         write_text(out / FRAME, json.dumps(record, indent=1) + "\n")
@@ -104,6 +105,17 @@ def remake_frame(
     found = first_difference(present, content_of(scene, catalogue, chosen.kind))
     cause = "" if found is None else "{} was {} and is {}".format(*found)
     return RemadeFrame(out, record, len(before), tuple(differing), cause)
+
+
+def _remove_frame(out: Path) -> None:
+    """Remove the files of a frame that was made before."""
+    try:
+        names = list(json.loads((out / FRAME).read_bytes())["files"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    for file in [*(out / str(name) for name in names), *(out / "layouts").glob("[0-9]*.json")]:
+        if file.resolve().is_relative_to(out.resolve()):
+            file.unlink(missing_ok=True)
 
 
 def _frame_of(dataset: Path, index: int) -> Record | None:

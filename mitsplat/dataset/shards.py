@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mitsplat.content_hash import file_hash
 from mitsplat.dataset.folder import (
     IMPLIED,
     RUNS,
@@ -61,6 +62,10 @@ def merge_shards(
         catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], (), splits=splits)
         scene_file = next((folders[0] / "scene").iterdir())
         _check_layouts(folders)
+        if overwrite:  # before what is there goes
+            for folder, part in manifests.items():
+                for record in part:
+                    _check_files(folder, record)
         manifest = stack.enter_context(open_folder(out, content, scene_file, None, resume=True, overwrite=overwrite))
         for folder, part in manifests.items():
             for record in part:
@@ -135,6 +140,8 @@ def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int
             first = last + 1
         missing += index - last - 1
         last, place = index, folder
+    if last < 0 and stated is None:
+        raise InputError(f"{', '.join(map(str, manifests))}: has no image yet: finish it first")
     count = last + 1 if stated is None else stated
     if count > last + 1 and not missing:
         first = last + 1
@@ -162,18 +169,34 @@ def _check_layouts(folders: Sequence[Path]) -> None:
                 raise InputError(f"{other} and {layout} must be the same: one layout was settled in two ways")
 
 
+def _check_files(folder: Path, record: Record) -> None:
+    for file, digest in record["files"].items():
+        source = _source(folder, file, record)
+        _check_content(source, file_hash(source), digest)
+
+
 def _take_files(folder: Path, out: Path, record: Record) -> None:
     for file, digest in record["files"].items():
-        try:
-            if ".." in Path(file).parts:  # inside one folder may be outside of the other
-                raise InputError(f"files must not be named by .. (got {file})")
-            source = file_inside(folder, file)
-        except InputError as error:
-            raise InputError(f"{folder}: frame {record['index']}: {error}; render that shard again") from error
+        source = _source(folder, file, record)
         found = write_file(out / file, partial(link_file, source))
         if found != digest:
             (out / file).unlink()
-            raise InputError(
-                f"{source}: must have the SHA-256 {digest}, as its manifest states (got {found}); remove it and render "
-                "that shard again"
-            )
+        _check_content(source, found, digest)
+
+
+def _source(folder: Path, file: str, record: Record) -> Path:
+    """A file of a shard's frame."""
+    try:
+        if ".." in Path(file).parts:  # inside one folder may be outside of the other
+            raise InputError(f"files must not be named by .. (got {file})")
+        return file_inside(folder, file)
+    except InputError as error:
+        raise InputError(f"{folder}: frame {record['index']}: {error}; render that shard again") from error
+
+
+def _check_content(source: Path, found: str, digest: str) -> None:
+    if found != digest:
+        raise InputError(
+            f"{source}: must have the SHA-256 {digest}, as its manifest states (got {found}); remove it and render "
+            "that shard again"
+        )

@@ -26,13 +26,22 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mitsplat.dataset.folder import SHEET, TIMINGS, Shard, append_run, content_of, finish_folder, open_folder
-from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle
+from mitsplat.dataset.folder import (
+    SHEET,
+    TIMINGS,
+    Shard,
+    append_run,
+    content_of,
+    finish_folder,
+    open_folder,
+    remove_folds,
+)
+from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle, layout_errors
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.prospects import refuse, run_faults
 from mitsplat.device import Device, current_device, find_device
-from mitsplat.engine.pool import run_frames
-from mitsplat.engine.ray import Cluster, run_on_ray
+from mitsplat.engine.pool import check_workers, run_frames
+from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, storage_errors
@@ -132,12 +141,14 @@ def write_dataset(
     formats = scene.spec.output.formats
     if unknown := set(formats) - set(FORMATS):
         raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
+    check_workers(workers)
     catalogue = Catalogue.of(scene)
     wanted = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
     if render is None and settle is None:
         refuse(scene, run_faults(scene, wanted, out=out, workers=workers, elsewhere=cluster is not None))
     if cluster is not None:
         chosen, cluster = cluster.on_device(device)
+        load_ray()
     else:
         chosen = current_device() if device is None else find_device(device)
     content = content_of(scene, catalogue, chosen.kind)
@@ -158,6 +169,8 @@ def write_dataset(
         if chosen.reason:
             note(f"device {chosen}: {chosen.reason}")
         if layouts:
+            if remove_folds(out):
+                note("lists of folds are removed, as they lack the new images: run `mitsplat split` again")
             append_run(out, workers, chosen.kind, [gpu.name for gpu in chosen.gpus])
         shortfall = Shortfall(scene, -(-count // scene.spec.output.views))
         for layout in sorted({layout_of(scene, index) for index in wanted}):
@@ -209,7 +222,9 @@ class Shortfall:
     def read(self, path: Path) -> None:
         """Count a layout that an earlier run settled, if it did."""
         with suppress(FileNotFoundError):
-            layout = Layout.from_json(json.loads(path.read_bytes()))
+            text = path.read_bytes()
+            with layout_errors(path):
+                layout = Layout.from_json(json.loads(text))
             self.add(layout.index, [(self._scene.assets[one.asset].name, one.reason) for one in layout.left_out])
 
     def add(self, layout: int, left_out: Sequence[tuple[str, str]]) -> None:

@@ -54,6 +54,9 @@ from mitsplat.progress import Progress
 LEAST_SCORE, NMS_IOU = 0.001, 0.7
 """Detections that are kept, and the overlap of boxes of a class beyond which the lower score is dropped."""
 
+_OWN = frozenset(("truth.json", "detections.json", "results.json", REPORT_FILE))
+"""Files of an evaluation."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -88,7 +91,8 @@ def evaluate_detector(
     Args:
         run: Folder of a finished training.
         data: A dataset of mitsplat, a YOLO folder or a COCO folder.
-        out: Folder to write; ``evaluation/<name of data>-<split>`` in the run by default. What is there is replaced.
+        out: Folder to write; ``evaluation/<name of data>-<split>`` in the run by default. An evaluation that is there
+            is replaced.
         split: Which of the images.
         size: Longer side that images are scaled to [px], that of the training by default.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, as PyTorch counts GPUs.
@@ -96,7 +100,7 @@ def evaluate_detector(
 
     Raises:
         InputError: If the run is not finished, or images are not as :func:`mitsplat.detector.read_set` wants them, have
-            other classes, or boxes alone where the detector predicts masks.
+            other classes, or boxes alone where the detector predicts masks; or the folder holds them or something else.
         MissingResourceError: If Ultralytics or the GPU is missing.
     """
     trained, root = open_run(run), Path(data)
@@ -109,8 +113,7 @@ def evaluate_detector(
         check_masks(found)
     name = f"{root.resolve().name}-{split}"
     out = trained.path / "evaluation" / name if out is None else Path(out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: must be a folder (got a file)")
+    _check_folder(out, root)
     load_libraries()
     check_torchvision()
     network = str(trained.record["settings"]["model"])
@@ -129,6 +132,17 @@ def evaluate_detector(
         "seconds": round(time.perf_counter() - started, 1),
     }
     return write_evaluation(found, detections, out, masks=trained.has_masks, about=about)
+
+
+def _check_folder(out: Path, root: Path) -> None:
+    """Refuse to write among the images that are judged, or among what is no evaluation."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: must be a folder (got a file)")
+    if root.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"{out}: must not hold the images that are judged, {root}: give another folder")
+    if out.is_dir() and not {path.name for path in out.iterdir()} <= _OWN:
+        strange = min(path.name for path in out.iterdir() if path.name not in _OWN)
+        raise InputError(f"{out}: holds something else than an evaluation (got {strange}): give another folder")
 
 
 def detect(

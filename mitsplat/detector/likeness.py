@@ -150,8 +150,10 @@ def compare_with_photographs(
     Raises:
         InputError: If there is nothing to compare, or something cannot be read.
     """
-    if size < 32 or most < 1:
-        raise InputError(f"size must be 32 px or more, and most at least 1 (got {size} and {most})")
+    if size < 32:
+        raise InputError(f"size must be 32 px or more (got {size})")
+    if most < 1:
+        raise InputError(f"images of each side must be at least 1 (got {most})")
     real = read_set(photographs, "all")
     sets = [in_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:

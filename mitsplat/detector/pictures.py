@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from mitsplat.arrays import ByteImage
 from mitsplat.content_hash import ContentHash
@@ -71,7 +71,8 @@ def look_at_image(path: Path) -> tuple[int, int, ContentHash]:
             turned = image.getexif().get(_ORIENTATION) in _TURNED
             form = image.format
     except IMAGE_ERRORS as error:
-        raise InputError(f"{path}: cannot be read as an image ({error})") from error
+        cause = "of no format that is known" if isinstance(error, UnidentifiedImageError) else error
+        raise InputError(f"{path}: cannot be read as an image ({cause})") from error
     if form in ("JPEG", "MPO") and not data.endswith(_JPEG_ENDS):
         raise InputError(f"{path}: {_ends(data)}")
     if form not in _WHOLE + _DECODED:

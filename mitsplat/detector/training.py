@@ -96,6 +96,8 @@ class TrainSettings:
         if self.real_size is not None and self.real_size < self.size:
             raise InputError(f"real_size must be no less than size, {self.size} px (got {self.real_size})")
         check_device(self.device)
+        if self.weights is not None:
+            object.__setattr__(self, "weights", Path(self.weights))
 
     def decisive(self) -> dict[str, Any]:
         """Those that decide what is learnt, not where."""

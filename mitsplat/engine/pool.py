@@ -148,6 +148,16 @@ class Pool(Protocol[Result]):
         """Stop all workers."""
 
 
+def check_workers(workers: int | None) -> None:
+    """Refuse fewer than one.
+
+    Raises:
+        InputError: If there are.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1 (got {workers})")
+
+
 def run_frames(
     make: MakeFrame[Result],
     layouts: Mapping[int, Sequence[int]],
@@ -177,8 +187,7 @@ def run_frames(
         LostWorkersError: If :data:`MOST_LOSSES` workers died of one frame. Workers are stopped before anything is
             raised, and when the iterator is closed.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"workers must be at least 1 (got {workers})")
+    check_workers(workers)
     total = sum(map(len, layouts.values()))
     most = affordable_workers(memory, device) if workers is None else workers
     few = min(most, total) <= 1 or (workers is None and total <= _FEW)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 from mitsplat.device import Device, Kind, use_share
-from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, run_pool
+from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, check_workers, run_pool
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.progress import Note
 
@@ -126,12 +126,24 @@ def run_on_ray(
         MissingResourceError: If Ray is not installed or not found, or has no room for one worker.
         InputError, FrameError, LostWorkersError: As :func:`mitsplat.engine.pool.run_frames`.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"workers must be at least 1 (got {workers})")
+    check_workers(workers)
     if not any(layouts.values()):
         return
     with closing(_Actors(job, cluster, workers)) as pool, closing(run_pool(pool, layouts, pool.room, note)) as results:
         yield from results
+
+
+def load_ray() -> Any:
+    """The module.
+
+    Raises:
+        MissingResourceError: If it is not installed.
+    """
+    try:
+        import ray  # optional: the extra [cluster]
+    except ImportError:
+        raise MissingResourceError("the engine ray needs Ray: pip install 'mitsplat[cluster]'") from None
+    return ray
 
 
 class _Actors(Generic[Result]):
@@ -142,10 +154,7 @@ class _Actors(Generic[Result]):
     """
 
     def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
-        try:
-            import ray  # optional: the extra [cluster]
-        except ImportError:
-            raise MissingResourceError("the engine ray needs Ray: pip install 'mitsplat[cluster]'") from None
+        ray = load_ray()
         self._ray = ray
         self._started = not ray.is_initialized()
         if self._started:

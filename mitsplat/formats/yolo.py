@@ -112,7 +112,8 @@ def data_yaml(
 
 def names_yaml(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]] | None = None) -> str:
     """What a description says of classes, and of the keypoints of every class for ``yolo-pose``."""
-    lines = ["names:", *(f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names))]
+    lines = ["names:" if class_names else "names: {}"]
+    lines += [f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names)]
     if keypoint_names is not None:
         count = max(map(len, keypoint_names), default=0)
         lines += [f"kpt_shape: [{count}, 3]", "kpt_names:"]

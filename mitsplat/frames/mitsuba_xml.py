@@ -18,7 +18,7 @@ from mitsplat.colour import decode_srgb
 from mitsplat.device import Device
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError
-from mitsplat.files import library_errors, write_file
+from mitsplat.files import library_errors, storage_errors, write_file
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
 from mitsplat.frames.untrusted_xml import check_xml
@@ -102,22 +102,25 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
         Path of the picture.
 
     Raises:
-        InputError: If the file is missing or Mitsuba refuses it.
+        InputError: If the file is missing or Mitsuba refuses it, or the picture cannot be written.
+        MissingResourceError: If the disk is full.
     """
     ensure_variant()
     path, out = Path(path), Path(out)
     check_xml(path, allow_outside=allow_outside)
     picture = out if out.suffix.lower() in (".png", ".jpg", ".exr") else out / "picture.png"
-    picture.parent.mkdir(parents=True, exist_ok=True)
+    with storage_errors(picture):
+        picture.parent.mkdir(parents=True, exist_ok=True)
     try:
         scene = mi.load_file(str(path.resolve()))
         image = np.array(_render(path, scene))
     except RuntimeError as error:
         raise InputError(one_sentence(path, str(error))) from error
-    if picture.suffix.lower() == ".exr":
-        mi.Bitmap(image[..., :3]).write(str(picture))
-        return picture
-    mi.Bitmap(develop(image[..., :3], {})).write(str(picture))
+    suffix = picture.suffix.lower()
+    bitmap = mi.Bitmap(image[..., :3] if suffix == ".exr" else develop(image[..., :3], {}))
+    kind = getattr(mi.Bitmap.FileFormat, {".exr": "OpenEXR", ".jpg": "JPEG", ".png": "PNG"}[suffix])
+    with storage_errors(picture), library_errors(picture):
+        write_file(picture, lambda part: bitmap.write(str(part), kind))
     return picture
 
 

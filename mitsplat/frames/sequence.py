@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
 from mitsplat.camera import Camera
+from mitsplat.errors import InputError
 from mitsplat.frames.frame import Frame, Renderer
 from mitsplat.quality import Quality
+from mitsplat.scene.conveyor import carried
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, layout_of, whole
 from mitsplat.scene.viewpoints import view_of
@@ -65,6 +67,8 @@ def render_frames(
         given = any(isinstance(each, Iterable) for each in (layouts, cameras))
         indices: Iterable[int] = itertools.count() if given else range(scene.num_frames)
     else:
+        if not isinstance(frames, Iterable) and whole(frames, "frames") < 0:
+            raise InputError(f"frames must be 0 or more (got {frames})")
         indices = frames if isinstance(frames, Iterable) else range(whole(frames, "frames"))
     parts: tuple[object, ...] = (indices, layouts, cameras)
     total = min((len(each) for each in parts if isinstance(each, Sized)), default=None)
@@ -78,14 +82,12 @@ def render_frames(
         for shot, following in _told(_with_next(shots), total, progress):
             index, layout, camera = shot
             next_layout, next_camera = (None, None) if following is None else _next(scene, shot, following)
-            yield renderer.render(
-                index,
-                layout=layout,
-                camera=view_of(scene, index, layout).camera if camera is None else camera,
-                lights=lights,
-                next_layout=next_layout,
-                next_camera=next_camera,
+            frame = renderer.render(
+                index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
             )
+            if next_camera is None:  # of the film, whatever view of the scene's comes next
+                frame = replace(frame, plan=replace(frame.plan, next_camera=None))
+            yield frame
 
 
 def without_end(scene: Scene) -> Scene:
@@ -99,6 +101,9 @@ def _next(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Cam
     (index, layout, _), (next_index, next_layout, next_camera) = shot, following
     if layout is None and layout_of(scene, index) != layout_of(scene, next_index):
         return None, None
+    if next_layout is not None:
+        view = next_index - layout_of(scene, next_index) * scene.spec.output.views
+        next_layout = carried(scene.spec, next_layout, view)
     return next_layout, view_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
 
 

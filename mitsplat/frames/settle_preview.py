@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 from rich.table import Table
 
-from mitsplat.errors import InputError
+from mitsplat.files import storage_errors, write_file
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import replay_layout
 from mitsplat.scene.layout import Layout
@@ -45,6 +46,7 @@ def write_preview(scene: Scene, layout: Layout, path: Path) -> int:
 
     Raises:
         InputError: If the file cannot be written.
+        MissingResourceError: If the disk is full.
     """
     frame = layout.index * scene.spec.output.views
     pictures = [
@@ -53,8 +55,7 @@ def write_preview(scene: Scene, layout: Layout, path: Path) -> int:
     ]
     step = round(_INTERVAL * 1000)
     durations = [step] * (len(pictures) - 1) + [_PAUSE]
-    try:
-        pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, format="GIF")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    film: dict[str, Any] = {"save_all": True, "append_images": pictures[1:], "duration": durations, "loop": 0}
+    with storage_errors(path):
+        write_file(path, lambda part: pictures[0].save(part, "GIF", **film))
     return len(pictures)

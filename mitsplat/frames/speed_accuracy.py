@@ -7,6 +7,7 @@ before the camera's development, whose noise would hide the differences.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import multiprocessing
 import resource
@@ -28,6 +29,7 @@ from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
 from mitsplat.device import Device, Kind, current_device, starting_on, use_device
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.files import storage_errors, write_file, write_text
 from mitsplat.frames.frame import render_frame
 from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.progress import Progress
@@ -357,10 +359,12 @@ def _mask_iou(mine: npt.NDArray[np.uint16] | None, theirs: npt.NDArray[np.uint16
 
 def write_csv(rows: Sequence[Row], file: Path) -> None:
     """One line per row, with a head."""
-    with file.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(asdict(rows[0])))
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    stream = io.StringIO(newline="")
+    writer = csv.DictWriter(stream, list(asdict(rows[0])))
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    with storage_errors(file):
+        write_text(file, stream.getvalue())
 
 
 def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float) -> None:
@@ -395,7 +399,8 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
     axes.axhline(tolerance, color="C3", linewidth=0.8, linestyle="--")
     axes.set(xscale="log", yscale="log", xlabel="seconds per image", ylabel="RMSE against exact", title=title)
     axes.margins(x=0.2, y=0.1)
-    figure.savefig(file, dpi=110)
+    with storage_errors(file):
+        write_file(file, lambda part: figure.savefig(part, dpi=110, format=file.suffix[1:]))
 
 
 def curve_of(rows: Sequence[Row], least: float = 0.0) -> list[tuple[float, float]]:

@@ -39,7 +39,7 @@ from mitsplat.scene.streams import random_stream
 from mitsplat.scene.viewpoints import View, camera_at, view_of
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
 from mitsplat.spec.image import Randomise
-from mitsplat.spec.lights import LightEntry, LightSpec
+from mitsplat.spec.lights import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.spec.objects import MAIN, ObjectSpec
 from mitsplat.spec.shapes import Region
 from mitsplat.spec.spec import SCHEMA_VERSION, SceneSpec
@@ -314,6 +314,9 @@ def plan_frame(
         spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # by which they are checked
         if unknown := {name for _, name in light_images(spec)} - set(scene.images):
             raise InputError(f"images of lights must be among those of the scene's own (got {min(unknown)!r})")
+        for light in spec.lights:
+            if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
+                raise InputError(f"pools of lights must be lists of the scene's own images (got {light.pool!r})")
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise

@@ -8,12 +8,14 @@ from pydantic import AfterValidator, Field, NonNegativeFloat
 
 from mitsplat.quality import KernelName, ResponseName
 from mitsplat.spec_types import (
+    BlurRange,
     JpegQuality,
     Kelvin,
     NonNegativeRange,
     Positive,
     PositiveRange,
     Range,
+    StopsRange,
     StrictModel,
     Unit,
     ordered,
@@ -23,7 +25,7 @@ from mitsplat.spec_types import (
 class Randomise(StrictModel):
     """Ranges drawn from uniformly, anew for every frame unless stated; a range of equal ends fixes the value."""
 
-    exposure: Range = Field((0.0, 0.0), description="Exposure [stops].")
+    exposure: StopsRange = Field((0.0, 0.0), description="Exposure [stops].")
     hue: Range = Field((0.0, 0.0), description="Hue shift [degrees].")
     saturation: NonNegativeRange = Field((1.0, 1.0), description="Factor on saturation.")
     chroma_stretch: PositiveRange = Field(
@@ -49,7 +51,7 @@ class Randomise(StrictModel):
         description="How far the lens shifts red outwards, and blue inwards, in the image's corners [px]; green stays, "
         "and so do labels.",
     )
-    motion_blur: NonNegativeRange = Field(
+    motion_blur: BlurRange = Field(
         (0.0, 0.0), description="Length of the camera's motion in the image, in a direction drawn anew [px]."
     )
     sharpening: NonNegativeRange = Field(

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
+from mitsplat.camera import MOST_PIXELS
 from mitsplat.quality import PresetName
 from mitsplat.spec.camera import CameraSpec
 from mitsplat.spec.image import Composite, DepthSensor, Randomise, Rendering, StereoSensor
@@ -53,8 +54,8 @@ FORMATS: tuple[str, ...] = get_args(FormatName)
 class Output(StrictModel):
     """What is written."""
 
-    width: int = Field(1280, ge=1, le=16384, description="Image width [px].")
-    height: int = Field(720, ge=1, le=16384, description="Image height [px].")
+    width: int = Field(1280, ge=1, le=MOST_PIXELS, description="Image width [px].")
+    height: int = Field(720, ge=1, le=MOST_PIXELS, description="Image height [px].")
     layouts: int = Field(4, ge=1, description="How many times the objects are dropped.")
     views: int = Field(10, ge=1, description="Images of each layout.")
     formats: tuple[FormatName, ...] = Field(
@@ -213,9 +214,10 @@ class SceneSpec(StrictModel):
             )
         if "depth-sensor" in self.output.formats and self.depth_sensor is None:
             raise FieldError(("output", "formats"), "depth-sensor needs a depth_sensor")
-        lens = self.camera.intrinsics
-        if isinstance(self.depth_sensor, StereoSensor) and (lens.lens == "fisheye" or any(lens.distortion)):
-            raise FieldError("depth_sensor", "stereo must have a camera without lens distortion")
+        lenses = [camera.intrinsics for _, camera in self.camera_entries]
+        bent = any(lens.lens == "fisheye" or any(lens.distortion) for lens in lenses)
+        if isinstance(self.depth_sensor, StereoSensor) and bent:
+            raise FieldError("depth_sensor", "stereo must have cameras without lens distortion")
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: give output.test")
         turn = len(self.seats)

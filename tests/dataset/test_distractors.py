@@ -75,6 +75,22 @@ def test_the_audit_finds_nothing(made: Path) -> None:
     assert found.frames == 16 and found.instances > 16
 
 
+def test_the_audit_finds_nothing_where_nothing_is_labelled(tmp_path: Path) -> None:
+    formats = [name for name in FORMATS if name not in ("colmap", "yolo-pose")]
+    scene = small_scene(tmp_path, [*large_boxes(), box_asset("crate", (0.1, 0.1, 0.1))], OBJECTS[1:], formats=formats)
+    out = write(scene, tmp_path / "out")
+    assert "names: {}\n" in (out / "data.yaml").read_text()
+    assert audit_dataset(out).violations == ()
+
+
+def test_the_audit_finds_nothing_where_images_are_for_tests_but_none_for_validation(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path, large_boxes(), OBJECTS[:1], layouts=2, formats=["yolo", "yolo-pose"])
+    output = scene.spec.output.model_copy(update={"validation": 0.0, "test": 0.5})
+    out = write(replace(scene, spec=scene.spec.model_copy(update={"output": output})), tmp_path / "out")
+    assert {record["split"] for record in records_of(out)} == {"train", "test"}
+    assert audit_dataset(out).violations == ()
+
+
 def test_the_manifest_states_every_draw(made: Path, scene: Scene) -> None:
     empty = set()
     for record in records_of(made):

@@ -15,7 +15,7 @@ from mitsplat.dataset import prospects
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.prospects import doubts, refuse, run_faults, sees
 from mitsplat.dataset.write import write_dataset
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames import speed_accuracy as chart
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
@@ -70,7 +70,8 @@ def test_what_cannot_work_is_refused(name, scene_data, write_scene):
     assert list(run_faults(load_scene(write_scene(scene_data)))) == []
     change, cause = HOPELESS[name]
     scene = scene_with(scene_data, write_scene, change)
-    with pytest.raises(InputError, match=f"^{scene.path}: .*{cause}"):
+    kind = MissingResourceError if name in ("huge", "disk") else InputError
+    with pytest.raises(kind, match=f"^{scene.path}: .*{cause}"):
         refuse(scene, run_faults(scene))
 
 

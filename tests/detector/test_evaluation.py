@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.detector.evaluation import Evaluation, truth_of, write_evaluation
+from mitsplat.detector.evaluation import Evaluation, evaluate_detector, truth_of, write_evaluation
 from mitsplat.detector.report import worst_images
 from mitsplat.detector.scores import Confusion, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set
-from tests.detector.painted import write_coco, write_yolo
+from mitsplat.errors import InputError
+from tests.detector.painted import snapshot, write_coco, write_yolo
 
 
 def guesses(found: LabelledSet, seed: int = 0) -> list[dict[str, Any]]:
@@ -81,6 +82,26 @@ def test_the_page_is_whole_and_shows_the_worst_images(judged: tuple[LabelledSet,
 def test_the_worst_come_first() -> None:
     errors = {1: (3, 0, 0, 0), 2: (1, 1, 0, 0), 3: (0, 1, 0, 0), 4: (2, 0, 0, 2), 5: (0, 1, 1, 1)}
     assert worst_images(Confusion(np.zeros((1, 1), dtype=np.int64), errors)) == [5, 3, 4, 2]
+
+
+def test_no_foreign_folder_is_written_to(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    record = {"settings": {"size": 64}, "classes": ["disc", "box"], "masks": True, "finished": {"steps": 1}}
+    (run / "run.json").write_text(json.dumps(record))
+    (run / "weights.pt").touch()
+    data = write_yolo(tmp_path / "cell", {"val": 1})
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/thesis.tex").touch()
+    before = snapshot(tmp_path)
+    for out, rule in (
+        (data, "must not hold the images that are judged"),
+        (tmp_path, "must not hold the images that are judged"),
+        (tmp_path / "thesis", r"holds something else than an evaluation \(got thesis.tex\)"),
+    ):
+        with pytest.raises(InputError, match=f"{out}: {rule}"):
+            evaluate_detector(run, data, out)
+    assert snapshot(tmp_path) == before
 
 
 def test_boxes_alone_are_judged_as_such(tmp_path: Path) -> None:

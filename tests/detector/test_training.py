@@ -29,7 +29,7 @@ from mitsplat.detector.scores import average_precision
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import RUN, Run, TrainSettings, open_run, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
-from tests.detector.painted import write_coco, write_yolo
+from tests.detector.painted import snapshot, write_coco, write_yolo
 
 TINY = TrainSettings(model="yolo11n-seg", steps=4, batch=4, size=64, share=0.25, device="cpu")
 
@@ -289,10 +289,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(data: Path, torchvision: None, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run that has learnt something."""
     return train_detector([data / "cell"], tmp_path_factory.mktemp("runs") / "run", _other(steps=100, batch=8, size=96))
-
-
-def snapshot(folder: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def tensors(run: Run) -> dict[str, Any]:

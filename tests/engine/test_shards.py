@@ -153,9 +153,9 @@ class TestRefusals:
     def test_another_division(self, scene, shards, tmp_path):
         write(scene, tmp_path / "whole")
         self.refuse([*shards, tmp_path / "whole"], tmp_path / "out", "must be of one division of one dataset")
-        with pytest.raises(InputError, match="cannot be resumed: it was shard 1/3 and is shard 2/3"):
+        with pytest.raises(InputError, match="it was shard 1/3 of 12 images and is shard 2/3 of 12"):
             write(scene, shards[0], shard=Shard(2, 3))
-        with pytest.raises(InputError, match="cannot be resumed: it was shard 1/3 and is a whole dataset"):
+        with pytest.raises(InputError, match="it was shard 1/3 of 12 images and is a whole dataset"):
             write(scene, shards[0])
 
     def test_another_layout(self, shards, tmp_path):

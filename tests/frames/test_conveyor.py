@@ -75,6 +75,17 @@ def test_flow_is_the_belts_and_what_lies_on_it(belt_data: SceneData, write_scene
     assert ms.render_frame(scene, 2, layout=lying(scene, 0)).flow is None
 
 
+def test_flow_of_a_film_of_settled_layouts_is_the_scenes(belt_data: SceneData, write_scene: WriteScene) -> None:
+    scene = ms.load_scene(write_scene(belt_data))
+    layout = lying(scene, 0)
+    film = list(ms.render_frames(scene, 3, layouts=layout))
+    for frame in film:
+        alone = ms.render_frame(scene, frame.index, layout=layout)
+        np.testing.assert_array_equal(frame.image, alone.image)
+        assert (frame.flow is None) == (alone.flow is None) == (frame.index == 2)
+        np.testing.assert_array_equal(frame.flow if frame.index < 2 else 0, alone.flow if frame.index < 2 else 0)
+
+
 def test_the_pattern_runs_with_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["objects"] = []
     scene = ms.load_scene(write_scene(belt_data))

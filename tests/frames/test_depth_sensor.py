@@ -188,7 +188,22 @@ def test_the_frame_s_seed_decides(sensor: Any) -> None:
                     "intrinsics": {"fov_x": 40, "distortion": [0.1, 0, 0, 0]},
                 },
             },
-            "depth_sensor: stereo must have a camera without lens distortion",
+            "depth_sensor: stereo must have cameras without lens distortion",
+        ),
+        (
+            {
+                "depth_sensor": {"kind": "stereo"},
+                "cameras": [
+                    {
+                        "kind": "orbit",
+                        "target": [0, 0, 0],
+                        "radius": 1,
+                        "height": 1,
+                        "intrinsics": {"fx": 80, "lens": "fisheye", "distortion": [0, 0, 0, 0]},
+                    }
+                ],
+            },
+            "depth_sensor: stereo must have cameras without lens distortion",
         ),
     ],
 )

@@ -18,7 +18,7 @@ import mitsplat as ms
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.flow import UNKNOWN_FLOW, motions_of, optical_flow
 from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.spec.camera import CameraOrbit
+from mitsplat.spec.camera import CameraOrbit, Motion
 from mitsplat.spec.lights import AreaLight
 from mitsplat.spec.shapes import Shape
 from mitsplat.splats import Splats
@@ -240,6 +240,22 @@ def test_frames_of_a_scene_are_those_alone_and_go_on(scene: ms.Scene) -> None:
     assert [frame.index for frame in itertools.islice(endless, 3)] == [11, 12, 13]
 
 
+def test_frames_before_a_moving_camera_are_those_alone(scene: ms.Scene) -> None:
+    motion = Motion(exposure=(0.05, 0.05), rotation=(200.0, 200.0), readout=(0.05, 0.05))
+    camera = scene.spec.camera.model_copy(update={"motion": motion})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
+    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    frame = next(ms.render_frames(scene, layouts=layout, quality="fast"))
+    alone = ms.render_frame(scene, 0, layout=layout, quality="fast")
+    assert frame.image.tobytes() == alone.image.tobytes()
+    assert frame.plan.viewpoint["motion"] == alone.plan.viewpoint["motion"]
+
+
+def test_fewer_frames_than_none_are_refused(scene: ms.Scene) -> None:
+    with pytest.raises(ms.InputError, match=r"frames must be 0 or more \(got -3\)"):
+        next(ms.render_frames(scene, -3))
+
+
 def test_settled_frames_are_those_of_the_scene(
     scene: ms.Scene, monkeypatch: pytest.MonkeyPatch, above: ms.Camera
 ) -> None:
@@ -275,6 +291,8 @@ def test_lights_in_place_of_the_scenes(scene: ms.Scene) -> None:
         lit([{"kind": "area", "position": [0.5, 0, 1], "radiance": -4.0}])
     with pytest.raises(ms.InputError, match="images of lights must be among those"):
         lit([{"kind": "environment", "image": "sky.exr"}])
+    with pytest.raises(ms.InputError, match=r"pools of lights must be lists .* \(got 'skies/\*'\)"):
+        lit([{"kind": "environment", "pool": "skies/*"}])
 
 
 def test_a_frame_shows_its_image_and_its_labels_side_by_side(scene: ms.Scene, above: ms.Camera) -> None:

@@ -83,6 +83,18 @@ def test_overrides_replace_what_the_file_says(scene_data: SceneData, write_scene
     assert (scene.spec.seed, scene.spec.quality) == (3, "fast")
 
 
+def test_overrides_may_be_numpys(scene_data: SceneData, write_scene: WriteScene) -> None:
+    given = {"seed": np.int64(3), "camera.target": np.zeros(3), "randomise.exposure": [np.float32(-0.5), 1]}
+    spec = load_scene(write_scene(scene_data), overrides=given).spec
+    assert (spec.seed, spec.camera.target, spec.randomise.exposure) == (3, (0, 0, 0), (-0.5, 1))
+
+
+@pytest.mark.parametrize(("key", "most"), [("exposure", 20), ("motion_blur", 1000)])
+def test_what_no_picture_shows_is_refused(scene_data: SceneData, write_scene: WriteScene, key: str, most: int) -> None:
+    with pytest.raises(InputError, match=rf"randomise.{key}\[0\]: must be <= {most} "):
+        load_scene(write_scene(scene_data), overrides={f"randomise.{key}": [1100, 1100]})
+
+
 def test_box_is_turned_about_fixed_axes_in_order_x_y_z(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene_data["shapes"][0]["box"] = {"size": [1, 2, 4], "rotate": [90, 90, 0], "position": [0, 0, 3]}
     mesh = load_scene(write_scene(scene_data)).shape_meshes[0]

@@ -1,0 +1,163 @@
+"""What a dataset's folder holds when something is refused, made again or divided anew."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.folds import write_folds
+from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.dataset.write import write_dataset
+from mitsplat.engine.ray import Cluster
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.frames.mitsuba_xml import render_xml
+from mitsplat.scene.scene import Scene, make_scene
+from tests.cli.test_nothing_lost import contents
+from tests.cli.typed import run
+from tests.conftest import BOTH, small_scene
+from tests.drawn import large_boxes, render_boxes, scatter_boxes
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path, large_boxes(), BOTH, layouts=3, views=2, formats=["yolo", "yolo-detect", "bop"])
+
+
+def write(scene: Scene, out: Path, **options: Any) -> Path:
+    return write_dataset(scene, out, render=render_boxes, settle=scatter_boxes, **options).path
+
+
+def with_wide_shape(scene: Scene) -> Scene:
+    """The scene with a table of 40 m, as of wrong units."""
+    table = {"name": "table", "box": {"size": [40, 40, 0.02], "position": [0, 0, -0.01]}}
+    spec = type(scene.spec)(**{**scene.spec.model_dump(), "shapes": (table,)})
+    return replace(make_scene(spec, scene.path.parent), path=scene.path)
+
+
+def test_nothing_is_overwritten_before_what_is_given_was_looked_at(scene: Scene, tmp_path: Path) -> None:
+    out = write(scene, tmp_path / "out")
+    before = contents(out)
+    with pytest.raises(InputError, match=r"workers must be at least 1 \(got 0\)"):
+        write(scene, out, overwrite=True, workers=0)
+    with pytest.raises(InputError, match=r"scene.yaml: shapes\[0\]: the mesh must be .* \(got 40"):
+        write_dataset(with_wide_shape(scene), out, overwrite=True)
+    assert contents(out) == before
+
+
+def test_nothing_is_overwritten_without_ray(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = write(scene, tmp_path / "out")
+    before = contents(out)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingResourceError, match="the engine ray needs Ray"):
+        write(scene, out, overwrite=True, cluster=Cluster(None))
+    assert contents(out) == before
+
+
+def test_a_merged_dataset_stays_where_a_shard_is_damaged(scene: Scene, tmp_path: Path) -> None:
+    shards = [write(scene, tmp_path / f"part{i}", shard=Shard(i, 2)) for i in (1, 2)]
+    whole = merge_shards(shards, tmp_path / "whole").path
+    before = contents(whole)
+    damaged = shards[1] / "labels/train/000004.txt"
+    damaged.unlink()  # which is a further name of the whole's
+    damaged.write_text("0 0 0\n")
+    with pytest.raises(InputError, match=f"{damaged}: must have the SHA-256"):
+        merge_shards(shards, whole, overwrite=True)
+    assert contents(whole) == before
+
+
+def test_what_has_no_image_yet_is_not_merged(scene: Scene, tmp_path: Path) -> None:
+    out = write(scene, tmp_path / "out", frames=1)
+    (out / "manifest.jsonl").write_bytes(b"")
+    with pytest.raises(InputError, match=f"{out}: has no image yet: finish it first"):
+        merge_shards([out], tmp_path / "whole")
+    assert not (tmp_path / "whole").exists()
+
+
+def test_files_of_others_stay(scene: Scene, tmp_path: Path) -> None:
+    """Of formats that the dataset has not, and what looks like a file that is being written."""
+    out = write(scene, tmp_path / "out", frames=2)
+    for name in ("colmap/database.db", "depth/a.png", "annotations/mine.json", "notes/.mine.part"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).touch()
+    torn = out / "images/.000003.png.4711.part"
+    torn.touch()
+    write(scene, out)
+    assert not torn.exists()
+    write(scene, out, overwrite=True)
+    for name in ("colmap/database.db", "depth/a.png", "annotations/mine.json", "notes/.mine.part"):
+        assert (out / name).exists()
+
+
+@pytest.mark.parametrize("text", ["\n", "{}", "[]", '{"index": 1, "instances": 3}'])
+def test_a_damaged_layout_is_named(scene: Scene, tmp_path: Path, text: str) -> None:
+    out = write(scene, tmp_path / "out")
+    layout = out / "layouts/0001.json"
+    layout.write_text(text)
+    with pytest.raises(InputError, match=f"{layout}: must be a layout as it settled .*; remove it and run again"):
+        write(scene, out)
+
+
+def test_folds_are_those_of_all_images_or_none(scene: Scene, tmp_path: Path) -> None:
+    out, said = write(scene, tmp_path / "out", frames=4), list[str]()
+    write_folds(out, 2)
+    assert len(list(out.rglob("fold*_train.txt"))) == 4  # for two tasks
+    write(scene, out, progress=lambda done, total, text: said.append(text))
+    assert not list(out.rglob("fold*_*")) and not list(out.rglob("folds"))
+    assert any("run `mitsplat split` again" in text for text in said)
+    write_folds(out, 3)
+    write_folds(out, 2)
+    assert not list(out.rglob("fold3*")) and len(list(out.rglob("fold2*.*"))) == 6
+    write(scene, out)  # adds nothing
+    assert len(list(out.rglob("fold2*.*"))) == 6
+
+
+def test_a_frame_that_is_made_again_is_alone_in_its_folder(scene: Scene, tmp_path: Path) -> None:
+    def make(out: Path, of: Scene) -> dict[str, bytes]:
+        remake_frame(of, 3, out, render=render_boxes, settle=scatter_boxes)
+        return contents(out)
+
+    other = replace(scene, spec=scene.spec.model_copy(update={"seed": 8}))
+    make(tmp_path / "again", other)
+    (tmp_path / "again/notes.txt").touch()
+    found = make(tmp_path / "again", scene)
+    assert found.pop("notes.txt") == b""
+    assert found == make(tmp_path / "fresh", scene)
+
+
+def test_reports_go_to_files_of_their_kind(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scene.yaml").write_text("mine")
+    for words, kind in ((("report", dataset), ".html"), (("compare", dataset, dataset), ".json")):
+        assert run(*words, "-o", tmp_path / "scene.yaml") == 2
+        assert capsys.readouterr().err == f"mitsplat: --out must end in {kind} (got {tmp_path / 'scene.yaml'})\n"
+    assert (tmp_path / "scene.yaml").read_text() == "mine"
+
+
+def test_meshes_beside_an_exported_scene_stay(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "y_files").mkdir()
+    (tmp_path / "y_files/object_0.ply").write_text("mine")
+    assert run("export", scene.path, "-o", tmp_path / "y.xml") == 2
+    assert f"--out needs a new folder beside it, {tmp_path / 'y_files'}" in capsys.readouterr().err
+    assert (tmp_path / "y_files/object_0.ply").read_text() == "mine"
+
+
+def test_a_picture_stays_where_there_is_no_room_for_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = '<scene version="3.0.0"><integrator type="splat_proxy"/><sensor type="perspective">'
+    text += '<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>'
+    (tmp_path / "scene.xml").write_text(text + '</sensor><emitter type="constant"/></scene>')
+    picture = render_xml(tmp_path / "scene.xml", tmp_path / "out.png")
+    before = contents(tmp_path)
+
+    def full(path: Path, write: Callable[[Path], object]) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mitsplat.frames.mitsuba_xml.write_file", full)
+    with pytest.raises(MissingResourceError, match=f"{picture}: No space left on device"):
+        render_xml(tmp_path / "scene.xml", picture)
+    assert contents(tmp_path) == before

@@ -39,6 +39,29 @@ class MassProperties:
     inertia: Float64Array
 
 
+def check_size(mesh: trimesh.Trimesh, name: str) -> float:
+    """Its longest extent [m].
+
+    Args:
+        mesh: Surface [m].
+        name: What to call it in an error.
+
+    Raises:
+        InputError: The mesh is empty, not finite, or its size tells of wrong units.
+    """
+    if len(mesh.faces) == 0:
+        raise InputError(f"{name}: the mesh must have faces (got none)")
+    if not np.isfinite(mesh.vertices).all():
+        row = int(np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))[0])
+        raise InputError(f"{name}: mesh vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
+    size = float(mesh.extents.max())
+    if not _SMALLEST <= size <= _LARGEST:
+        raise InputError(
+            f"{name}: the mesh must be {_SMALLEST} m to {_LARGEST} m across, in metres (got {size:g} m: wrong units?)"
+        )
+    return size
+
+
 def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> trimesh.Trimesh:
     """Return a welded copy for physics, wound so that it encloses a positive volume, of 200,000 triangles at most.
 
@@ -52,16 +75,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     Raises:
         InputError: The mesh is empty, not finite, has no volume, or its size tells of wrong units.
     """
-    if len(mesh.faces) == 0:
-        raise InputError(f"{name}: the mesh must have faces (got none)")
-    if not np.isfinite(mesh.vertices).all():
-        row = int(np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))[0])
-        raise InputError(f"{name}: mesh vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
-    size = float(mesh.extents.max())
-    if not _SMALLEST <= size <= _LARGEST:
-        raise InputError(
-            f"{name}: the mesh must be {_SMALLEST} m to {_LARGEST} m across, in metres (got {size:g} m: wrong units?)"
-        )
+    size = check_size(mesh, name)
     welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     welded.update_faces(welded.nondegenerate_faces())

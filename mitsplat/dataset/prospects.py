@@ -20,7 +20,7 @@ from mitsplat.camera import Camera
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding
-from mitsplat.mesh import prepare_mesh
+from mitsplat.mesh import check_size
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
@@ -112,7 +112,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if shape.collider:
             try:
-                prepare_mesh(mesh, f"shapes[{number}]")
+                check_size(mesh, f"shapes[{number}]")
             except InputError as error:
                 yield Finding("shape", False, str(error), "correct it, or let it be no collider")
                 return

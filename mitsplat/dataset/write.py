@@ -20,6 +20,7 @@ Shards are datasets of their own that share everything but their frames; :mod:`m
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
@@ -52,6 +53,8 @@ from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note, Progress
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene, layout_of
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,9 @@ def write_dataset(
             note(f"device {chosen}: {chosen.reason}")
         if layouts:
             if remove_folds(out):
-                note("lists of folds are removed, as they lack the new images: run `mitsplat split` again")
+                _logger.warning(
+                    "%s: lists of folds lack the new images and are removed: run `mitsplat split` again", out
+                )
             append_run(out, workers, chosen.kind, [gpu.name for gpu in chosen.gpus])
         shortfall = Shortfall(scene, -(-count // scene.spec.output.views))
         for layout in sorted({layout_of(scene, index) for index in wanted}):

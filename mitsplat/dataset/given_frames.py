@@ -62,7 +62,11 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
             split = split_of(index, output.validation, output.test)
-            plan = replace(frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint={})
+            # What the camera's pose and lens do not say of how it was drawn.
+            moved = {name: drawn for name, drawn in frame.plan.viewpoint.items() if name == "motion"}
+            plan = replace(
+                frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint=moved
+            )
             layout = replace(frame.layout, index=index)
             with storage_errors(out):
                 write_text(out / f"layouts/{index:04d}.json", json.dumps(layout.to_json()))

@@ -16,6 +16,7 @@ from mitsplat.errors import InputError
 from mitsplat.frames.sequence import render_frames
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
+from mitsplat.spec.camera import Motion
 from mitsplat.spec.spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes
@@ -54,6 +55,18 @@ def test_frames_of_ones_own_pass_the_audit_in_every_format(scene: Scene, frames:
     assert [record["layout"] for record in records] == [0, 1, 2]
     poses = [label["world_from_object"] for label in records[2]["labels"]["instances"] if label["class"] == "nut"]
     assert poses[0][0][3] == pytest.approx(0.07)
+
+
+def test_the_motion_of_the_camera_is_stated(scene: Scene, tmp_path: Path) -> None:
+    motion = Motion(exposure=(0.01, 0.01), rotation=(100.0, 100.0))
+    camera = scene.spec.camera.model_copy(update={"motion": motion})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
+    layout = Layout.of_poses(scene, {"nut": [np.eye(4)], "bolt": [np.diag([1, -1, -1, 1])]})
+    frame = next(render_frames(scene, layouts=layout, quality="fast", progress=False))
+    out = write_frames(scene, tmp_path / "out", [frame]).path
+    (record,) = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    assert record["viewpoint"] == {"motion": json.loads(json.dumps(frame.plan.viewpoint["motion"]))}
+    assert list(audit_dataset(out).violations) == []
 
 
 def test_the_audit_still_holds_such_frames_against_their_layouts(scene: Scene, frames: list, tmp_path: Path) -> None:

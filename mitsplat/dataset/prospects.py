@@ -17,6 +17,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
+from mitsplat.dataset.folder import MANIFEST
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding
@@ -189,10 +190,15 @@ def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
 
 
 def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
-    """More images than the disk can hold."""
+    """More images than the disk can hold, beside those that are there."""
     place = (out or Path.cwd()).absolute()
     while not place.is_dir():
         place = place.parent
+    there = 0
+    if out is not None and (out / MANIFEST).is_file():
+        with (out / MANIFEST).open("rb") as lines:
+            there = sum(1 for _ in lines)
+    frames = max(frames - there, 0)
     free, need = shutil.disk_usage(place).free, frames * FRAME_BYTES
     if need > free:
         text = f"output: {frames} images take at least {_amount(need)} ({_amount(free)} are free at {place})"

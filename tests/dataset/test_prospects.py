@@ -13,7 +13,7 @@ from mitsplat.camera import Camera
 from mitsplat.checks.preflight import check_scene
 from mitsplat.dataset import prospects
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.prospects import doubts, refuse, run_faults, sees
+from mitsplat.dataset.prospects import disk_faults, doubts, refuse, run_faults, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames import speed_accuracy as chart
@@ -73,6 +73,14 @@ def test_what_cannot_work_is_refused(name, scene_data, write_scene):
     kind = MissingResourceError if name in ("huge", "disk") else InputError
     with pytest.raises(kind, match=f"^{scene.path}: .*{cause}"):
         refuse(scene, run_faults(scene))
+
+
+@pytest.mark.usefixtures("machine")
+def test_images_that_are_there_need_no_room(tmp_path):
+    (text,) = [fault.text for fault in disk_faults(2_000_000, tmp_path)]
+    assert text == f"output: 2000000 images take at least 15.3 GiB (10.0 GiB are free at {tmp_path})"
+    (tmp_path / "manifest.jsonl").write_text("{}\n" * 1_000_000)
+    assert list(disk_faults(2_000_000, tmp_path)) == []
 
 
 @pytest.mark.usefixtures("machine")

@@ -279,6 +279,8 @@ def not_finite() -> trimesh.Trimesh:
         ({"density": 0.0}, "density must be a number > 0 .* .got 0."),
         ({"density": float("nan")}, "density must be a number > 0 .* .got nan."),
         ({"friction": -0.5}, "friction must be a number of at least 0 .got -0.5."),
+        ({"up": "-y"}, "up must be y or z .got '-y'."),
+        ({"kind": "part"}, "kind must be object or environment .got 'part'."),
     ],
 )
 def test_bad_input_is_refused_in_one_sentence(arguments: dict[str, object], sentence: str) -> None:

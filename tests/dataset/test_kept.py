@@ -123,8 +123,9 @@ def test_a_frame_that_is_made_again_is_alone_in_its_folder(scene: Scene, tmp_pat
         remake_frame(of, 3, out, render=render_boxes, settle=scatter_boxes)
         return contents(out)
 
-    other = replace(scene, spec=scene.spec.model_copy(update={"seed": 8}))
-    make(tmp_path / "again", other)
+    output = scene.spec.output.model_copy(update={"formats": ("yolo", "depth")})
+    make(tmp_path / "again", replace(scene, spec=scene.spec.model_copy(update={"seed": 8, "output": output})))
+    assert list((tmp_path / "again/depth").rglob("*.*"))
     (tmp_path / "again/notes.txt").touch()
     found = make(tmp_path / "again", scene)
     assert found.pop("notes.txt") == b""

@@ -88,12 +88,10 @@ Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
 Range = Annotated[tuple[float, float], AfterValidator(ordered)]
-StopsRange = Annotated[
-    tuple[Annotated[float, Field(ge=-20, le=20)], Annotated[float, Field(ge=-20, le=20)]], AfterValidator(ordered)
-]
-BlurRange = Annotated[
-    tuple[Annotated[float, Field(ge=0, le=1000)], Annotated[float, Field(ge=0, le=1000)]], AfterValidator(ordered)
-]
+Stops = Annotated[float, Field(ge=-20, le=20)]
+StopsRange = Annotated[tuple[Stops, Stops], AfterValidator(ordered)]
+Blur = Annotated[float, Field(ge=0, le=1000)]
+BlurRange = Annotated[tuple[Blur, Blur], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_each_ordered)]
 SizeRange = Annotated[tuple[tuple[Positive, Positive], tuple[Positive, Positive]], AfterValidator(_each_ordered)]

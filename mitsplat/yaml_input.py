@@ -106,7 +106,7 @@ def load_yaml(
     overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
     data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
-        _set(data, keys, _of_numpy(value))
+        _set(data, keys, _as_written(value))
     if newest is not None:  # first: whatever else is wrong with a newer file may be right for newer code
         check_format_version(data, newest, _place(path, _line(tree, (FORMAT_VERSION,)), ()))
     try:
@@ -138,15 +138,8 @@ def _as_written(value: Any) -> Any:
         return _as_written(dict(value))
     if isinstance(value, Mapping):
         return {str(key): _as_written(inner) for key, inner in value.items()}
-    return [_as_written(inner) for inner in value] if isinstance(value, list | tuple) else value
-
-
-def _of_numpy(value: Any) -> Any:
-    """The same with NumPy's numbers and arrays as Python's."""
-    if isinstance(value, Mapping):
-        return {key: _of_numpy(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_of_numpy(inner) for inner in value]
+        return [_as_written(inner) for inner in value]
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 

@@ -146,6 +146,11 @@ def write_scene(tmp_path: Path) -> WriteScene:
     return write
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """What all files of a folder hold, by their paths in it."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def small_scene(folder: Path, assets: Sequence[Asset], objects: list[dict[str, Any]], **output: Any) -> Scene:
     """A scene in ``folder`` of assets that fall before an orbiting camera, in images of 64x48."""
     for asset in assets:

@@ -194,12 +194,11 @@ def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
     place = (out or Path.cwd()).absolute()
     while not place.is_dir():
         place = place.parent
-    there = 0
-    if out is not None and (out / MANIFEST).is_file():
+    free = shutil.disk_usage(place).free
+    if frames * FRAME_BYTES > free and out is not None and (out / MANIFEST).is_file():
         with (out / MANIFEST).open("rb") as lines:
-            there = sum(1 for _ in lines)
-    frames = max(frames - there, 0)
-    free, need = shutil.disk_usage(place).free, frames * FRAME_BYTES
+            frames -= sum(1 for _ in lines)
+    need = frames * FRAME_BYTES
     if need > free:
         text = f"output: {frames} images take at least {_amount(need)} ({_amount(free)} are free at {place})"
         yield Finding("disk", False, text, "lower output.layouts or views, give --frames, or write to another disk")

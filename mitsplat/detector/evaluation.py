@@ -44,7 +44,7 @@ from mitsplat.detector.scores import (
     confuse,
 )
 from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_set
-from mitsplat.detector.training import open_run
+from mitsplat.detector.training import check_folder, open_run
 from mitsplat.errors import InputError
 from mitsplat.files import storage_errors, write_text
 from mitsplat.html import REPORT_FILE
@@ -113,7 +113,9 @@ def evaluate_detector(
         check_masks(found)
     name = f"{root.resolve().name}-{split}"
     out = trained.path / "evaluation" / name if out is None else Path(out)
-    _check_folder(out, root)
+    if root.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"{out}: must not hold the images that are judged, {root}: give another folder")
+    check_folder(out, "an evaluation", _OWN)
     load_libraries()
     check_torchvision()
     network = str(trained.record["settings"]["model"])
@@ -132,17 +134,6 @@ def evaluate_detector(
         "seconds": round(time.perf_counter() - started, 1),
     }
     return write_evaluation(found, detections, out, masks=trained.has_masks, about=about)
-
-
-def _check_folder(out: Path, root: Path) -> None:
-    """Refuse to write among the images that are judged, or among what is no evaluation."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: must be a folder (got a file)")
-    if root.resolve().is_relative_to(out.resolve()):
-        raise InputError(f"{out}: must not hold the images that are judged, {root}: give another folder")
-    if out.is_dir() and not {path.name for path in out.iterdir()} <= _OWN:
-        strange = min(path.name for path in out.iterdir() if path.name not in _OWN)
-        raise InputError(f"{out}: holds something else than an evaluation (got {strange}): give another folder")
 
 
 def detect(

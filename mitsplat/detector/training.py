@@ -18,7 +18,7 @@ import fcntl
 import json
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -167,7 +167,8 @@ def train_detector(
         raise InputError("--real-size is that of photographs: name them by --real")
     if settings.weights is not None and not settings.weights.is_file():
         raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {settings.weights})")
-    _check_folder(out)
+    if not (out / RUN).is_file():
+        check_folder(out, "a run")
     load_libraries()
     network, masks = read_network(settings.model)
     settings = replace(settings, model=network)
@@ -363,13 +364,17 @@ def _digests(described: Any) -> list[str]:
     return [found["digest"] for found in sets]
 
 
-def _check_folder(out: Path) -> None:
+def check_folder(out: Path, kind: str, own: Collection[str] = ()) -> None:
+    """Refuse a file, and a folder that holds something else than files of its ``own``; hidden ones do not count.
+
+    Raises:
+        InputError: Which says what ``kind`` of folder is wanted.
+    """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: must be a folder (got a file)")
-    if not out.is_dir() or (out / RUN).is_file():
-        return
-    if strange := sorted(path.name for path in out.iterdir() if not path.name.startswith(".")):
-        raise InputError(f"{out}: holds something else than a run (got {strange[0]}): give another folder")
+    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    if strange := [name for name in names if not name.startswith(".") and name not in own]:
+        raise InputError(f"{out}: holds something else than {kind} (got {strange[0]}): give another folder")
 
 
 def _check_apart(out: Path, found: LabelledSet) -> None:

@@ -66,10 +66,12 @@ def render_frames(
     if frames is None:
         given = any(isinstance(each, Iterable) for each in (layouts, cameras))
         indices: Iterable[int] = itertools.count() if given else range(scene.num_frames)
+    elif isinstance(frames, Iterable):
+        indices = frames
     else:
-        if not isinstance(frames, Iterable) and whole(frames, "frames") < 0:
-            raise InputError(f"frames must be 0 or more (got {frames})")
-        indices = frames if isinstance(frames, Iterable) else range(whole(frames, "frames"))
+        if (count := whole(frames, "frames")) < 0:
+            raise InputError(f"frames must be 0 or more (got {count})")
+        indices = range(count)
     parts: tuple[object, ...] = (indices, layouts, cameras)
     total = min((len(each) for each in parts if isinstance(each, Sized)), default=None)
     scene = without_end(scene)

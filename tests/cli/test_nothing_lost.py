@@ -17,11 +17,7 @@ from mitsplat.fit.folder import FitFolder
 from mitsplat.lighting import refuse_to_replace
 from mitsplat.video import choose_frames
 from tests.cli.typed import run
-from tests.conftest import WriteScene, box_asset
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+from tests.conftest import WriteScene, box_asset, contents
 
 
 @pytest.mark.parametrize("command", ["bake", "import"])

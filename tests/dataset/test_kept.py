@@ -19,9 +19,8 @@ from mitsplat.engine.ray import Cluster
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.mitsuba_xml import render_xml
 from mitsplat.scene.scene import Scene, make_scene
-from tests.cli.test_nothing_lost import contents
 from tests.cli.typed import run
-from tests.conftest import BOTH, small_scene
+from tests.conftest import BOTH, contents, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
 

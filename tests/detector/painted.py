@@ -109,8 +109,3 @@ def write_coco(root: Path, count: int, *, form: str = "polygons", first: int = 0
     content = {"images": images, "annotations": annotations, "categories": categories}
     (root / "labels.json").write_text(json.dumps(content))
     return root
-
-
-def snapshot(folder: Path) -> dict[str, bytes]:
-    """What all files hold."""
-    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

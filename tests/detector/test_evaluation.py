@@ -15,7 +15,8 @@ from mitsplat.detector.report import worst_images
 from mitsplat.detector.scores import Confusion, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set
 from mitsplat.errors import InputError
-from tests.detector.painted import snapshot, write_coco, write_yolo
+from tests.conftest import contents
+from tests.detector.painted import write_coco, write_yolo
 
 
 def guesses(found: LabelledSet, seed: int = 0) -> list[dict[str, Any]]:
@@ -93,7 +94,7 @@ def test_no_foreign_folder_is_written_to(tmp_path: Path) -> None:
     data = write_yolo(tmp_path / "cell", {"val": 1})
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis/thesis.tex").touch()
-    before = snapshot(tmp_path)
+    before = contents(tmp_path)
     for out, rule in (
         (data, "must not hold the images that are judged"),
         (tmp_path, "must not hold the images that are judged"),
@@ -101,7 +102,7 @@ def test_no_foreign_folder_is_written_to(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=f"{out}: {rule}"):
             evaluate_detector(run, data, out)
-    assert snapshot(tmp_path) == before
+    assert contents(tmp_path) == before
 
 
 def test_boxes_alone_are_judged_as_such(tmp_path: Path) -> None:

@@ -29,7 +29,8 @@ from mitsplat.detector.scores import average_precision
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import RUN, Run, TrainSettings, open_run, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
-from tests.detector.painted import snapshot, write_coco, write_yolo
+from tests.conftest import contents
+from tests.detector.painted import write_coco, write_yolo
 
 TINY = TrainSettings(model="yolo11n-seg", steps=4, batch=4, size=64, share=0.25, device="cpu")
 
@@ -233,12 +234,12 @@ def test_what_is_learnt_from_is_never_in_the_folder_of_the_run(
 ) -> None:
     write_yolo(tmp_path / "run/data", {"train": 2}, mitsplat=True)
     (tmp_path / "run" / RUN).write_text(json.dumps({"settings": {}, "classes": ["a"], "masks": True}))
-    before = snapshot(tmp_path)
+    before = contents(tmp_path)
     (tmp_path / "link").symlink_to(tmp_path / "run/data")
     for dataset in (tmp_path / "run/data", tmp_path / "link"):
         with pytest.raises(InputError, match="run: must not hold what is learnt from"):
             train_detector([dataset], tmp_path / "run", TINY, overwrite=True)
-    assert {path: data for path, data in snapshot(tmp_path).items() if "/link/" not in path} == before
+    assert {path: data for path, data in contents(tmp_path).items() if "/link/" not in path} == before
 
 
 def test_boxes_are_learnt_by_a_network_of_boxes(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
@@ -322,10 +323,10 @@ def test_the_same_command_gives_the_same_weights(data: Path, tmp_path: Path) -> 
     def train(name: str, **changes: Any) -> Run:
         return train_detector([data / "cell"], tmp_path / name, _other(**changes), real=data / "photographs")
 
-    before = snapshot(data)
+    before = contents(data)
     run, other = train("run"), train("other", seed=1)
     again = typed(data, tmp_path)
-    assert snapshot(data) == before
+    assert contents(data) == before
     finished = run.record["finished"]
     assert finished["steps"] == finished["updates_of_weights"] == 4 and finished["real_images_taken"] == 4
     assert {path.name for path in run.path.iterdir()} == {".lock", "args.yaml", "results.csv", "run.json", "weights.pt"}

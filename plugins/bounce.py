@@ -1,11 +1,13 @@
-"""Light that reaches objects from their surroundings: the radiance that the surroundings' splats have captured.
+"""Light that reaches objects from their surroundings: what the surroundings' splats have captured, and visible meshes.
 
 What a ray from an object meets, if it is not another object, shines with the colour that was captured there, which
-holds all earlier bounces. A grid of mean colours is enough, because irradiance blurs it over the hemisphere.
+holds all earlier bounces. A grid of mean colours is enough, because irradiance blurs it over the hemisphere. A visible
+mesh shines with what its diffuse material reflects of the emitters' light that arrives there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,14 +18,26 @@ from scipy.ndimage import distance_transform_edt
 
 from mitsplat.colour import decode_srgb
 from mitsplat.plugins.device import wrapped
+from mitsplat.plugins.emitters import Emitters, receiver
+from mitsplat.plugins.light_tiles import BLOCK
+from mitsplat.plugins.proxies import Proxies
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
 
 CELLS = 80
 """Cells of the grid along its longest side."""
 
-BOUNCE_RAYS = 6
+BOUNCE_RAYS = 7
 """Rays per object pixel, before neighbours are averaged."""
+
+MESH_RAYS = 2
+"""The same per pixel of what is no object, such as a table, at one of four: neighbours on even surfaces count."""
+
+STRIDE = BLOCK * BLOCK
+"""Numbers from one ray of a pixel to its next; those between are of its neighbours."""
+
+LANES = 1 << 20
+"""Rays that are traced at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,48 +91,90 @@ class RadianceGrid:
         return dr.gather(mi.Color3f, self.colours, mi.UInt32((i.z * self.cells.y + i.y) * self.cells.x + i.x), active)
 
 
-def bounced_light(grid: RadianceGrid, proxies: Any, origin: Any, normal: Any, sequence: Any) -> Any:
-    """Irradiance (Color3f) from static proxies over that of display white, at points where there is no noise yet.
+def bounced_light(
+    grid: RadianceGrid | None,
+    proxies: Proxies,
+    emitters: Emitters,
+    white: Any,
+    origin: Any,
+    normal: Any,
+    start: Any,
+    sequence: Callable[[Any], tuple[Any, Any]],
+    rays: int,
+) -> Any:
+    """Irradiance (Color3f) from static proxies and visible meshes over that of display white.
+
+    Points are where there is no noise yet. Every mesh that a ray meets is lit by one ray to an emitter.
 
     Args:
-        grid: Captured colours of the static proxies.
-        proxies: What rays meet.
+        grid: Captured colours of the static proxies; None if there are none.
+        proxies: What rays meet, and what stands in the light of what they meet.
+        emitters: Light on visible meshes.
+        white: Irradiance (Color3f) of display white.
         origin: Where rays start [m].
         normal: Unit normal of the surface.
-        sequence: Gives the point of the unit square for ray ``i`` of every point.
+        start: Number of the first ray of every point.
+        sequence: Two points of the unit square for rays by their numbers.
+        rays: From every point.
     """
-    static, dynamic = proxies.static.scene, proxies.dynamic
     count = dr.width(origin)
-    frame = mi.Frame3f(normal)
-    rounds = dr.opaque(mi.UInt32, BOUNCE_RAYS)
+    together = max(1, min(rays, LANES // count))
+    total = mi.Color3f(dr.zeros(mi.Float, count))
+    for first in range(0, rays, together):
+        some = min(together, rays - first)
+        lane = dr.arange(mi.UInt32, count * some)
+        row = lane // dr.opaque(mi.UInt32, some)
+        number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
+        towards, light = sequence(number)
+        frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
+        ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), frame.to_world(mi.warp.square_to_cosine_hemisphere(towards)))
+        dr.eval(ray, number, light)
+        radiance = _reflected(grid, proxies, emitters, white, ray, light, number)
+        total += mi.Color3f(*[dr.block_sum(channel, some) for channel in radiance])
+        dr.eval(total)
+    return total / rays
 
-    def ray_of(i: Any) -> Any:
-        return mi.Ray3f(origin, frame.to_world(mi.warp.square_to_cosine_hemisphere(sequence(i))))
 
-    def meet(i: Any) -> Any:
-        """Distance [m] to what ray ``i`` of every point meets, infinite for nothing."""
-        return static.ray_intersect_preliminary(ray_of(i)).t
-
-    known = None
-    if proxies.apart and dynamic is not None:
-        known = dr.empty(mi.Float, BOUNCE_RAYS * count)
-        lane = dr.arange(mi.UInt32, count) * BOUNCE_RAYS
-
-        def note(i: Any) -> tuple[Any]:
-            dr.scatter(known, meet(i), lane + i)
-            return (i + 1,)
-
-        dr.while_loop((dr.zeros(mi.UInt32, count),), lambda i: i < rounds, note, label="met")
-        dr.eval(known)
-
-    def body(i: Any, total: Any) -> tuple[Any, Any]:
-        ray = ray_of(i)
-        away = meet(i) if known is None else dr.gather(mi.Float, known, lane + i)
-        met = away < dr.inf
-        if dynamic is not None:
-            ray.maxt = away
-            met &= ~dynamic.scene.ray_test(ray, active=met)
-        return i + 1, total + dr.select(met, grid.at(ray(away), met), 0)
-
-    state = dr.zeros(mi.UInt32, count), dr.zeros(mi.Color3f, count)
-    return dr.while_loop(state, lambda i, _: i < rounds, body, label="bounce")[1] / BOUNCE_RAYS
+def _reflected(
+    grid: RadianceGrid | None, proxies: Proxies, emitters: Emitters, white: Any, ray: Any, light: Any, key: Any
+) -> Any:
+    """Colour (Color3f) of what rays meet; each scene is traced by a kernel of its own, see ``Proxies.apart``."""
+    static, dynamic = proxies.static, proxies.dynamic
+    radiance = mi.Color3f(dr.zeros(mi.Float, dr.width(key)))
+    if static is not None:
+        ray.maxt = static.scene.ray_intersect_preliminary(ray).t
+        dr.eval(ray)
+    met, visible, hit = ray.maxt < dr.inf, None, None
+    if dynamic is not None and proxies.shows_meshes:
+        hit = dynamic.scene.ray_intersect_preliminary(ray)
+        # A sky in a room stands for what walls reflect.
+        visible = hit.is_valid() & dynamic.is_visible(hit) & (hit.t < emitters.sky_reach)
+        met &= ~hit.is_valid()
+        dr.eval(hit, visible)
+    elif dynamic is not None:
+        met &= ~dynamic.scene.ray_test(ray, active=met)
+    if grid is not None:
+        radiance = dr.select(met, grid.at(ray(dr.select(met, ray.maxt, 0)), met), 0)
+    dr.eval(radiance)
+    if visible is None:
+        return radiance
+    lane = dr.compress(visible)
+    if not dr.width(lane):
+        return radiance
+    ray, hit = (dr.gather(type(v), v, lane) for v in (ray, hit))
+    si = hit.compute_surface_interaction(ray)
+    normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+    diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
+    reflectance = dr.select(diffuse, si.bsdf().eval_diffuse_reflectance(si, diffuse), 0)
+    beam = emitters.sample(receiver(si.p, normal), dr.gather(mi.Point2f, light, lane), mi.Bool(True))
+    arriving = reflectance * beam.irradiance / white
+    shadow = si.spawn_ray(beam.direction)
+    shadow.maxt = dr.maximum(beam.reach * (1 - 1e-3), 0)
+    key = dr.gather(mi.UInt32, key, lane)
+    dr.eval(arriving, shadow, key)
+    free = dr.max(arriving) > 0
+    for stopper in proxies.stoppers:
+        free = free & ~stopper.stop(shadow, mi.UInt32(0), key, free)
+        dr.eval(free)
+    dr.scatter(radiance, dr.select(free, arriving, 0), lane)
+    return radiance

@@ -26,12 +26,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.plugins.bounce import RadianceGrid, bounced_light
+from mitsplat.plugins.bounce import BOUNCE_RAYS, MESH_RAYS, RadianceGrid, bounced_light
 from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import Beam, Emitters, receiver
 from mitsplat.plugins.footprint import Points
 from mitsplat.plugins.highlight import Lobe, mirrored_tent
-from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter, packed
+from mitsplat.plugins.light_filter import NOWHERE, Estimate, LightFilter, packed
 from mitsplat.plugins.light_planes import LEAST_ROWS, Planes, between_samples, plane_codes
 from mitsplat.plugins.light_tiles import BLOCK, Tiles, block_order, parity
 from mitsplat.plugins.lit_surface import Surface, VisibleSurfaces
@@ -108,6 +108,7 @@ def light_factor(
     reference: Any,
     sky_reach: float = float("inf"),
     grid: RadianceGrid | None = None,
+    bounce: bool = False,
 ) -> tuple[Any, Any]:
     """Light factor and highlight (Color3f) of every visible point, see the module docstring.
 
@@ -124,7 +125,8 @@ def light_factor(
         point: Where in the scene rays are shared out among emitters by how much light they send [m].
         reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
         sky_reach: What is farther than this from a point does not hide the sky from it [m].
-        grid: Captured colours of the surroundings, for the light that they reflect to objects; None leaves it out.
+        grid: Captured colours of the surroundings; None if there are none.
+        bounce: Whether objects get the light that surroundings and visible meshes reflect to them.
     """
     emitters, view = Emitters(scene, point, sky_reach), visible.view
     everything = visible.at(dr.arange(mi.UInt32, view.width * view.height))
@@ -173,6 +175,10 @@ def light_factor(
         relit = dr.gather(mi.Bool, here.relit, special)
         dr.scatter(unshadowed, dr.sum(open_light / reference) / 3, special, relit)
         dr.eval(unshadowed)
+    bounced = None
+    if bounce and dr.width(special) and (proxies.shows_meshes or (grid is not None and proxies.static is not None)):
+        whole = _Tracer(emitters, proxies, here, index, view, seed, plane and plane.lattice)
+        bounced = whole.bounce(grid, reference)
     if first < accuracy.most:
         pixels = dr.width(needed) if accuracy.metered else 0
         wanted = light_filter.rays_for(points.summed(estimate), accuracy.error, unshadowed, pixels)
@@ -190,7 +196,7 @@ def light_factor(
             lane = stable_order(level, LEVEL_BITS)
             rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.shared(extra, rows)))
             estimate = tracer.trace(rows, estimate, extra, accuracy.most - first, points.turn(rows))
-    lit, base, shine, glare = light_filter.smooth(points.summed(estimate))
+    lit, base, shine, glare, bounced = light_filter.smooth(points.summed(estimate), bounced)
     share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
     light = mi.Color3f(*[v + dr.zeros(mi.Float, dr.width(needed)) for v in light])
     dr.eval(light, share, shine, glare)
@@ -205,11 +211,10 @@ def light_factor(
         relit = part * open_light / reference
         mirrored -= dr.select(own.relit, relit * tent, 0)
         dr.eval(relit, mirrored)
-        if grid is not None and proxies.static is not None:
+        if bounced is not None:
             # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
             # known.
-            lattice, coarse = (plane.lattice, plane.coarse) if plane is not None else (None, None)
-            relit += _Tracer(emitters, proxies, own, pixels, view, seed, lattice).bounce(grid, coarse)
+            relit += dr.gather(mi.Color3f, bounced, special)
         dr.scatter(light, relit, pixels, own.relit)
         highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
         dr.scatter(highlight, mirrored, pixels)
@@ -434,19 +439,30 @@ class _Tracer:
         _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
         return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
 
-    def bounce(self, grid: RadianceGrid, coarse: Any) -> Any:
-        """Irradiance (Color3f) from the surroundings over that of display white, averaged over neighbours."""
-        light_filter = LightFilter(self.surface, self.view, self.pixel, coarse)
-        places = _blockwise(light_filter.place, self.view)
-        here = gathered(self.surface, places)
-        start = self._start(dr.gather(mi.UInt32, self.pixel, places))
-        total = bounced_light(
-            grid, self.proxies, _origin(here), here.normal, lambda i: _sequence(start + i * (BLOCK * BLOCK))
-        )
-        rough = dr.empty(mi.Color3f, dr.width(places))
-        dr.scatter(rough, total, places)
-        dr.eval(rough)
-        return mi.Color3f(*light_filter.average([*rough], dr.full(mi.Float, 1, dr.width(places)), RADIUS))
+    def bounce(self, grid: RadianceGrid | None, white: Any) -> tuple[Any, Any]:
+        """Irradiance (Color3f) from the surroundings over that of display white, and where it is known (Float).
+
+        It is that of relit points, by a few rays: their neighbours must be averaged.
+        """
+        surface, count = self.surface, dr.width(self.pixel)
+        thing, x, y = surface.instance > 0, self.pixel % self.view.width, self.pixel // self.view.width
+        some = (x & 3) == (((y & 1) << 1) | ((y >> 1) & 1))  # one of every four along rows, and along columns
+        if self.lattice is not None:
+            some |= dr.gather(mi.Bool, self.lattice, self.pixel)
+        total, known = mi.Color3f(dr.zeros(mi.Float, count)), dr.zeros(mi.Float, count)
+        for which, rays in ((thing, BOUNCE_RAYS), (~thing & some, MESH_RAYS)):
+            places = dr.compress(surface.relit & which)
+            if not dr.width(places):
+                continue
+            own = gathered(surface, places)
+            start = self._start(dr.gather(mi.UInt32, self.pixel, places))
+            origin, normal = mi.Point3f(_origin(own)), mi.Vector3f(own.normal)
+            dr.eval(start, origin, normal)
+            found = bounced_light(grid, self.proxies, self.emitters, white, origin, normal, start, _two_points, rays)
+            dr.scatter(total, found, places)
+            dr.scatter(known, mi.Float(1), places)
+            dr.eval(total, known)
+        return total, known
 
     def _start(self, pixel: Any) -> Any:
         start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
@@ -483,6 +499,10 @@ def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
 def _sequence(i: Any, recurrence: tuple[int, int] = RECURRENCE) -> Any:
     """Point ``i`` of a low-discrepancy sequence, to 24 bits however large ``i`` is."""
     return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
+
+
+def _two_points(i: Any) -> tuple[Any, Any]:
+    return _sequence(i), _sequence(i, ROBERTS)
 
 
 def _bayer(x: Any, y: Any) -> Any:

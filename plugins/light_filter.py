@@ -145,12 +145,21 @@ class LightFilter:
         allowed = error * dr.power(dr.clip(light, DARKEST, 1) / HALF, 1 - DISPLAY)
         return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
-    def smooth(self, estimate: Estimate) -> tuple[Any, Any, Any, Any]:
-        """The first four sums of the estimate per ray, averaged over neighbours, at the pixels of ``index``."""
+    def smooth(self, estimate: Estimate, beside: tuple[Any, Any] | None = None) -> tuple[Any, Any, Any, Any, Any]:
+        """The first four sums of the estimate per ray, averaged over neighbours, at the pixels of ``index``.
+
+        And so other light ``beside`` it (Color3f), from where it is known (1, else 0); 0 where no neighbour knows it.
+        """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.shine, estimate.glare)]
+        if beside is not None:
+            values += [*beside[0], beside[1]]
         values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
-        return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7]
+        other = None
+        if beside is not None:
+            *colour, share = values[8:]
+            other = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
+        return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], other
 
     def _share(self, estimate: Estimate) -> tuple[Any, Any, Any]:
         """Share of light that arrives, over 3 x 3 pixels, its variance, and of how many pixels' rays that is."""

@@ -78,6 +78,7 @@ class Proxies:
     Attributes:
         static, dynamic: They, as they are met.
         casting: What casts the shadows of what is dynamic: none, one or two scenes.
+        shows_meshes: Whether visible meshes are among the dynamic ones.
         apart: Whether a kernel may trace but one scene, as on CUDA: there Dr.Jit leaves out all but the first one.
     """
 
@@ -92,6 +93,7 @@ class Proxies:
         self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
         casting = [self.dynamic] if casters is None else [_TraceScene.build([], visible), SplatOccluders.build(casters)]
         self.casting: tuple[Stopper, ...] = tuple(stopper for stopper in casting if stopper is not None)
+        self.shows_meshes = bool(visible)
         self.apart = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
 
     @property
@@ -134,6 +136,10 @@ class _TraceScene:
             dr.select(closer, dr.select(proxy, lift, 0), other.lift),
             dr.select(closer, number, other.instance),
         )
+
+    def is_visible(self, hit: Any) -> Any:
+        """Whether what rays have met is a visible shape."""
+        return mi.Bool(True) if self.mesh is None else hit.shape != self.mesh
 
     def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
         """Whether rays are stopped."""

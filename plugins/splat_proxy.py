@@ -303,7 +303,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 point=self.reference,
                 reference=white,
                 sky_reach=self.sky_reach or np.inf,
-                grid=contents.grid if self.bounce else None,
+                grid=contents.grid,
+                bounce=self.bounce,
             )
         if not self.highlight:
             highlight = mi.Color3f(0)

@@ -39,12 +39,16 @@ import mitsuba as mi  # noqa: E402
 from mitsplat.plugins.light_filter import Estimate, LightFilter  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
+SMOOTH = LightFilter.smooth
 
 
-def means(_: LightFilter, estimate: Estimate) -> tuple[Any, Any, Any, Any]:
-    """What a filter of one pixel would give."""
+def means(
+    light_filter: LightFilter, estimate: Estimate, beside: tuple[Any, Any] | None = None
+) -> tuple[Any, Any, Any, Any, Any]:
+    """What a filter of one pixel would give; bounced light is that of a few rays, and always averaged."""
     count = dr.rcp(dr.maximum(estimate.rays, 1))
-    return estimate.lit * count, estimate.base * count, estimate.shine * count, estimate.glare * count
+    other = SMOOTH(light_filter, estimate, beside)[4]
+    return estimate.lit * count, estimate.base * count, estimate.shine * count, estimate.glare * count, other
 
 
 @contextmanager

@@ -485,6 +485,27 @@ def test_red_wall_lights_what_stands_before_it() -> None:
     np.testing.assert_allclose(without, 0.5, atol=0.03)
 
 
+def test_visible_red_wall_lights_what_stands_before_it() -> None:
+    """A mesh sees half of the sky that it hides another half of: it shines with all of its reflectance."""
+    make_integrator()
+    red = [0.8, 0.2, 0.1]
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0]).rotate([0, 1, 0], -90).scale(500),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": red}},
+    }
+    shapes = {
+        "wall": wall,
+        "object": make_splats_shape(floor(0.02), proxy=slab(0.02), instance=1, capture_light="uniform"),
+        "sky": WHITE_SKY,
+    }
+    camera = down_camera(0.2, 32, 6.0)
+    with_bounce, without = (noise_free(shapes, camera, white=np.pi, bounce=b).light for b in (True, False))
+    added = (with_bounce - without).mean(axis=(0, 1))
+    np.testing.assert_allclose(added / red, 0.5, atol=0.03)
+    np.testing.assert_allclose(without, 0.5, atol=0.03)
+
+
 @pytest.mark.parametrize("occluders", ["proxies", "splats"])
 @pytest.mark.parametrize("rays", [8, 80])
 def test_one_scene_in_each_kernel_makes_the_same_light(

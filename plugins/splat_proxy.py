@@ -125,7 +125,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - bounce
        - |bool|
-       - Whether uniformly captured objects also get the light that the surroundings reflect. (Default: true)
+       - Whether uniformly captured objects and plain meshes also get the light that the surroundings and visible
+         meshes reflect. (Default: true)
 
      * - highlight
        - |bool|

@@ -147,8 +147,9 @@ def _reflected(
     met, visible, hit = ray.maxt < dr.inf, None, None
     if dynamic is not None and proxies.shows_meshes:
         hit = dynamic.scene.ray_intersect_preliminary(ray)
-        # A sky in a room stands for what walls reflect.
-        visible = hit.is_valid() & dynamic.is_visible(hit) & (hit.t < emitters.sky_reach)
+        visible = hit.is_valid() & dynamic.is_visible(hit)
+        if emitters.sky is not None:  # in a room it stands for what walls reflect
+            visible &= hit.t < emitters.sky_reach
         met &= ~hit.is_valid()
         dr.eval(hit, visible)
     elif dynamic is not None:

@@ -91,91 +91,95 @@ class RadianceGrid:
         return dr.gather(mi.Color3f, self.colours, mi.UInt32((i.z * self.cells.y + i.y) * self.cells.x + i.x), active)
 
 
-def bounced_light(
-    grid: RadianceGrid | None,
-    proxies: Proxies,
-    emitters: Emitters,
-    white: Any,
-    origin: Any,
-    normal: Any,
-    start: Any,
-    sequence: Callable[[Any], tuple[Any, Any]],
-    rays: int,
-) -> Any:
-    """Irradiance (Color3f) from static proxies and visible meshes over that of display white.
+@dataclass(frozen=True, eq=False)
+class Reflectors:
+    """What reflects light onto things.
 
-    Points are where there is no noise yet. Every mesh that a ray meets is lit by one ray to an emitter.
-
-    Args:
+    Attributes:
         grid: Captured colours of the static proxies; None if there are none.
         proxies: What rays meet, and what stands in the light of what they meet.
         emitters: Light on visible meshes.
         white: Irradiance (Color3f) of display white.
-        origin: Where rays start [m].
-        normal: Unit normal of the surface.
-        start: Number of the first ray of every point.
-        sequence: Two points of the unit square for rays by their numbers.
-        rays: From every point.
     """
-    count = dr.width(origin)
-    together = max(1, min(rays, LANES // count))
-    total = mi.Color3f(dr.zeros(mi.Float, count))
-    for first in range(0, rays, together):
-        some = min(together, rays - first)
-        lane = dr.arange(mi.UInt32, count * some)
-        row = lane // dr.opaque(mi.UInt32, some)
-        number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
-        towards, light = sequence(number)
-        frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
-        ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), frame.to_world(mi.warp.square_to_cosine_hemisphere(towards)))
-        dr.eval(ray, number, light)
-        radiance = _reflected(grid, proxies, emitters, white, ray, light, number)
-        total += mi.Color3f(*[dr.block_sum(channel, some) for channel in radiance])
-        dr.eval(total)
-    return total / rays
 
+    grid: RadianceGrid | None
+    proxies: Proxies
+    emitters: Emitters
+    white: Any
 
-def _reflected(
-    grid: RadianceGrid | None, proxies: Proxies, emitters: Emitters, white: Any, ray: Any, light: Any, key: Any
-) -> Any:
-    """Colour (Color3f) of what rays meet; each scene is traced by a kernel of its own, see ``Proxies.apart``."""
-    static, dynamic = proxies.static, proxies.dynamic
-    radiance = mi.Color3f(dr.zeros(mi.Float, dr.width(key)))
-    if static is not None:
-        ray.maxt = static.scene.ray_intersect_preliminary(ray).t
-        dr.eval(ray)
-    met, visible, hit = ray.maxt < dr.inf, None, None
-    if dynamic is not None and proxies.shows_meshes:
-        hit = dynamic.scene.ray_intersect_preliminary(ray)
-        visible = hit.is_valid() & dynamic.is_visible(hit)
-        if emitters.sky is not None:  # in a room it stands for what walls reflect
-            visible &= hit.t < emitters.sky_reach
-        met &= ~hit.is_valid()
-        dr.eval(hit, visible)
-    elif dynamic is not None:
-        met &= ~dynamic.scene.ray_test(ray, active=met)
-    if grid is not None:
-        radiance = dr.select(met, grid.at(ray(dr.select(met, ray.maxt, 0)), met), 0)
-    dr.eval(radiance)
-    if visible is None:
-        return radiance
-    lane = dr.compress(visible)
-    if not dr.width(lane):
-        return radiance
-    ray, hit = (dr.gather(type(v), v, lane) for v in (ray, hit))
-    si = hit.compute_surface_interaction(ray)
-    normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
-    diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
-    reflectance = dr.select(diffuse, si.bsdf().eval_diffuse_reflectance(si, diffuse), 0)
-    beam = emitters.sample(receiver(si.p, normal), dr.gather(mi.Point2f, light, lane), mi.Bool(True))
-    arriving = reflectance * beam.irradiance / white
-    shadow = si.spawn_ray(beam.direction)
-    shadow.maxt = dr.maximum(beam.reach * (1 - 1e-3), 0)
-    key = dr.gather(mi.UInt32, key, lane)
-    dr.eval(arriving, shadow, key)
-    free = dr.max(arriving) > 0
-    for stopper in proxies.stoppers:
-        free = free & ~stopper.stop(shadow, mi.UInt32(0), key, free)
-        dr.eval(free)
-    dr.scatter(radiance, dr.select(free, arriving, 0), lane)
-    return radiance
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return self.proxies.shows_meshes or (self.grid is not None and self.proxies.static is not None)
+
+    def irradiance(
+        self, origin: Any, normal: Any, start: Any, rays: int, sequence: Callable[[Any], tuple[Any, Any]]
+    ) -> Any:
+        """What they send to points (Color3f) over the irradiance of display white.
+
+        Args:
+            origin: Where rays start [m].
+            normal: Unit normal of the surface.
+            start: Number of the first ray of every point.
+            rays: From every point.
+            sequence: Two points of the unit square for rays by their numbers.
+        """
+        count = dr.width(origin)
+        together = max(1, min(rays, LANES // count))
+        total = mi.Color3f(dr.zeros(mi.Float, count))
+        for first in range(0, rays, together):
+            some = min(together, rays - first)
+            lane = dr.arange(mi.UInt32, count * some)
+            row = lane // dr.opaque(mi.UInt32, some)
+            number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
+            upward, light = sequence(number)
+            frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
+            towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
+            ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
+            dr.eval(ray, number, light)
+            total += mi.Color3f(*[dr.block_sum(c, some) for c in self._colour(ray, number, light)])
+            dr.eval(total)
+        return total / rays
+
+    def _colour(self, ray: Any, key: Any, light: Any) -> Any:
+        """That (Color3f) of what rays meet; each scene is traced by a kernel of its own, see ``Proxies.apart``."""
+        static, dynamic = self.proxies.static, self.proxies.dynamic
+        colour = mi.Color3f(dr.zeros(mi.Float, dr.width(key)))
+        if static is not None:
+            ray.maxt = static.scene.ray_intersect_preliminary(ray).t
+            dr.eval(ray)
+        met, mesh, hit = ray.maxt < dr.inf, None, None
+        if dynamic is not None and self.proxies.shows_meshes:
+            hit = dynamic.scene.ray_intersect_preliminary(ray)
+            mesh = hit.is_valid() & dynamic.is_visible(hit)
+            if self.emitters.sky is not None:  # in a room it stands for what walls reflect
+                mesh &= hit.t < self.emitters.sky_reach
+            met &= ~hit.is_valid()
+            dr.eval(hit, mesh)
+        elif dynamic is not None:
+            met &= ~dynamic.scene.ray_test(ray, active=met)
+        if self.grid is not None:
+            colour = dr.select(met, self.grid.at(ray(dr.select(met, ray.maxt, 0)), met), 0)
+        dr.eval(colour)
+        if mesh is not None:
+            lane = dr.compress(mesh)
+            if dr.width(lane):
+                some = (dr.gather(type(v), v, lane) for v in (ray, hit, key, light))
+                dr.scatter(colour, self._lit_mesh(*some), lane)
+        return colour
+
+    def _lit_mesh(self, ray: Any, hit: Any, key: Any, light: Any) -> Any:
+        """Colour (Color3f) of visible meshes: what they reflect of one ray to an emitter."""
+        si = hit.compute_surface_interaction(ray)
+        normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+        diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
+        reflectance = dr.select(diffuse, si.bsdf().eval_diffuse_reflectance(si, diffuse), 0)
+        beam = self.emitters.sample(receiver(si.p, normal), light, mi.Bool(True))
+        colour, shadow = reflectance * beam.irradiance / self.white, si.spawn_ray(beam.direction)
+        shadow.maxt = beam.reach * (1 - 1e-3)
+        free = dr.max(colour) > 0
+        dr.eval(colour, shadow, key, free)
+        for stopper in self.proxies.stoppers:
+            free = free & ~stopper.stop(shadow, mi.UInt32(0), key, free)
+            dr.eval(free)
+        return dr.select(free, colour, 0)

@@ -26,7 +26,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.plugins.bounce import BOUNCE_RAYS, MESH_RAYS, RadianceGrid, bounced_light
+from mitsplat.plugins.bounce import BOUNCE_RAYS, MESH_RAYS, RadianceGrid, Reflectors
 from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import Beam, Emitters, receiver
 from mitsplat.plugins.footprint import Points
@@ -175,10 +175,10 @@ def light_factor(
         relit = dr.gather(mi.Bool, here.relit, special)
         dr.scatter(unshadowed, dr.sum(open_light / reference) / 3, special, relit)
         dr.eval(unshadowed)
-    bounced = None
-    if bounce and dr.width(special) and (proxies.shows_meshes or (grid is not None and proxies.static is not None)):
+    bounced, reflectors = None, Reflectors(grid, proxies, emitters, reference)
+    if bounce and reflectors.any and dr.width(special):
         whole = _Tracer(emitters, proxies, here, index, view, seed, plane and plane.lattice)
-        bounced = whole.bounce(grid, reference)
+        bounced = whole.bounce(reflectors)
     if first < accuracy.most:
         pixels = dr.width(needed) if accuracy.metered else 0
         wanted = light_filter.rays_for(points.summed(estimate), accuracy.error, unshadowed, pixels)
@@ -439,7 +439,7 @@ class _Tracer:
         _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
         return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
 
-    def bounce(self, grid: RadianceGrid | None, white: Any) -> tuple[Any, Any]:
+    def bounce(self, reflectors: Reflectors) -> tuple[Any, Any]:
         """Irradiance (Color3f) from the surroundings over that of display white, and where it is known (Float).
 
         It is that of relit points, by a few rays: their neighbours must be averaged.
@@ -458,7 +458,7 @@ class _Tracer:
             start = self._start(dr.gather(mi.UInt32, self.pixel, places))
             origin, normal = mi.Point3f(_origin(own)), mi.Vector3f(own.normal)
             dr.eval(start, origin, normal)
-            found = bounced_light(grid, self.proxies, self.emitters, white, origin, normal, start, _two_points, rays)
+            found = reflectors.irradiance(origin, normal, start, rays, _two_points)
             dr.scatter(total, found, places)
             dr.scatter(known, mi.Float(1), places)
             dr.eval(total, known)

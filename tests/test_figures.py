@@ -56,7 +56,7 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
         "detector.experiment-no_shadow-0": run(0.35, list(draws - 0.05)),
         "detector.experiment-traced_shadow-0": run(0.45, list(draws + 0.05)),
         "detector.experiment-images_900-0": run(0.38, list(draws - 0.02)),
-        "detector.experiment-synthetic-0-plan_workshop": run(0.3, list(draws - 0.1)),
+        "detector.experiment-traced_shadow-0-plan_workshop": run(0.3, list(draws - 0.1)),
         "detector.experiment-no_shadow-0-plan_workshop": run(0.2, list(draws - 0.2)),
     }
     *_, earlier, shadow, real, synthetic, _ = experiment_table(results).splitlines()
@@ -75,8 +75,8 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
         results[f"detector.experiment-synthetic-{seed}"]["figures"]["scenes"] = ["of later ones", ""]
     *_, before, _, _, _, _, _ = experiment_table(results).splitlines()
     assert before.endswith("| `synthetic` | 0.020 to 0.040 |")  # although of other scenes
-    *_, shadow, synthetic = experiment_table(results, "workshop").splitlines()
-    assert shadow.endswith("| `synthetic` | 0.100 to 0.100 |") and synthetic.startswith("| `synthetic` | 1 | 0.300 | ")
+    *_, shadow, traced = experiment_table(results, "workshop").splitlines()
+    assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |") and traced.startswith("| `traced_shadow` | 1 | 0.300 |")
 
 
 @pytest.mark.parametrize(

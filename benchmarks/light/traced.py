@@ -2,11 +2,12 @@
 
     python -m benchmarks.light.traced [--scene scenes/workcell.yaml] [--frames 4] [--truth 2048]
 
-The truth is the ratio of ``--truth`` rays per pixel without a filter. Errors are the standard deviation of the light
-factor (mean of RGB) from it, where it matters: at objects that are lit anew, and where a shadow takes 1 % or more of
-the light; but not at pixels beside which another instance begins, where a ray may meet the proxy of what the pixel does
-not show, and no number of rays without a filter is a truth. The PSNR [dB] is that of pictures, except for those pixels,
-as each frame's camera develops them, noise and all, to those of the truth: what highlights miss counts as well.
+The truth is the ratio of ``--truth`` rays per pixel without a filter, and reflected light of many rays. Errors are the
+standard deviation of the light factor (mean of RGB) from it, where it matters: at objects that are lit anew, and where
+a shadow takes 1 % or more of the light; but not at pixels beside which another instance begins, where a ray may meet
+the proxy of what the pixel does not show, and no number of rays without a filter is a truth. The PSNR [dB] is that of
+pictures, except for those pixels, as each frame's camera develops them, noise and all, to those of the truth: what
+highlights miss counts as well.
 Processor seconds of all threads are medians over frames, less those of the same frames without light.
 """
 
@@ -36,10 +37,13 @@ ensure_variant()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from mitsplat.plugins import light  # noqa: E402
 from mitsplat.plugins.light_filter import Estimate, LightFilter  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SMOOTH = LightFilter.smooth
+REFLECTED = 96
+"""Rays of reflected light for every pixel of the truth."""
 
 
 def means(
@@ -154,12 +158,14 @@ def measure(args: argparse.Namespace) -> None:
     rows = [Row(f"{n} rays everywhere", False, _everywhere(pictures, n)) for n in (1, 4, 16, 64)]
     rows += [Row(f"{n} rays everywhere, filtered", True, _everywhere(pictures, n)) for n in (4, 16)]
     rows += [Row(f"error {e}", True, pictures.integrator(shadow_error=e)) for e in (0.1, 0.06, 0.03, 0.015)]
+    rows += [Row("no reflected light", True, pictures.integrator(bounce=False))]
     dark, exact = pictures.integrator(shadow="none"), _everywhere(pictures, args.truth)
     for row in rows:
         row.render(pictures, 0)  # compiles
     pictures.render(0, dark, 1)
     for number in range(args.frames):
-        with filtered(False):
+        many = {"BOUNCE_RAYS": REFLECTED, "MESH_RAYS": REFLECTED}
+        with filtered(False), patch.multiple(light, **many):
             truth, _ = pictures.render(number, exact, 0)
         without = float(np.median([pictures.render(number, dark, 1)[1] for _ in range(3)]))
         for row in rows:

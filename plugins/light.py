@@ -20,7 +20,7 @@ see :mod:`mitsplat.plugins.light_planes`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -31,7 +31,7 @@ from mitsplat.plugins.device import gathered
 from mitsplat.plugins.emitters import Beam, Emitters, receiver
 from mitsplat.plugins.footprint import Points
 from mitsplat.plugins.highlight import Lobe, mirrored_tent
-from mitsplat.plugins.light_filter import NOWHERE, Estimate, LightFilter, packed
+from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter, packed
 from mitsplat.plugins.light_planes import LEAST_ROWS, Planes, between_samples, plane_codes
 from mitsplat.plugins.light_tiles import BLOCK, Tiles, block_order, parity
 from mitsplat.plugins.lit_surface import Surface, VisibleSurfaces
@@ -442,24 +442,36 @@ class _Tracer:
     def bounce(self, reflectors: Reflectors) -> tuple[Any, Any]:
         """Irradiance (Color3f) from the surroundings over that of display white, and where it is known (Float).
 
-        It is that of relit points, by a few rays: their neighbours must be averaged.
+        It is that of relit points, by a few rays: their neighbours must be averaged. On meshes it is of one pixel in
+        each cell of 2 x 2, and a mean over many cells already: what is bright and small, as a wall is near a lamp, few
+        rays meet.
         """
-        surface, count = self.surface, dr.width(self.pixel)
-        thing, x, y = surface.instance > 0, self.pixel % self.view.width, self.pixel // self.view.width
-        some = (x & 3) == (((y & 1) << 1) | ((y >> 1) & 1))  # one of every four along rows, and along columns
+        surface, view = self.surface, self.view
+        cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
+        x, y = self.pixel % view.width, self.pixel // view.width
+        column, row = x >> 1, y >> 1
+        chosen = ((x & 1) == (row & 1)) & ((y & 1) == ((column + row) & 1))  # as often in each row, and in each column
         if self.lattice is not None:
-            some |= dr.gather(mi.Bool, self.lattice, self.pixel)
+            chosen |= dr.gather(mi.Bool, self.lattice, self.pixel)
+        thing, count = surface.instance > 0, dr.width(self.pixel)
         total, known = mi.Color3f(dr.zeros(mi.Float, count)), dr.zeros(mi.Float, count)
-        for which, rays in ((thing, BOUNCE_RAYS), (~thing & some, MESH_RAYS)):
+        for on_mesh, which, rays in ((False, thing, BOUNCE_RAYS), (True, ~thing & chosen, MESH_RAYS)):
             places = dr.compress(surface.relit & which)
             if not dr.width(places):
                 continue
             own = gathered(surface, places)
             start = self._start(dr.gather(mi.UInt32, self.pixel, places))
             origin, normal = mi.Point3f(_origin(own)), mi.Vector3f(own.normal)
-            dr.eval(start, origin, normal)
+            dr.eval(own, start, origin, normal)
             found = reflectors.irradiance(origin, normal, start, rays, _two_points)
-            dr.scatter(total, found, places)
+            if on_mesh:
+                cell, ones = (
+                    dr.gather(mi.UInt32, row * cells.width + column, places),
+                    dr.full(mi.Float, 1, dr.width(places)),
+                )
+                for stride, radius in ((1, RADIUS), (RADIUS, RADIUS // 2)):
+                    found = LightFilter(own, cells, cell, stride=stride).average([*found], ones, radius)
+            dr.scatter(total, mi.Color3f(*found), places)
             dr.scatter(known, mi.Float(1), places)
             dr.eval(total, known)
         return total, known

@@ -100,13 +100,14 @@ class LightFilter:
     the known neighbours that show the same thing.
     """
 
-    def __init__(self, here: Any, view: View, index: Any, coarse: Any = None) -> None:
+    def __init__(self, here: Any, view: View, index: Any, coarse: Any = None, stride: int = 1) -> None:
         """A filter at the pixels ``index`` of an image, which show the points ``here``.
 
-        Where ``coarse`` is true of a pixel of the image, its neighbours are two pixels apart, and it stands for four.
+        Neighbours are ``stride`` pixels apart. Where ``coarse`` is true of a pixel of the image, its neighbours are two
+        pixels apart, and it stands for four.
         """
         self.view, self.index, self.here = view, index, here
-        self.stride = mi.Int32(1)
+        self.stride = mi.Int32(stride)
         if coarse is not None:
             self.stride = dr.select(dr.gather(mi.Bool, coarse, index), mi.Int32(2), 1)
         # What is gathered from neighbours lies together, and holds no more than the pixels in question.

@@ -65,6 +65,14 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def reflected() -> Iterator[None]:
+    """Reflected light of many rays, which on meshes is no mean over cells."""
+    rays = patch.multiple(light, BOUNCE_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
+    with rays, patch.object(LightFilter, "average", lambda _, values, *__: values):
+        yield
+
+
 class Pictures:
     """The frames of a scene's first layout, under integrators of the same splats."""
 
@@ -164,8 +172,7 @@ def measure(args: argparse.Namespace) -> None:
         row.render(pictures, 0)  # compiles
     pictures.render(0, dark, 1)
     for number in range(args.frames):
-        many = {"BOUNCE_RAYS": REFLECTED, "MESH_RAYS": REFLECTED}
-        with filtered(False), patch.multiple(light, **many):
+        with filtered(False), reflected():
             truth, _ = pictures.render(number, exact, 0)
         without = float(np.median([pictures.render(number, dark, 1)[1] for _ in range(3)]))
         for row in rows:

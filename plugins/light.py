@@ -465,12 +465,10 @@ class _Tracer:
             dr.eval(own, start, origin, normal)
             found = reflectors.irradiance(origin, normal, start, rays, _two_points)
             if on_mesh:
-                cell, ones = (
-                    dr.gather(mi.UInt32, row * cells.width + column, places),
-                    dr.full(mi.Float, 1, dr.width(places)),
-                )
-                for stride, radius in ((1, RADIUS), (RADIUS, RADIUS // 2)):
-                    found = LightFilter(own, cells, cell, stride=stride).average([*found], ones, radius)
+                cell = dr.gather(mi.UInt32, row * cells.width + column, places)
+                alike = dr.full(mi.Float, 1, dr.width(places))
+                for stride in (1, RADIUS):
+                    found = LightFilter(own, cells, cell, stride=stride).average([*found], alike, RADIUS)
             dr.scatter(total, mi.Color3f(*found), places)
             dr.scatter(known, mi.Float(1), places)
             dr.eval(total, known)

@@ -76,7 +76,8 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     *_, before, _, _, _, _, _ = experiment_table(results).splitlines()
     assert before.endswith("| `synthetic` | 0.020 to 0.040 |")  # although of other scenes
     *_, shadow, traced = experiment_table(results, "workshop").splitlines()
-    assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |") and traced.startswith("| `traced_shadow` | 1 | 0.300 |")
+    assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")
+    assert traced.startswith("| `traced_shadow` | 1 | 0.300 | ")
 
 
 @pytest.mark.parametrize(

@@ -137,7 +137,9 @@ class Composite(StrictModel):
     occluders: Literal["proxies", "splats"] = Field(
         "proxies", description="What casts traced shadows of objects: their meshes, or the splats of thin, porous ones."
     )
-    bounce: bool = Field(True, description="Whether objects get the light that the environment and visible shapes reflect to them.")
+    bounce: bool = Field(
+        True, description="Whether objects get the light that the environment and visible shapes reflect to them."
+    )
     exposure: Literal["fixed", "auto"] = Field(
         "fixed",
         description="As lights are given, or as a camera that exposes by itself: every picture as bright on average. "

@@ -506,6 +506,31 @@ def test_visible_red_wall_lights_what_stands_before_it() -> None:
     np.testing.assert_allclose(without, 0.5, atol=0.03)
 
 
+def test_light_from_a_bright_spot_leaves_no_patches_on_a_mesh() -> None:
+    """Few rays from a table meet the spot that a lamp makes on the ceiling."""
+    make_integrator()
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    table = mi.ScalarTransform4f().scale(2)
+    ceiling = mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(4)
+    shapes = {
+        "table": {"type": "rectangle", "to_world": table, "bsdf": grey},
+        "ceiling": {"type": "rectangle", "to_world": ceiling, "bsdf": grey},
+        "lamp": {"type": "point", "position": [0.3, 0.2, 0.5], "intensity": {"type": "rgb", "value": 1.0}},
+        "thing": make_splats_shape(nothing(), proxy=slab(0.01, top=-5), instance=1),
+    }
+    camera = down_camera(0.9, 96, 60.0)
+    with_bounce, without = (
+        [
+            render_layers(make_integrator(bounce=bounce), mi.load_dict({"type": "scene", **shapes}), camera, seed=seed)
+            for seed in (1, 2)
+        ]
+        for bounce in (True, False)
+    )
+    reflected = [(lit.light - direct.light).mean(axis=-1) for lit, direct in zip(with_bounce, without, strict=True)]
+    assert np.mean(reflected) > 0.1
+    assert np.std(reflected[0] / reflected[1]) < 0.05
+
+
 @pytest.mark.parametrize("occluders", ["proxies", "splats"])
 @pytest.mark.parametrize("rays", [8, 80])
 def test_one_scene_in_each_kernel_makes_the_same_light(

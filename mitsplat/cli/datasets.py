@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
-from mitsplat.cli.options import DeviceName, JsonLog, command_log, progress_bar, take_device, tell_device
+from mitsplat.cli.options import DeviceName, JsonLog, check_ending, command_log, progress_bar, take_device, tell_device
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.quality import PresetName
 
@@ -266,8 +266,9 @@ def chart(
     from mitsplat.device import find_device
     from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
 
-    if out.suffix.lower() != ".png" or not out.parent.is_dir():
-        raise InputError(f"--out must end in .png, in a folder that exists (got {out})")
+    check_ending(out, ".png")
+    if not out.parent.is_dir():
+        raise InputError(f"--out must be in a folder that exists (got {out})")
     check_tolerance(tolerance)
     chosen = find_device(device)
     tell_device(chosen)
@@ -326,8 +327,7 @@ def report(
     """
     from mitsplat.report.report import write_report
 
-    if out is not None and out.suffix.lower() != ".html":
-        raise InputError(f"--out must end in .html (got {out})")
+    check_ending(out, ".html")
     page, found, warnings = write_report(dataset, out)
     for warning in warnings:
         typer.echo(f"look  {warning}")
@@ -348,8 +348,7 @@ def preview(
     allow_outside: AllowOutside = False,
 ) -> None:
     """Render one frame of SCENE to a picture, with its layers side by side."""
-    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise InputError(f"--out must end in .png or .jpg (got {out})")
+    check_ending(out, ".png", ".jpg", ".jpeg")
     if not out.parent.is_dir():
         raise InputError(f"--out must be in a folder that exists (got {out})")
     from PIL import Image
@@ -423,8 +422,7 @@ def settle(
 
     They are kept, so that rendering finds them settled.
     """
-    if out.suffix.lower() != ".gif":
-        raise InputError(f"--out must end in .gif (got {out})")
+    check_ending(out, ".gif")
     if not out.parent.is_dir():
         raise InputError(f"--out must be in a folder that exists (got {out})")
     from rich.console import Console
@@ -467,8 +465,7 @@ def export(
 
     It can be edited, and rendered by `mitsplat render`.
     """
-    if out.suffix.lower() != ".xml":
-        raise InputError(f"--out must end in .xml (got {out})")
+    check_ending(out, ".xml")
     if out.exists() and not (overwrite and out.is_file()):
         raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
     files = out.with_name(f"{out.stem}_files")

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from mitsplat.cli.options import JsonLog, Seed, command_log
-from mitsplat.errors import InputError
+from mitsplat.cli.options import JsonLog, Seed, check_ending, command_log
 
 if TYPE_CHECKING:
     from mitsplat.detector.likeness import Trait
@@ -154,8 +153,7 @@ def compare(
     from mitsplat.detector.likeness import compare_with_photographs
     from mitsplat.files import write_text
 
-    if out is not None and out.suffix.lower() != ".json":
-        raise InputError(f"--out must end in .json (got {out})")
+    check_ending(out, ".json")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
         found = compare_with_photographs(datasets, photographs, split=split, size=size, most=images, progress=progress)
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")

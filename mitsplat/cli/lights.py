@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from mitsplat.cli.options import check_ending
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,8 +82,7 @@ def lights(
     )
     from mitsplat.lighting.panorama import HDR_SUFFIXES
 
-    if out.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError(f"--out must end in .yaml (got {out})")
+    check_ending(out, ".yaml", ".yml")
     refuse_to_replace(out, images)
     photograph = None
     if camera is None:

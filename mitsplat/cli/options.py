@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from mitsplat.cli import fault
-from mitsplat.errors import exit_status, sentence_of
+from mitsplat.errors import InputError, exit_status, sentence_of
 from mitsplat.progress import Progress
 
 if TYPE_CHECKING:
@@ -39,6 +39,12 @@ JsonLog = Annotated[
     bool,
     typer.Option("--json", help="Log to stderr for machines: an event a line, as a JSON object, instead of a bar."),
 ]
+
+
+def check_ending(out: Path | None, *endings: str) -> None:
+    """Refuse a file that is to be written, and ends otherwise."""
+    if out is not None and out.suffix.lower() not in endings:
+        raise InputError(f"--out must end in {' or '.join(endings)} (got {out})")
 
 
 def take_device(name: str) -> None:

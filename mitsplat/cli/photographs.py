@@ -21,6 +21,7 @@ from mitsplat.cli.options import (
     Name,
     Seed,
     ShDegree,
+    check_ending,
     progress_bar,
     stage_bar,
     take_device,
@@ -263,8 +264,7 @@ def board(
 
     In photographs of what stands on or beside it, it gives `mitsplat capture` metres and the vertical.
     """
-    if out.suffix.lower() != ".pdf":
-        raise InputError(f"--out must end in .pdf (got {out})")
+    check_ending(out, ".pdf")
     _board(squares, square).write_pdf(out, paper)
     typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
 

@@ -545,4 +545,4 @@ class TestInput:
 
     def test_lines_are_yaml(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert run("lights", "dark.exr", "-o", "out.txt") == 2
-        assert capsys.readouterr().err == "mitsplat: --out must end in .yaml (got out.txt)\n"
+        assert capsys.readouterr().err == "mitsplat: --out must end in .yaml or .yml (got out.txt)\n"

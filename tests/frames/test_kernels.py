@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 
 from mitsplat.camera import Camera
 from mitsplat.frames.frame import Renderer
@@ -17,6 +19,12 @@ from mitsplat.scene.scene import load_scene, plan_frame
 from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightDraw
 
 WORKCELL = Path(__file__).parents[2] / "scenes/workcell.yaml"
+
+
+@pytest.fixture(autouse=True)
+def nothing_of_earlier_tests() -> None:
+    """Kernels serve all kinds of emitters and materials that live: if some went meanwhile, others would be compiled."""
+    gc.collect()
 
 
 def strewn(index: int, assets: list[int]) -> Layout:

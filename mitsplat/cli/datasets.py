@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
-from mitsplat.cli.options import DeviceName, JsonLog, check_ending, command_log, progress_bar, take_device, tell_device
+from mitsplat.cli.options import (
+    DeviceName,
+    JsonLog,
+    check_ending,
+    check_place,
+    command_log,
+    progress_bar,
+    take_device,
+    tell_device,
+)
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.quality import PresetName
 
@@ -266,9 +275,7 @@ def chart(
     from mitsplat.device import find_device
     from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
 
-    check_ending(out, ".png")
-    if not out.parent.is_dir():
-        raise InputError(f"--out must be in a folder that exists (got {out})")
+    check_place(out, ".png")
     check_tolerance(tolerance)
     chosen = find_device(device)
     tell_device(chosen)
@@ -348,9 +355,7 @@ def preview(
     allow_outside: AllowOutside = False,
 ) -> None:
     """Render one frame of SCENE to a picture, with its layers side by side."""
-    check_ending(out, ".png", ".jpg", ".jpeg")
-    if not out.parent.is_dir():
-        raise InputError(f"--out must be in a folder that exists (got {out})")
+    check_place(out, ".png", ".jpg", ".jpeg")
     from PIL import Image
 
     from mitsplat.dataset.prospects import count_faults, image_faults, layout_faults, refuse
@@ -422,9 +427,7 @@ def settle(
 
     They are kept, so that rendering finds them settled.
     """
-    check_ending(out, ".gif")
-    if not out.parent.is_dir():
-        raise InputError(f"--out must be in a folder that exists (got {out})")
+    check_place(out, ".gif")
     from rich.console import Console
 
     from mitsplat.dataset.prospects import count_faults, layout_faults, refuse

@@ -47,6 +47,13 @@ def check_ending(out: Path | None, *endings: str) -> None:
         raise InputError(f"--out must end in {' or '.join(endings)} (got {out})")
 
 
+def check_place(out: Path, *endings: str) -> None:
+    """Refuse such a file, and one in a folder that is not there."""
+    check_ending(out, *endings)
+    if not out.parent.is_dir():
+        raise InputError(f"--out must be in a folder that exists (got {out})")
+
+
 def take_device(name: str) -> None:
     """Compute on a device from now on; why ``auto`` chose it is said."""
     from mitsplat.device import use_device  # most commands do without

@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from mitsplat.colour import decode_srgb
 from mitsplat.plugins.device import wrapped
 from mitsplat.plugins.emitters import Emitters, receiver
-from mitsplat.plugins.light_tiles import BLOCK
+from mitsplat.plugins.light_tiles import STRIDE
 from mitsplat.plugins.proxies import Proxies
 from mitsplat.spherical_harmonics import SH_C0
 from mitsplat.splats import Splats
@@ -32,9 +32,6 @@ BOUNCE_RAYS = 7
 
 MESH_RAYS = 2
 """The same per pixel of what is no object, such as a table, at one of four: neighbours on even surfaces count."""
-
-STRIDE = BLOCK * BLOCK
-"""Numbers from one ray of a pixel to its next; those between are of its neighbours."""
 
 LANES = 1 << 20
 """Rays that are traced at once."""

@@ -33,7 +33,7 @@ from mitsplat.plugins.footprint import Points
 from mitsplat.plugins.highlight import Lobe, mirrored_tent
 from mitsplat.plugins.light_filter import NOWHERE, RADIUS, Estimate, LightFilter, packed
 from mitsplat.plugins.light_planes import LEAST_ROWS, Planes, between_samples, plane_codes
-from mitsplat.plugins.light_tiles import BLOCK, Tiles, block_order, parity
+from mitsplat.plugins.light_tiles import BLOCK, STRIDE, Tiles, block_order, parity
 from mitsplat.plugins.lit_surface import Surface, VisibleSurfaces
 from mitsplat.plugins.proxies import Proxies, Stopper
 from mitsplat.plugins.rays import View
@@ -347,7 +347,7 @@ class _Tracer:
         pixel, inside = block_order(self.view)
         origin, normal, offset, instance = _packed_rays(self.surface, captured, pixel)
         x, y = pixel % width, pixel // width
-        number = self._start(pixel) + parity(x // BLOCK, y // BLOCK) * (BLOCK * BLOCK)
+        number = self._start(pixel) + parity(x // BLOCK, y // BLOCK) * STRIDE
         active = inside & (offset > 0)
         beam = self.emitters.sample(receiver(origin, normal), _sequence(number, ROBERTS), active)
         ray, key = _shadow_ray(origin, beam, offset), pixel * RECURRENCE[0] + number
@@ -385,7 +385,7 @@ class _Tracer:
         pixel = dr.gather(mi.UInt32, self.pixel, places)
         begin, step = turn
         done = mi.UInt32(dr.gather(mi.Float, before.rays, places))
-        start, step = self._start(pixel) + (begin + done * step) * (BLOCK * BLOCK), step * (BLOCK * BLOCK)
+        start, step = self._start(pixel) + (begin + done * step) * STRIDE, step * STRIDE
         si = receiver(surface.position, surface.normal)
         origin = _origin(surface)
         lobe = Lobe.of(surface)
@@ -466,9 +466,8 @@ class _Tracer:
             found = reflectors.irradiance(origin, normal, start, rays, _two_points)
             if on_mesh:
                 cell = dr.gather(mi.UInt32, row * cells.width + column, places)
-                alike = dr.full(mi.Float, 1, dr.width(places))
                 for stride in (1, RADIUS):
-                    found = LightFilter(own, cells, cell, stride=stride).average([*found], alike, RADIUS)
+                    found = LightFilter(own, cells, cell, stride=stride).average([*found])
             dr.scatter(total, mi.Color3f(*found), places)
             dr.scatter(known, mi.Float(1), places)
             dr.eval(total, known)

@@ -174,9 +174,9 @@ class LightFilter:
         dr.eval(share, variance)
         return share, variance, shared
 
-    def average(self, values: list[Any], rays: Any, radius: int) -> list[Any]:
-        """Averages at the pixels of ``index`` of values there, weighted by rays."""
-        return self._average(values, rays, radius)[0]
+    def average(self, values: list[Any]) -> list[Any]:
+        """Averages at the pixels of ``index`` of values there, all of as many rays."""
+        return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), RADIUS)[0]
 
     def _average(
         self, values: list[Any], rays: Any, radius: int, share: tuple[Any, Any] | None = None

@@ -14,6 +14,9 @@ BLOCK = 8
 """Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
 that follows averages a stratified set."""
 
+STRIDE = BLOCK * BLOCK
+"""Numbers from one ray of a pixel to its next in that sequence; those between are of its neighbours."""
+
 TOGETHER = 3
 """Rays that are stopped in a quarter of a tile from which on this is a shadow, and no chance."""
 

@@ -69,7 +69,7 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
 def reflected() -> Iterator[None]:
     """Reflected light of many rays, which on meshes is no mean over cells."""
     rays = patch.multiple(light, BOUNCE_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
-    with rays, patch.object(LightFilter, "average", lambda _, values, *__: values):
+    with rays, patch.object(LightFilter, "average", lambda _, values: values):
         yield
 
 

@@ -111,7 +111,7 @@ def project_cloud(
         quality: Cut-offs and SH degree.
     """
     projector = Projector(_only(cloud), numbers["table"], View.of_numbers(kind, numbers), quality, at_camera=False)
-    return projector.every_record(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))
+    return projector.every_record(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))[:4]
 
 
 def gather_gradients(
@@ -189,9 +189,9 @@ def _image(
     view = View.of_numbers(kind, numbers)
     lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
     # The way back needs them again, and to undo a lens's distortion takes longer than a march.
-    slopes = Lanes(lists, view).centre_slopes()
+    slopes = Lanes(lists, view).centre_slopes() if view.distortion else None
     image = march(lists, view, quality, slopes=slopes)
-    return image.rgb, image.alpha, slopes if view.distortion else None
+    return image.rgb, image.alpha, slopes
 
 
 @recorded

@@ -45,7 +45,7 @@ from mitsplat.plugins.project import CloudSet, Placement
 from mitsplat.plugins.rays import TILE_HEIGHT, TILE_PIXELS, View
 from mitsplat.plugins.shares import add_to_tally, new_tally, settle_instances, winner_of_tally
 from mitsplat.plugins.tiles import TileLists, bin_gaussians, in_ray_order, some_tiles
-from mitsplat.plugins.walk import Lanes, Pixel, Rays, largest, walk
+from mitsplat.plugins.walk import Lanes, Pixel, Rays, largest, rows_together, walk
 from mitsplat.quality import Order, Quality
 
 
@@ -274,7 +274,7 @@ def _march(
     estimated: bool = False,
 ) -> tuple[Image, Any]:
     """The image of one march, and the places of the tiles whose errors are ``estimated`` above the tolerance."""
-    lanes = Lanes(lists, view, TILE_HEIGHT if order == "tile" else 1)
+    lanes = Lanes(lists, view, len(slopes[0]) if slopes else rows_together(order))
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
         for p, m in zip(lanes.pixel, lanes.inside, strict=True)
@@ -288,7 +288,7 @@ def _march(
 
     def right(pixels: list[Pixel]) -> Any:
         """Whether lanes have no ray whose error exceeds the tolerance."""
-        return ~_too_wrong([pixel[ERROR] for pixel in pixels], tolerance)
+        return ~_too_wrong([pixel[ERROR] for pixel in pixels], lanes.inside, tolerance)
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
         """States of the rays at a place in the pixels, and estimates of their errors."""
@@ -301,7 +301,7 @@ def _march(
     found, errors = pixels(0.5, 0.5, labelled=True)
     image, unsure = _collect(found, lanes, lists.instance, quality)
     if gives_up and several:
-        unsure &= lanes.image(mi.Bool, [~_too_wrong(errors, tolerance)] * lanes.rows)
+        unsure &= lanes.image(mi.Bool, [~_too_wrong(errors, lanes.inside, tolerance)] * lanes.rows)
     if quality.order != "tile":
         image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
     if estimated:
@@ -322,7 +322,7 @@ def _march(
         *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
         if estimated:
             image.error = lanes.image(mi.Float, errors)
-    return image, _tiles_of(_too_wrong(errors, tolerance), lanes) if estimated else None
+    return image, _tiles_of(_too_wrong(errors, lanes.inside, tolerance), lanes) if estimated else None
 
 
 def _late(quality: Quality) -> Late:
@@ -335,9 +335,9 @@ def _without_extra(pixels: list[Pixel], late: Late) -> list[Pixel]:
     return [pixel[: len(pixel) - _EXTRA[late]] for pixel in pixels]
 
 
-def _too_wrong(errors: list[Any], tolerance: Any) -> Any:
-    """Whether the estimate for any of a lane's rays exceeds the tolerance."""
-    return largest(errors) > tolerance
+def _too_wrong(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
+    """Whether the estimate for any of a lane's rays inside of the image exceeds the tolerance."""
+    return largest([dr.select(m, error, 0.0) for error, m in zip(errors, inside, strict=True)]) > tolerance
 
 
 def _tiles_of(flags: Any, lanes: Lanes) -> Any:
@@ -353,7 +353,7 @@ def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | Non
 
     Arguments are those of :func:`march`, but nothing is repaired: the order is per tile or per ray.
     """
-    lanes = Lanes(lists, view, TILE_HEIGHT if quality.order == "tile" else 1, apart=True)
+    lanes = Lanes(lists, view, rows_together(quality.order), apart=True)
     places = zip(lanes.pixel, lanes.inside, strict=True)
     far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
     if quality.order == "ray":

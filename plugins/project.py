@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,8 +24,9 @@ from mitsplat.plugins.gaussian import (
     project_gaussian,
     rotation_axes,
 )
-from mitsplat.plugins.rays import View
+from mitsplat.plugins.rays import Kind, View
 from mitsplat.quality import KERNELS, Quality
+from mitsplat.recorded import Table, recorded
 
 PLACEMENT = 32
 """Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
@@ -259,18 +260,37 @@ class Projector:
         dr.eval(records, tile_box, least)
         return records, near_rows, least, tile_box
 
-    def every_record(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
-        """View records of all Gaussians, seen or not, least depths, boxes of tiles, and which are seen.
+    def every_record(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """View records of all Gaussians, least depths, boxes of tiles, which are seen, and which of those at the plane.
 
-        Boxes of those that are not seen are empty. Unlike after :meth:`cull`, no width depends on the view.
+        Boxes of those that are not seen are empty, and records of those that reach the camera's plane do not say so.
+        Unlike after :meth:`cull`, no width depends on the view.
         """
         g = self._load(owner, local)
-        response, opacity, _, _, visible, box, least = self._bounds(g)
+        response, opacity, _, near, visible, box, least = self._bounds(g)
         x0, x1, y0, y1 = self._tile_box(box)
         visible = dr.detach(visible) & (x1 > x0) & (y1 > y0)
         record = self._record(g, response, opacity, local)
         boxes = _rows(mi.UInt32, [x0, x1, y0, dr.select(visible, y1, y0)])
-        return _rows(mi.Float, record), dr.detach(least), boxes, visible
+        return _rows(mi.Float, record), dr.detach(least), boxes, visible, visible & dr.detach(near)
+
+    def records_at_once(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
+        """As :meth:`records`, of all Gaussians, those out of view with empty boxes: by recorded kernels.
+
+        There is no gradient to them.
+        """
+        clouds, view = self.clouds, self.view
+        shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
+        arrays = Table(clouds.geometry), Table(clouds.scales), Table(clouds.sh), Table(self.table)
+        records, least, boxes, near = _every_record(view.kind, view.numbers, shape, arrays, owner, local)
+        index = dr.compress(near)
+        if not dr.width(index):
+            return records, None, least, boxes
+        rows = self._near_rows(index, owner, local)
+        dr.scatter(records, mi.Float(dr.arange(mi.UInt32, dr.width(index))), index * RECORD)
+        dr.scatter(records, mi.Float(-1.0), index * RECORD + 2)
+        dr.eval(records)
+        return records, rows, least, boxes
 
     def _record(self, g: dict[str, Any], response: Response, opacity: Any, local: Any) -> list[Any]:
         """View records of Gaussians that do not reach the camera's plane."""
@@ -323,6 +343,24 @@ class Projector:
         # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
         direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
         return evaluate_sh(direction, coefficient, bands)
+
+
+@recorded
+def _every_record(
+    kind: Kind,
+    numbers: Mapping[str, Any],
+    shape: tuple[Quality, bool, bool, int, int],
+    arrays: tuple[Any, Any, Any, Any],
+    owner: Any,
+    local: Any,
+) -> tuple[Any, Any, Any, Any]:
+    """Records, least depths, boxes of tiles, and which reach the camera's plane, see ``Projector.every_record``."""
+    quality, at_camera, changed, sh_count, sh_stride = shape
+    geometry, scales, sh, table = arrays
+    clouds = CloudSet((dr.width(owner),), (0,), geometry, scales, sh, sh_count, sh_stride)
+    projector = Projector(clouds, table, View.of_numbers(kind, numbers), quality, at_camera, changed)
+    records, least, boxes, _, near = projector.every_record(owner, local)
+    return records, least, boxes, near
 
 
 def _rows(kind: Any, columns: list[Any]) -> Any:

@@ -19,6 +19,9 @@ of each ray, and bound depths less tightly. A packet of eight lanes carries all 
 
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 
+Kind = tuple[int, int, int, Lens, int, int]
+"""Width, height, number of coefficients of distortion, lens, samples and zoom of a view."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -78,9 +81,9 @@ class View:
         return self.width, self.height, *lens, self.near, self.samples, self.world_from_camera.tobytes()
 
     @property
-    def kind(self) -> tuple[int, int, int, Lens, int]:
-        """What decides the kernels of a view beside its :attr:`numbers`: size, coefficients, lens, samples."""
-        return self.width, self.height, len(self.distortion), self.lens, self.samples
+    def kind(self) -> Kind:
+        """What decides the kernels of a view beside its :attr:`numbers`."""
+        return self.width, self.height, len(self.distortion), self.lens, self.samples, self.zoom
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -88,12 +91,12 @@ class View:
         return self._opaque | ({"extent": self._extent} if self.distortion else {})
 
     @classmethod
-    def of_numbers(cls, kind: tuple[int, int, int, Lens, int], numbers: Mapping[str, Any]) -> View:
+    def of_numbers(cls, kind: Kind, numbers: Mapping[str, Any]) -> View:
         """A view that knows no more than its kind and :attr:`numbers`: enough to project, not to march."""
         view = object.__new__(cls)
-        width, height, coefficients, lens, samples = kind
+        width, height, coefficients, lens, samples, zoom = kind
         known = {"width": width, "height": height, "distortion": (0.0,) * coefficients, "lens": lens}
-        known |= {"samples": samples, "_opaque": dict(numbers)}
+        known |= {"samples": samples, "zoom": zoom, "_opaque": dict(numbers)}
         if coefficients:
             known["_extent"] = numbers["extent"]
         view.__dict__.update(known)

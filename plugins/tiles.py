@@ -26,6 +26,9 @@ from mitsplat.plugins.sorting import numpy_sorts_slowly, sort_in_threads, stable
 from mitsplat.plugins.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
 from mitsplat.quality import Quality
 
+AT_ONCE = 1 << 22
+"""Most Gaussians that are projected without a look at which of them are seen: records take 84 bytes each."""
+
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
@@ -97,15 +100,17 @@ def bin_gaussians(
     changed = any(placement.appearance is not None for placement in placements)
     source = Projector(clouds, table, view, quality, at_camera, changed)
 
-    visible, near = source.cull(owner, local, chosen)
-    index = dr.compress(visible)
-    if dr.width(index) == 0:
-        return _empty(view, chosen)
-    owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
-    near = dr.gather(mi.Bool, near, index)
-    dr.eval(owner, local, near)
-
-    records, near_rows, least, box = source.records(owner, local, near)
+    if chosen is None and not (fitted or for_gradients) and _at_once(dr.width(local)):
+        records, near_rows, least, box = source.records_at_once(owner, local)
+    else:
+        visible, near = source.cull(owner, local, chosen)
+        index = dr.compress(visible)
+        if dr.width(index) == 0:
+            return _empty(view, chosen)
+        owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
+        near = dr.gather(mi.Bool, near, index)
+        dr.eval(owner, local, near)
+        records, near_rows, least, box = source.records(owner, local, near)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
     if fitted:
@@ -116,6 +121,14 @@ def bin_gaussians(
     return bin_records(
         records, near_rows, least, box, view, quality, only, chosen, groups=groups, for_gradients=for_gradients
     )
+
+
+def _at_once(count: int) -> bool:
+    """Whether so many Gaussians are projected before it is known which are seen.
+
+    On a GPU, that takes less time than to wait for the number of them, and to trace what comes then.
+    """
+    return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and count <= AT_ONCE
 
 
 def bin_records(

@@ -36,6 +36,15 @@ ray, its record, of which colour and instance may be asked for, and the depth of
 nothing."""
 
 
+def rows_together(order: Order) -> int:
+    """Pixels of a column that a lane carries, of a walk in an order.
+
+    A GPU has lanes enough for a ray each, and those of a warp fetch the same record then: the march takes 0.6 of the
+    time that it does with four. The orders of rays hold too many numbers for more than one.
+    """
+    return TILE_HEIGHT if order == "tile" and dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 1
+
+
 class Lanes:
     """Which pixels each lane carries: one or more of a column of a tile.
 

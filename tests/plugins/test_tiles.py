@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mitsplat.camera import Camera
-from mitsplat.quality import PRESETS
-from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.quality import PRESETS, PresetName
+from mitsplat.render.layers import Layers, ensure_variant, make_sensor, render_splats
 from tests.render.test_render import make_splats
 
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=50, fov_x=50)
@@ -85,3 +85,27 @@ def test_lists_are_the_same_however_they_are_sorted(monkeypatch: pytest.MonkeyPa
         found.append(render_splats(splats, CAMERA.resized(64, 48), quality=PRESETS["fast"]))
     for name in ("rgb", "alpha", "depth", "instance"):
         np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced", "exact"])
+@pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}])
+def test_pictures_are_the_same_however_they_are_projected_and_walked(
+    preset: PresetName, lens: dict[str, tuple[float, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All Gaussians at once and a ray a lane, as on a GPU, or what is seen and four: also near the camera's plane."""
+    from mitsplat.plugins import march, tiles
+    from mitsplat.plugins.walk import rows_together
+
+    quality = replace(PRESETS[preset], kernel="mip")
+    cameras = [replace(Camera.look_at((0, 0, z), (0, 0, z + 1), up=(0, -1, 0), width=75, height=50, fov_x=50), **lens)
+               for z in (-2, 0, 9)]  # before the splats, among them, and with all of them behind it  # fmt: skip
+    found: list[list[Layers]] = []
+    for at_once, rows in ((False, 4), (True, 1)):
+        monkeypatch.setattr(tiles, "_at_once", lambda _, at_once=at_once: at_once)
+        monkeypatch.setattr(march, "rows_together", lambda order, rows=rows: rows if order == "tile" else 1)
+        found.append([render_splats(make_splats(700, 8), camera, quality=quality) for camera in cameras])
+    for seen, again in zip(*found, strict=True):
+        for name in ("rgb", "alpha", "depth", "instance"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(again, name))
+    assert [bool(layers.alpha.any()) for layers in found[0]] == [True, True, False]
+    assert rows_together("ray") == rows_together("window") == 1

@@ -213,10 +213,11 @@ class Camera:
         local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
         depth = local[:, 2]
         front = depth > 0
-        pixels = np.full((len(local), 2), np.nan)
         if not self.distortion:
-            pixels[front] = local[front, :2] / depth[front, None] * (self.fx, self.fy) + (self.cx, self.cy)
-        elif self.lens == "fisheye":
+            depths = np.where(front, depth, np.nan)
+            return local[:, :2] / depths[:, None] * (self.fx, self.fy) + (self.cx, self.cy), depth
+        pixels = np.full((len(local), 2), np.nan)
+        if self.lens == "fisheye":
             slopes = local[front, :2] / depth[front, None]
             slope = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
             shown = slopes * fisheye_radius(np.arctan(slope), self.distortion) / slope

@@ -108,11 +108,10 @@ class Sight:
         count = len(self.ids)
         pixel, depth = camera.project(self._points)
         front = depth > camera.near
-        size = np.array([camera.width, camera.height])
         with np.errstate(invalid="ignore"):
-            inside = front & ((pixel >= 0) & (pixel < size)).all(axis=1)
+            inside = front & _within(pixel, camera, 0)
             # Distortion of what is far outside is anybody's guess, and the raster needs an end.
-            raster = front & ((pixel >= -size) & (pixel < 2 * size)).all(axis=1)
+            raster = front & _within(pixel, camera, 1)
         owner = self._owner
         total = np.bincount(owner, minlength=count)
         within = np.bincount(owner[inside], minlength=count) / np.maximum(total, 1)
@@ -153,16 +152,17 @@ class Sight:
         cell = np.floor(pixel[raster] / edge).astype(np.int64)
         key = (cell[:, 0] + across // 3 + 1) + across * (cell[:, 1] + int(camera.height / edge) + 2)
         among = np.flatnonzero(raster)
-        order = np.lexsort((depth[among], key))
+        key = key * count + self._owner[among]
+        order = np.argsort(key)
         among, key, cell = among[order], key[order], cell[order]
-        first = np.ones(len(key), dtype=bool)
-        first[1:] = key[1:] != key[:-1]
         # Of each cell, every object in it once, by its nearest point there, and the one in front of the others.
-        _, place = np.unique(key * count + self._owner[among], return_index=True)
-        nearest, owner = among[place], self._owner[among[place]]
-        centre = (cell[place] + 0.5) * edge
-        shown = ((centre >= 0) & (centre < (camera.width, camera.height))).all(axis=1)
-        seen = first[place] & shown
+        first = _starts(key)
+        nearest = among[_least(depth[among], first)]
+        centre = np.asarray((cell[first] + 0.5) * edge, dtype=np.float64)
+        owner, shown = self._owner[nearest], _within(centre, camera, 0)
+        seen = np.zeros(len(first), dtype=bool)
+        seen[_least(depth[nearest], _starts(key[first] // count))] = True
+        seen &= shown
         triangles = _between(self._triangles, camera.centre, self._points)
         if len(triangles):
             seen[seen] = ~_crossed(camera.centre, self._points[nearest[seen]], triangles)
@@ -248,6 +248,29 @@ def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
     return np.asarray((point - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
 
 
+def _within(pixel: Float64Array, camera: Camera, margin: int) -> BoolArray:
+    """Whether pixels (N, 2) lie in a camera's image, with a margin of so many images on each side."""
+    x, y, width, height = pixel[:, 0], pixel[:, 1], camera.width, camera.height
+    inside = (x >= -margin * width) & (x < (1 + margin) * width)
+    return np.asarray(inside & (y >= -margin * height) & (y < (1 + margin) * height))
+
+
+def _starts(key: Int64Array) -> Int64Array:
+    """Where runs of equal numbers begin."""
+    begins = np.ones(len(key), dtype=bool)
+    begins[1:] = key[1:] != key[:-1]
+    return np.flatnonzero(begins)
+
+
+def _least(values: Float64Array, starts: Int64Array) -> Int64Array:
+    """Place of the first of the least values of each run, of those that begin at ``starts``."""
+    if not len(starts):
+        return starts
+    least = np.minimum.reduceat(values, starts)
+    equals = np.flatnonzero(values == np.repeat(least, np.diff(starts, append=len(values))))
+    return equals[np.searchsorted(equals, starts)]
+
+
 def _among(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
     return np.asarray((values >= bounds[0]) & (values <= bounds[1]))
 
@@ -257,13 +280,15 @@ class _Triangles:
 
     def __init__(self, triangles: Float64Array) -> None:
         self._triangles = triangles
-        a, b, c = (triangles[:, corner] for corner in range(3))
-        self._low, self._high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        by_axis = np.ascontiguousarray(np.moveaxis(triangles, 2, 0))
+        self._boxes = list(zip(by_axis.min(axis=2), by_axis.max(axis=2), strict=True))
 
     def distance(self, point: Float64Array, reach: float) -> float:
         """Distance of a point to the nearest triangle, or ``reach`` if none is as near."""
-        apart = np.maximum(self._low - point, point - self._high)
-        near = self._triangles[(apart < reach).all(axis=1)]
+        touched = np.ones(len(self._triangles), dtype=bool)
+        for (low, high), place in zip(self._boxes, point, strict=True):
+            touched &= (low < place + reach) & (high > place - reach)
+        near = self._triangles[touched]
         if not len(near):
             return reach
         closest = trimesh.triangles.closest_point(near, np.broadcast_to(point, (len(near), 3)))

@@ -104,8 +104,9 @@ def test_pictures_are_the_same_however_they_are_projected_and_walked(
         monkeypatch.setattr(tiles, "_at_once", lambda _, at_once=at_once: at_once)
         monkeypatch.setattr(march, "rows_together", lambda order, rows=rows: rows if order == "tile" else 1)
         found.append([render_splats(make_splats(700, 8), camera, quality=quality) for camera in cameras])
+    rounding = 5e-6 if mi.variant() == "cuda_ad_rgb" else 0.0  # there a branch rounds by how many rays are in it
     for seen, again in zip(*found, strict=True):
         for name in ("rgb", "alpha", "depth", "instance"):
-            np.testing.assert_array_equal(getattr(seen, name), getattr(again, name))
+            np.testing.assert_allclose(getattr(seen, name), getattr(again, name), rtol=rounding, atol=0, err_msg=name)
     assert [bool(layers.alpha.any()) for layers in found[0]] == [True, True, False]
     assert rows_together("ray") == rows_together("window") == 1

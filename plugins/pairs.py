@@ -79,7 +79,7 @@ def pair_records(
         raise CrowdedError
     order = dr.arange(mi.UInt32, count)
     x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
-    row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0))
+    row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0), view.tiles_y)
     if rows == 0:
         return None
     # Rows first: one lane finds the spans of one record, and then one lane fills one span.
@@ -102,7 +102,7 @@ def pair_records(
 
     dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
     dr.eval(owner, first_tile, length)
-    pair_of, pairs = prefix_ranges(length)
+    pair_of, pairs = prefix_ranges(length, view.tiles_x)
     if pairs == 0:
         return None
     record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
@@ -138,20 +138,21 @@ def pair_records(
     return Pairs(key, number, first)
 
 
-def prefix_ranges(sizes: Any) -> tuple[Any, int]:
-    """Where each of consecutive ranges begins, and their whole size.
+def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
+    """Where each of consecutive ranges begins, none of them larger than ``most``, and their whole size.
 
     Raises:
         CrowdedError: If that is more than :data:`PAIRS_MAX`.
     """
-    begin, last = dr.prefix_sum(sizes), dr.width(sizes) - 1
-    whole = dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last)
-    # Added as floats too, because a sum of integers would wrap.
-    rough = mi.UInt32(dr.minimum(dr.sum(mi.Float(sizes)), 2.0 * PAIRS_MAX))
-    total, rough = np.array(dr.concat([whole, rough])).tolist()
-    if rough > PAIRS_MAX:
+    count = dr.width(sizes)
+    begin, last = dr.prefix_sum(sizes), count - 1
+    sums = [dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last)]
+    if count * most > 0xFFFFFFFF:  # added as floats too, because a sum of integers may wrap
+        sums.append(mi.UInt32(dr.minimum(dr.sum(mi.Float(sizes)), 2.0 * PAIRS_MAX)))
+    totals: list[int] = np.array(dr.concat(sums)).tolist()
+    if max(totals) > PAIRS_MAX:
         raise CrowdedError
-    return begin, total
+    return begin, totals[0]
 
 
 def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any], tuple[Any, Any]]:

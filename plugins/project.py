@@ -283,9 +283,9 @@ class Projector:
         shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
         arrays = Table(clouds.geometry), Table(clouds.scales), Table(clouds.sh), Table(self.table)
         records, least, boxes, near = _every_record(view.kind, view.numbers, shape, arrays, owner, local)
-        index = dr.compress(near)
-        if not dr.width(index):
+        if not dr.any(near):
             return records, None, least, boxes
+        index = dr.compress(near)
         rows = self._near_rows(index, owner, local)
         dr.scatter(records, mi.Float(dr.arange(mi.UInt32, dr.width(index))), index * RECORD)
         dr.scatter(records, mi.Float(-1.0), index * RECORD + 2)

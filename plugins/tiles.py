@@ -260,7 +260,7 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
     """Places in ``tiles``, levels, and records (from ``shift`` on) of the entries of some tiles; None if none."""
     start = dr.gather(mi.UInt32, lists.start, tiles)
     length = dr.gather(mi.UInt32, lists.stop, tiles) - start
-    begin, size = prefix_ranges(length)
+    begin, size = prefix_ranges(length, lists.pairs)
     if size == 0:
         return None
     number, place, level = (dr.empty(mi.UInt32, size) for _ in range(3))

@@ -1,7 +1,7 @@
 """From clouds of Gaussians to depth-sorted lists per image tile, all on the device.
 
 1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
-2. *Project* what is left to view records (one kernel), see :mod:`mitsplat.plugins.project`.
+2. *Project* what is left to view records (one kernel), see :mod:`mitsplat.plugins.project`. On a GPU, both at once.
 3. *Pair* each with the tiles that its cut-off ellipse really meets, see
    :mod:`mitsplat.plugins.pairs`.
 4. *Sort* the pairs by tile and by depth there, see :mod:`mitsplat.plugins.tile_depths`.

@@ -16,6 +16,7 @@ from mitsplat.cli.options import (
     DeviceName,
     JsonLog,
     check_ending,
+    check_new,
     check_place,
     command_log,
     progress_bar,
@@ -469,8 +470,7 @@ def export(
     It can be edited, and rendered by `mitsplat render`.
     """
     check_ending(out, ".xml")
-    if out.exists() and not (overwrite and out.is_file()):
-        raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
+    check_new(out, overwrite=overwrite)
     files = out.with_name(f"{out.stem}_files")
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
         raise InputError(f"--out needs a new folder beside it, {files} (it is there); --overwrite replaces its files")

@@ -54,6 +54,12 @@ def check_place(out: Path, *endings: str) -> None:
         raise InputError(f"--out must be in a folder that exists (got {out})")
 
 
+def check_new(out: Path, *, overwrite: bool) -> None:
+    """Refuse a file that is there, unless it is to be replaced."""
+    if out.exists() and not (overwrite and out.is_file()):
+        raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
+
+
 def take_device(name: str) -> None:
     """Compute on a device from now on; why ``auto`` chose it is said."""
     from mitsplat.device import use_device  # most commands do without

@@ -22,6 +22,7 @@ from mitsplat.cli.options import (
     Seed,
     ShDegree,
     check_ending,
+    check_new,
     progress_bar,
     stage_bar,
     take_device,
@@ -259,12 +260,14 @@ def board(
     paper: Annotated[Literal["a4", "letter", "a3"], typer.Option(help="Paper, in landscape.")] = "a4",
     squares: Annotated[str, typer.Option(metavar="CxR", help="Squares across and down.")] = "7x5",
     square: Annotated[float, typer.Option(help="Edge of a square [m].")] = 0.035,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,
 ) -> None:
     """Write a ChArUco board to print.
 
     In photographs of what stands on or beside it, it gives `mitsplat capture` metres and the vertical.
     """
     check_ending(out, ".pdf")
+    check_new(out, overwrite=overwrite)
     _board(squares, square).write_pdf(out, paper)
     typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
 

@@ -87,6 +87,15 @@ def test_lights_replace_their_own_alone(tmp_path: Path) -> None:
     refuse_to_replace(out, [])
 
 
+def test_a_sheet_is_replaced_where_that_is_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = tmp_path / "board.pdf"
+    sheet.write_text("an invoice")
+    assert run("board", "-o", sheet) == 2 and sheet.read_text() == "an invoice"
+    said = f"mitsplat: --out must be a new file (got {sheet}); --overwrite replaces one\n"
+    assert capsys.readouterr().err == said
+    assert run("board", "-o", sheet, "--overwrite") == 0 and sheet.read_bytes().startswith(b"%PDF")
+
+
 def test_an_export_is_edited_and_so_kept(
     tmp_path: Path,
     scene_data: dict[str, Any],

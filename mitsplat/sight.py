@@ -36,20 +36,41 @@ _TESTS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
+class Framed:
+    """Where the surfaces of a layout are in a camera's image.
+
+    Attributes:
+        camera: The camera.
+        x, y, depth: Pixel positions [px] and depths [m] of the points, shape (P,).
+        raster: Which of them are in front of the camera and in the image or as far around it as it is wide and high.
+        edge: Size of the raster's cells [px].
+        within: Share of the surface of each object that is in front of the camera and in the image, shape (N,).
+        extents: Longer side of the box around each in the image [px], 0 for what is not in it, shape (N,).
+        lost: Share of each that is not in the raster, shape (N,).
+    """
+
+    camera: Camera
+    x: Float64Array
+    y: Float64Array
+    depth: Float64Array
+    raster: BoolArray
+    edge: float
+    within: Float64Array
+    extents: Float64Array
+    lost: Float64Array
+
+
+@dataclass(frozen=True, eq=False)
 class Prospect:
     """What a view is predicted to show of the labelled objects of a layout.
 
     Attributes:
-        within: Share of the surface of each that is in front of the camera and in the image, shape (N,).
-        extents: Longer side of the box around each in the image [px], 0 for what is not in it, shape (N,).
         visible: Visible fraction of each, 0 for what is not in the image, shape (N,).
         beyond: Share of each beyond the image's border, shape (N,).
         in_view: How many have enough visible pixels to be labelled.
         hidden, cut: How many of those are partly hidden, and cut by the border, as the scene file says.
     """
 
-    within: Float64Array
-    extents: Float64Array
     visible: Float64Array
     beyond: Float64Array
     in_view: int
@@ -101,67 +122,64 @@ class Sight:
         """The surfaces of a layout, kept for its next frame."""
         return Sight(scene, layout)
 
-    def prospect(
-        self, camera: Camera, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
-    ) -> Prospect:
-        """What a camera would show of the labelled objects."""
-        count = len(self.ids)
+    def framed(self, camera: Camera) -> Framed:
+        """Where the surfaces are in a camera's image."""
+        count, owner = len(self.ids), self._owner
         pixel, depth = camera.project(self._points)
+        x, y = np.ascontiguousarray(pixel.T)
         front = depth > camera.near
         with np.errstate(invalid="ignore"):
-            inside = front & _within(pixel, camera, 0)
+            inside = front & _within(x, y, camera, 0)
             # Distortion of what is far outside is anybody's guess, and the raster needs an end.
-            raster = front & _within(pixel, camera, 1)
-        owner = self._owner
-        total = np.bincount(owner, minlength=count)
-        within = np.bincount(owner[inside], minlength=count) / np.maximum(total, 1)
+            raster = front & _within(x, y, camera, 1)
+        total = np.maximum(np.bincount(owner, minlength=count), 1)
+        within = np.bincount(owner[inside], minlength=count) / total
+        lost = 1.0 - np.bincount(owner[raster], minlength=count) / total
+        extents, edge = np.zeros(count), 1.0
         if count:  # points are in the order of their owners, who all have some
             starts = np.searchsorted(owner, np.arange(count))
-            low, high = (
-                pick.reduceat(np.where(inside[:, None], pixel, none), starts)
-                for pick, none in ((np.minimum, np.inf), (np.maximum, -np.inf))
-            )
-            extents = np.where(within > 0, (high - low).max(axis=1), 0.0)
-        else:
-            extents = np.zeros(0)
-        edge = (
-            _CELL * self._spacing * max(camera.fx, camera.fy) / max(float(np.median(depth[front])), camera.near)
-            if front.any()
-            else 1.0
-        )
-        visible, beyond, seen = self._cells(camera, pixel, depth, raster, edge)
-        lost = 1.0 - np.bincount(owner[raster], minlength=count) / np.maximum(total, 1)
-        beyond = lost + (1.0 - lost) * beyond
-        shown = self.labelled & (seen * edge**2 >= min_pixels)
+            for at in (x, y):
+                high = np.maximum.reduceat(np.where(inside, at, -np.inf), starts)
+                low = np.minimum.reduceat(np.where(inside, at, np.inf), starts)
+                extents = np.maximum(extents, np.where(within > 0, high - low, 0.0))
+        if front.any():
+            away = max(float(np.median(depth[front])), camera.near)
+            edge = _CELL * self._spacing * max(camera.fx, camera.fy) / away
+        return Framed(camera, x, y, depth, raster, edge, within, extents, lost)
+
+    def prospect(
+        self, framed: Framed, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
+    ) -> Prospect:
+        """What a view would show of the labelled objects."""
+        visible, beyond, seen = self._cells(framed)
+        beyond = framed.lost + (1.0 - framed.lost) * beyond
+        shown = self.labelled & (seen * framed.edge**2 >= min_pixels)
         hidden = cut = 0
         if occlusion is not None:
             hidden = int(np.count_nonzero(shown & _among(visible, occlusion.visible)))
         if truncation is not None:
             cut = int(np.count_nonzero(shown & _among(beyond, truncation.cut)))
         ours = self.labelled
-        return Prospect(
-            within[ours], extents[ours], visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut
-        )
+        return Prospect(visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut)
 
-    def _cells(
-        self, camera: Camera, pixel: Float64Array, depth: Float64Array, raster: BoolArray, edge: float
-    ) -> tuple[Float64Array, Float64Array, Int64Array]:
-        """Visible fraction and share beyond the border of each object, by cells of ``edge`` pixels; its seen cells."""
-        count = len(self.ids)
+    def _cells(self, framed: Framed) -> tuple[Float64Array, Float64Array, Int64Array]:
+        """Visible fraction and share beyond the border of each object, by cells of the raster; its seen cells."""
+        count, camera, edge, depth = len(self.ids), framed.camera, framed.edge, framed.depth
         across = int(3 * camera.width / edge) + 2
-        cell = np.floor(pixel[raster] / edge).astype(np.int64)
-        key = (cell[:, 0] + across // 3 + 1) + across * (cell[:, 1] + int(camera.height / edge) + 2)
-        among = np.flatnonzero(raster)
-        key = key * count + self._owner[among]
+        left, above = across // 3 + 1, int(camera.height / edge) + 2
+        among = np.flatnonzero(framed.raster)
+        column, row = (np.floor(at[among] / edge).astype(np.int64) for at in (framed.x, framed.y))
+        key = (column + left + across * (row + above)) * count + self._owner[among]
         order = np.argsort(key)
-        among, key, cell = among[order], key[order], cell[order]
+        among, key = among[order], key[order]
         # Of each cell, every object in it once, by its nearest point there, and the one in front of the others.
         first = _starts(key)
         nearest = among[_least(depth[among], first)]
-        centre = np.asarray((cell[first] + 0.5) * edge, dtype=np.float64)
-        owner, shown = self._owner[nearest], _within(centre, camera, 0)
+        owner, cell = self._owner[nearest], key[first] // count
         seen = np.zeros(len(first), dtype=bool)
-        seen[_least(depth[nearest], _starts(key[first] // count))] = True
+        seen[_least(depth[nearest], _starts(cell))] = True
+        x, y = (np.asarray((n + 0.5) * edge, np.float64) for n in (cell % across - left, cell // across - above))
+        shown = _within(x, y, camera, 0)
         seen &= shown
         triangles = _between(self._triangles, camera.centre, self._points)
         if len(triangles):
@@ -172,18 +190,19 @@ class Sight:
         beyond = np.where(everywhere > 0, 1.0 - own / np.maximum(everywhere, 1), 1.0)
         return seen_cells / np.maximum(own, 1), beyond, seen_cells
 
-    def faults(self, camera: Camera, prospect: Prospect, rules: Acceptance) -> list[tuple[float, str]]:
+    def faults(self, framed: Framed, rules: Acceptance) -> list[tuple[float, str]]:
         """By what share a view misses each rule that it does not fulfil, and the same in words."""
-        found = []
-        share = float(np.mean(prospect.within >= 0.5)) if len(prospect.within) else 1.0
+        found, eye = [], framed.camera.centre
+        within, extents = framed.within[self.labelled], framed.extents[self.labelled]
+        share = float(np.mean(within >= 0.5)) if len(within) else 1.0
         if share < rules.in_view:
             text = f"shows {share:.3g} of the labelled objects, where in_view is {rules.in_view:g}"
             found.append((1 - share / rules.in_view, text))
-        least = float(prospect.extents[prospect.within > 0].min(initial=np.inf))
+        least = float(extents[within > 0].min(initial=np.inf))
         if least < rules.extent:
             found.append((1 - least / rules.extent, f"shows one of {least:.3g} px, where extent is {rules.extent:g}"))
-        away = self._clearance(camera.centre, rules.clearance)
-        if name := self._around(camera.centre):
+        away = self._clearance(eye, rules.clearance)
+        if name := self._around(eye):
             found.append((1.0, f"is from inside of {name}"))
         elif away < rules.clearance:
             text = f"is {away:.3g} m from what is nearest, where clearance is {rules.clearance:g}"
@@ -248,9 +267,9 @@ def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
     return np.asarray((point - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
 
 
-def _within(pixel: Float64Array, camera: Camera, margin: int) -> BoolArray:
-    """Whether pixels (N, 2) lie in a camera's image, with a margin of so many images on each side."""
-    x, y, width, height = pixel[:, 0], pixel[:, 1], camera.width, camera.height
+def _within(x: Float64Array, y: Float64Array, camera: Camera, margin: int) -> BoolArray:
+    """Whether pixels lie in a camera's image, with a margin of so many images on each side."""
+    width, height = camera.width, camera.height
     inside = (x >= -margin * width) & (x < (1 + margin) * width)
     return np.asarray(inside & (y >= -margin * height) & (y < (1 + margin) * height))
 

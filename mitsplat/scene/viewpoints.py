@@ -240,10 +240,11 @@ def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout
             rng = _stream(spec.seed, "camera border", index, number)
             pose, target = _look_past(here.take(pose)[0], pose, target, rng)
         eye, held = here.take(pose)
-        prospect = sight.prospect(eye, camera.occlusion, camera.truncation, spec.labels.min_pixels)
-        if camera.accept is not None and (faults := sight.faults(eye, prospect, camera.accept)):
+        framed = sight.framed(eye)
+        if camera.accept is not None and (faults := sight.faults(framed, camera.accept)):
             refused.append((sum(miss for miss, _ in faults), " and ".join(text for _, text in faults)))
             continue
+        prospect = sight.prospect(framed, camera.occlusion, camera.truncation, spec.labels.min_pixels)
         drawn = {"target": target.tolist(), "object": seen, "attempt": number, "predicted": prospect.to_json()} | held
         cost = _cost(prospect, [0.0 if share is None else share.share for share in shares], fate)
         if best is None or cost < best[0]:
@@ -267,7 +268,7 @@ def _cost(prospect: Prospect, shares: list[float], fate: Float64Array) -> float:
     wanted = np.floor(np.multiply(shares, prospect.in_view) + fate)
     counts = np.array([prospect.hidden, prospect.cut])
     if not prospect.in_view:
-        return float(len(prospect.within))  # an image without objects has no share of them, whatever is asked for
+        return float(len(prospect.visible))  # an image without objects has no share of them, whatever is asked for
     return float(np.abs(counts - wanted).sum()) / prospect.in_view
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import importlib.metadata
 import json
@@ -13,7 +14,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -148,22 +149,30 @@ def open_folder(
 def open_finished(out: Path) -> Iterator[Manifest]:
     """The manifest of a dataset that nobody is writing, and nobody is as long as this is open.
 
+    It may lie where nothing can be written, as on a share of another machine: then nobody writes it from here.
+
     Raises:
         InputError: If it is in use or damaged.
     """
+    path = out / LOCK
+    lock: IO[str] | None
+    kind = fcntl.LOCK_EX
     try:
-        lock = (out / LOCK).open("a+")
+        lock = path.open("a+")
     except OSError as error:
-        raise InputError(f"{out / LOCK}: {error.strerror}") from error
-    with lock:
-        _take_lock(out, lock)
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise InputError(f"{path}: {error.strerror}") from error
+        lock, kind = path.open() if path.is_file() else None, fcntl.LOCK_SH
+    with lock or nullcontext():
+        if lock is not None:
+            _take_lock(out, lock, kind)
         yield Manifest(out / MANIFEST)
 
 
-def _take_lock(out: Path, lock: IO[str]) -> None:
+def _take_lock(out: Path, lock: IO[str], kind: int = fcntl.LOCK_EX) -> None:
     """Refuse a folder that another run writes; the lock goes with the open file, however its process ends."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(lock, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.seek(0)
         raise InputError(f"{out} is being written by another run ({lock.read()})") from None

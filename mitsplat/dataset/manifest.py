@@ -213,7 +213,16 @@ def _append(path: Path, line: bytes) -> int:
 
 
 def cut_torn_line(path: Path) -> None:
-    """Make the file if it is missing; cut it behind its last newline if a line was not written to its end."""
+    """Make the file if it is missing; cut it behind its last newline if a line was not written to its end.
+
+    One that is whole need not be writable.
+    """
+    if path.is_file():
+        with path.open("rb") as whole:
+            end = whole.seek(0, os.SEEK_END)
+            whole.seek(max(0, end - 1))
+            if whole.read() in (b"", b"\n"):
+                return
     with path.open("a+b") as file:
         end = file.tell()
         tail = b""

@@ -1,5 +1,7 @@
 """Datasets made in parts, on Ray or by other numbers of workers are the same bytes as one run's."""
 
+import errno
+import fcntl
 import json
 import os
 import pickle
@@ -85,6 +87,29 @@ class TestSameBytes:
         assert write(scene, shards[1], shard=Shard(2, 2)).rendered == 1
         merge_shards(shards, tmp_path / "out")
         assert contents(tmp_path / "out") == whole
+
+    @pytest.mark.parametrize("locked", [True, False])
+    def test_of_shards_that_cannot_be_written_to(self, scene, tmp_path, whole, locked, monkeypatch):
+        """As on a share of another machine; a run that still writes one from elsewhere holds its lock."""
+        shards = write_shards(scene, tmp_path / "shards", 2)
+        if not locked:
+            for shard in shards:
+                (shard / ".lock").unlink()
+        opened = Path.open
+
+        def read_only(path, mode="r", *args, **kwargs):
+            if tmp_path / "shards" in path.parents and set(mode) & set("wax+"):
+                raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+            return opened(path, mode, *args, **kwargs)
+
+        monkeypatch.setattr(Path, "open", read_only)
+        merge_shards(shards, tmp_path / "out")
+        assert contents(tmp_path / "out") == whole
+        if locked:
+            with opened(shards[0] / ".lock", "a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                with pytest.raises(InputError, match="is being written by another run"):
+                    merge_shards(shards, tmp_path / "again")
 
 
 @pytest.mark.parametrize(("total", "views", "count"), [(12, 4, 3), (12, 4, 5), (10, 4, 3), (1, 4, 1), (1000, 1, 7)])

@@ -107,7 +107,8 @@ class Sight:
         ]
         self.centres: Float64Array = np.array(middles, dtype=np.float64).reshape(-1, 3)
         self._points: Float64Array = np.concatenate(placed) if placed else np.zeros((0, 3))
-        self._owner = np.repeat(np.arange(len(instances)), [len(points) for points in placed])
+        self._counts = np.array([len(points) for points in placed], dtype=np.int64)
+        self._owner = np.repeat(np.arange(len(instances)), self._counts)
         self._spacing = _spacing(scene) * float(np.sqrt(step))
         self._radii = np.array([np.linalg.norm(mesh.extents) / 2 for mesh in meshes])
         shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
@@ -132,12 +133,10 @@ class Sight:
             inside = front & _within(x, y, camera, 0)
             # Distortion of what is far outside is anybody's guess, and the raster needs an end.
             raster = front & _within(x, y, camera, 1)
-        total = np.maximum(np.bincount(owner, minlength=count), 1)
-        within = np.bincount(owner[inside], minlength=count) / total
-        lost = 1.0 - np.bincount(owner[raster], minlength=count) / total
+        within, in_raster = (np.bincount(owner[some], minlength=count) / self._counts for some in (inside, raster))
         extents, edge = np.zeros(count), 1.0
         if count:  # points are in the order of their owners, who all have some
-            starts = np.searchsorted(owner, np.arange(count))
+            starts = np.cumsum(self._counts) - self._counts
             for at in (x, y):
                 high = np.maximum.reduceat(np.where(inside, at, -np.inf), starts)
                 low = np.minimum.reduceat(np.where(inside, at, np.inf), starts)
@@ -145,7 +144,7 @@ class Sight:
         if front.any():
             away = max(float(np.median(depth[front])), camera.near)
             edge = _CELL * self._spacing * max(camera.fx, camera.fy) / away
-        return Framed(camera, x, y, depth, raster, edge, within, extents, lost)
+        return Framed(camera, x, y, depth, raster, edge, within, extents, 1.0 - in_raster)
 
     def prospect(
         self, framed: Framed, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
@@ -184,9 +183,8 @@ class Sight:
         triangles = _between(self._triangles, camera.centre, self._points)
         if len(triangles):
             seen[seen] = ~_crossed(camera.centre, self._points[nearest[seen]], triangles)
-        seen_cells, own, everywhere = (
-            np.bincount(owner[some], minlength=count) for some in (seen, shown, np.ones(len(owner), dtype=bool))
-        )
+        seen_cells, own = (np.bincount(owner[some], minlength=count) for some in (seen, shown))
+        everywhere = np.bincount(owner, minlength=count)
         beyond = np.where(everywhere > 0, 1.0 - own / np.maximum(everywhere, 1), 1.0)
         return seen_cells / np.maximum(own, 1), beyond, seen_cells
 

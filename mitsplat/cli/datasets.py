@@ -469,8 +469,7 @@ def export(
 
     It can be edited, and rendered by `mitsplat render`.
     """
-    check_ending(out, ".xml")
-    check_new(out, overwrite=overwrite)
+    check_new(out, ".xml", overwrite=overwrite)
     files = out.with_name(f"{out.stem}_files")
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
         raise InputError(f"--out needs a new folder beside it, {files} (it is there); --overwrite replaces its files")

@@ -54,8 +54,9 @@ def check_place(out: Path, *endings: str) -> None:
         raise InputError(f"--out must be in a folder that exists (got {out})")
 
 
-def check_new(out: Path, *, overwrite: bool) -> None:
-    """Refuse a file that is there, unless it is to be replaced."""
+def check_new(out: Path, *endings: str, overwrite: bool) -> None:
+    """Refuse such a file, and one that is there, unless it is to be replaced."""
+    check_ending(out, *endings)
     if out.exists() and not (overwrite and out.is_file()):
         raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
 

@@ -21,7 +21,6 @@ from mitsplat.cli.options import (
     Name,
     Seed,
     ShDegree,
-    check_ending,
     check_new,
     progress_bar,
     stage_bar,
@@ -266,8 +265,7 @@ def board(
 
     In photographs of what stands on or beside it, it gives `mitsplat capture` metres and the vertical.
     """
-    check_ending(out, ".pdf")
-    check_new(out, overwrite=overwrite)
+    check_new(out, ".pdf", overwrite=overwrite)
     _board(squares, square).write_pdf(out, paper)
     typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
 

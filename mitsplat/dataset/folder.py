@@ -154,25 +154,27 @@ def open_finished(out: Path) -> Iterator[Manifest]:
     Raises:
         InputError: If it is in use or damaged.
     """
-    path = out / LOCK
-    lock: IO[str] | None
-    kind = fcntl.LOCK_EX
+    path, lock = out / LOCK, None
     try:
         lock = path.open("a+")
     except OSError as error:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
             raise InputError(f"{path}: {error.strerror}") from error
-        lock, kind = path.open() if path.is_file() else None, fcntl.LOCK_SH
+        if path.is_file():
+            lock = path.open()
     with lock or nullcontext():
         if lock is not None:
-            _take_lock(out, lock, kind)
+            _take_lock(out, lock)
         yield Manifest(out / MANIFEST)
 
 
-def _take_lock(out: Path, lock: IO[str], kind: int = fcntl.LOCK_EX) -> None:
-    """Refuse a folder that another run writes; the lock goes with the open file, however its process ends."""
+def _take_lock(out: Path, lock: IO[str]) -> None:
+    """Refuse a folder that another run writes; the lock goes with the open file, however its process ends.
+
+    Who cannot write there shares it with others that read.
+    """
     try:
-        fcntl.flock(lock, kind | fcntl.LOCK_NB)
+        fcntl.flock(lock, (fcntl.LOCK_EX if lock.writable() else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.seek(0)
         raise InputError(f"{out} is being written by another run ({lock.read()})") from None

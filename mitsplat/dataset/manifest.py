@@ -217,18 +217,16 @@ def cut_torn_line(path: Path) -> None:
 
     One that is whole need not be writable.
     """
-    if path.is_file():
-        with path.open("rb") as whole:
-            end = whole.seek(0, os.SEEK_END)
-            whole.seek(max(0, end - 1))
-            if whole.read() in (b"", b"\n"):
-                return
-    with path.open("a+b") as file:
-        end = file.tell()
+    if not path.exists():
+        path.touch()
+    with path.open("rb") as file:
+        size = end = file.seek(0, os.SEEK_END)
         tail = b""
         while end and b"\n" not in tail:
             start = max(0, end - 65536)
             file.seek(start)
             tail = file.read(end - start)
             end = start
-        file.truncate(end + tail.rfind(b"\n") + 1)
+    whole = end + tail.rfind(b"\n") + 1
+    if whole < size:
+        os.truncate(path, whole)

@@ -24,8 +24,6 @@ import gzip
 import io
 import re
 import struct
-import subprocess
-import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -36,9 +34,11 @@ import numpy.typing as npt
 from scipy.special import expit, logit
 
 from mitsplat.arrays import Float32Array
+from mitsplat.child_process import run_bounded
 from mitsplat.errors import InputError
 from mitsplat.files import storage_errors, write_file
 from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.splat_converter import convert_splats
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
@@ -65,22 +65,6 @@ _SPZ_HEADER = struct.Struct("<4s2I4B")
 _SPZ_FRACTIONAL_BITS = 12
 _SPZ_FRACTIONAL_BITS_OFFSET = 13
 _SPZ_POSITION_BITS = 23
-
-_CONVERTER = """
-import os, resource, sys
-import gaussforge
-source, target, memory = sys.argv[1:]
-resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-output = os.fdopen(os.dup(1), "wb")
-os.dup2(2, 1)  # the decoders print to stdout
-# strict checks array sizes; it also refuses the infinite logits that an opacity of 0 or 1 has in an .spz file
-result = gaussforge.GaussForge().convert(sys.stdin.buffer.read(), source, target, strict=source != "spz")
-if not result.get("data"):
-    sys.exit(result.get("error", "nothing could be decoded"))
-with output:
-    output.write(result["data"])
-"""
 
 
 class SplatArrays(NamedTuple):
@@ -357,17 +341,18 @@ def _convert(data: bytes, source: str, target: str) -> bytes:
     """
     if source == "sog":
         _check_zip(data)
-    memory = (4 << 30) + 64 * len(data)
-    seconds = 60 + len(data) / 1e6
-    command = [sys.executable, "-P", "-c", _CONVERTER, source, target, str(memory)]
-    try:
-        result = subprocess.run(command, input=data, capture_output=True, check=False, timeout=seconds)
-    except subprocess.TimeoutExpired:
-        raise InputError(f"not a valid {source} file (its decoder did not end within {seconds:.0f} s)") from None
-    if result.returncode == 0:
-        return result.stdout
-    lines = result.stderr.decode("utf-8", "replace").strip().splitlines()
-    reason = lines[-1] if lines and result.returncode > 0 else f"its decoder stopped with status {result.returncode}"
+    ended = run_bounded(
+        convert_splats,
+        source,
+        target,
+        data=data,
+        imports=["gaussforge"],
+        memory=(4 << 30) + 64 * len(data),
+        seconds=60 + len(data) / 1e6,
+    )
+    if ended.status == 0:
+        return ended.output
+    reason = ended.reason if (ended.status or 0) > 0 else f"its decoder {ended.reason}"
     raise InputError(f"not a valid {source} file ({reason})")
 
 

@@ -2,37 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
+
+from mitsplat.child_process import limit_memory, run_bounded
 
 IMAGES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """Suffixes of what patterns of images match."""
 
 _SECONDS = 120
 _MEMORY = 6 << 30
-_TRIAL = """
-import os, resource, sys
-import mitsplat, mitsuba as mi
-mi.set_variant("scalar_rgb")
-files = list(zip(sys.argv[1::2], map(int, sys.argv[2::2])))
-with open("/proc/self/statm") as pages:  # a driver of a GPU may have set aside any amount of addresses
-    held = int(pages.read().split()[0]) * resource.getpagesize()
-most = held + max(memory for _, memory in files)
-resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-for path, memory in files:
-    resource.setrlimit(resource.RLIMIT_AS, (held + memory, most))
-    try:
-        mi.Bitmap(path)
-    except RuntimeError as error:
-        print(str(error).strip().splitlines()[-1], file=sys.stderr, flush=True)
-        os._exit(1)
-    print(flush=True)
-os._exit(0)  # within this limit, what ends a driver may never end
-"""
-
 _Stamp = tuple[Path, int, int]
 """A file, when it was changed [ns], and its size [bytes]."""
 
@@ -64,16 +45,25 @@ def check_images(paths: Sequence[Path]) -> list[str | None]:
 @lru_cache(maxsize=64)
 def _try_images(files: tuple[_Stamp, ...]) -> tuple[int, str | None]:
     """How many of the files can be read, and why the next one cannot, or None."""
-    command = [sys.executable, "-c", _TRIAL]
-    for path, _, size in files:  # half-precision pixels of one colour take a thousandth of what they become
-        command += [str(path), str(_MEMORY + 1000 * size)]
-    try:
-        result = subprocess.run(command, capture_output=True, check=False, timeout=_SECONDS + len(files))
-    except subprocess.TimeoutExpired as error:
-        return len((error.stdout or b"").splitlines()), f"its reader did not end within {_SECONDS} s"
-    good = len(result.stdout.splitlines())
-    if result.returncode == 0:
+    # Half-precision pixels of one colour take a thousandth of what they become.
+    limits = [_MEMORY + 1000 * size for _, _, size in files]
+    arguments = [text for (path, _, _), limit in zip(files, limits, strict=True) for text in (str(path), str(limit))]
+    ended = run_bounded(
+        _read_images, *arguments, imports=["mitsuba"], memory=max(limits), seconds=_SECONDS + len(files)
+    )
+    good = len(ended.output.splitlines())
+    if ended.status == 0:
         return good, None
-    lines = result.stderr.decode("utf-8", "replace").strip().splitlines()
-    ended = f"its reader stopped with status {result.returncode}"
-    return good, lines[-1] if lines and result.returncode > 0 else ended
+    return good, ended.reason if (ended.status or 0) > 0 else f"its reader {ended.reason}"
+
+
+def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
+    """Read images, each within the memory that follows its path, and write a line for each."""
+    import mitsuba as mi  # for the child only
+
+    mi.set_variant("scalar_rgb")
+    for path, limit in zip(arguments[::2], arguments[1::2], strict=True):
+        limit_memory(int(limit))
+        mi.Bitmap(path)
+        output.write(b"\n")
+        output.flush()

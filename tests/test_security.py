@@ -103,6 +103,7 @@ class TestXml:
         (tmp_path / "in/mesh.ply").write_text("")
         (tmp_path / "secret.xml").write_text(XML.format(""))
         (tmp_path / "in/link.xml").symlink_to(tmp_path / "secret.xml")
+        os.mkfifo(tmp_path / "in/pipe")
         return tmp_path / "in/scene.xml"
 
     @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ class TestXml:
             (XML.format('<include filename="../secret.xml"/>'), "include must be inside the scene's folder"),
             (XML.format('<include filename="link.xml"/>'), "include must be inside the scene's folder"),
             (XML.format('<include filename="/etc/passwd"/>'), "include must be inside the scene's folder"),
-            (XML.format('<include filename="$file"/>'), "include must not be a parameter"),
+            (XML.format('<include filename="$file"/>'), "undefined parameter: .file"),
             (XML.format('<path value=".."/>'), "path must be inside the scene's folder"),
             (
                 XML.format('<shape type="ply"><string name="filename" value="../secret.xml"/></shape>'),
@@ -138,7 +139,20 @@ class TestXml:
                 XML.format('<default name="d" value=".."/><string name="a" value="$d/secret.xml"/>'),
                 "(put together|name a file)",
             ),
-            (XML.format('<string name="a" value="$elsewhere/secret.xml"/>'), "put together"),
+            (XML.format('<string name="a" value="$elsewhere/secret.xml"/>'), "undefined parameter: .elsewhere"),
+            (XML.format('<include filename="scene.xml"/>'), "must not include files on more than 15 levels"),
+            (XML.format('<shape type="../evil"/>'), "type must be the name of a plugin"),
+            (
+                XML.format('<bsdf type="conductor"><string name="material" value="../x"/></bsdf>'),
+                "must not name a file",
+            ),
+            (XML.format('<shape type="ply"><string name="filename" value="pipe"/></shape>'), "must name a file or"),
+            (XML.format('<default name="a" value="b"><include filename="c"/></default>'), "<default> must hold no"),
+            (XML.format('<shape type="a"><path value="."/></shape>'), "path must be directly in the first element"),
+            (XML.format('<path value="no"/>'), "path: no such folder"),
+            (XML.format('<include filename="no.xml"/>'), "include: no such file"),
+            (XML.format('<default name="a"/>'), 'missing required attribute "value" in <default>'),
+            ('<include version="3.9.0" filename="link.xml"/>', "must begin with <scene>"),
             (XML.format('<spectrum name="a" filename="../secret.xml"/>'), "spectrum must be inside"),
             (XML.format('<rgb name="a" value="../secret.xml"/>'), "must not name a file"),
             (XML.format("<a>" * 100 + "</a>" * 100), "must not nest deeper than 64"),
@@ -151,14 +165,78 @@ class TestXml:
         with pytest.raises(InputError, match=rf"scene\.xml:\d+: .*{message}"):
             check_xml(scene)
 
-    def test_includes_are_checked_too_and_may_go_round(self, scene):
+    def test_includes_are_checked_too(self, scene):
         scene.write_text(XML.format('<include filename="b.xml"/>'))
-        (scene.parent / "b.xml").write_text(XML.format('<include filename="scene.xml"/><string value="mesh.ply"/>'))
+        (scene.parent / "b.xml").write_text(XML.format('<string name="filename" value="mesh.ply"/>'))
         check_xml(scene)
         (scene.parent / "b.xml").write_text(XML.format('<include filename="../secret.xml"/>'))
         with pytest.raises(InputError, match=r"b\.xml:1: include must be inside"):
             check_xml(scene)
         check_xml(scene, allow_outside=True)
+
+    def test_includes_do_not_multiply(self, scene):
+        for number in range(10):
+            (scene.parent / f"{number}.xml").write_text(XML.format(f'<include filename="{number + 1}.xml"/>' * 2))
+        (scene.parent / "10.xml").write_text(XML.format(""))
+        scene.write_text(XML.format('<include filename="0.xml"/>'))
+        with pytest.raises(InputError, match=r"scene\.xml: must not include more than 100 files"):
+            check_xml(scene)
+
+    def test_parameters_do_not_multiply(self, scene):
+        levels = ['<default name="a0" value="xxxxxxxxxx"/>']
+        levels += [f'<default name="a{i}" value="{f"$a{i - 1}" * 10}"/>' for i in range(1, 10)]
+        scene.write_text(XML.format("\n".join(levels)))
+        with pytest.raises(InputError, match=r"scene\.xml:7: text must not be longer than 1048576 characters"):
+            check_xml(scene)
+
+    def test_a_relative_scene_is_confined_to_its_folder(self, scene, monkeypatch):
+        monkeypatch.chdir(scene.parents[1])
+        scene.write_text(XML.format('<shape type="ply"><string name="filename" value="../secret.xml"/></shape>'))
+        with pytest.raises(InputError, match=r"in/scene\.xml:1: must not name a file outside of the scene's folder"):
+            check_xml(scene.relative_to(scene.parents[1]))
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            '<path value="sub/deep"/> <shape type="ply"><string name="filename" value="../../../secret.xml"/></shape>',
+            '<path value="sub"/> <shape type="ply"><string name="filename" value="ok.ply"/></shape>',
+            '<shape type="ply"><string name="filename" value="ok.ply"/></shape> <path value="sub"/>',
+            '<shape type="a"><bsdf type="b"><string name="filename" value="../secret.xml"/></bsdf></shape>',
+            '<path value="sub"/> <spectrum name="a" filename="ok.ply"/>',
+            '<default name="d" value="../.."/><path value="sub"/><include filename="$d/secret.xml"/>',
+        ],
+    )
+    def test_folders_to_search_do_not_lead_outside(self, scene, text):
+        (scene.parent / "sub/deep").mkdir(parents=True)
+        (scene.parent / "sub/ok.ply").symlink_to(scene.parents[1] / "secret.xml")
+        scene.write_text(XML.format(text))
+        with pytest.raises(InputError, match=r"scene\.xml:1: .*(outside of|inside) the scene's folder"):
+            check_xml(scene)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ('<!DOCTYPE a [<!ENTITY b SYSTEM "/etc/passwd">]>' + XML.format("&b;"), "must not have a document type"),
+            (XML.format('<include filename="../../secret.xml"/>'), "include must be inside"),
+            (XML.format('<shape type="ply"><string name="filename" value="{}"/></shape>'), "must not name a file"),
+        ],
+    )
+    def test_what_is_included_by_way_of_a_folder_is_checked(self, scene, text, message):
+        (scene.parent / "sub").mkdir()
+        (scene.parent / "sub/inner.xml").write_text(text.replace("{}", str(scene.parents[1] / "secret.xml")))
+        scene.write_text(XML.format('<path value="sub"/>\n<include filename="inner.xml"/>'))
+        with pytest.raises(InputError, match=rf"sub/inner\.xml:1: {message}"):
+            check_xml(scene)
+
+    def test_mitsuba_gets_absolute_paths_without_links(self, scene):
+        """So that a link that is changed after the check does not change what is read."""
+        (scene.parent / "sub").mkdir()
+        (scene.parent / "sub/good.ply").write_text("")
+        (scene.parent / "ok.ply").symlink_to("sub/good.ply")
+        scene.write_text(XML.format('\n<shape type="ply"><string name="filename" value="ok.ply"/></shape>'))
+        (text,) = check_xml(scene).texts
+        assert text.splitlines()[1].startswith('<shape type="ply"><string name="filename" value=')
+        assert f'"{(scene.parent / "sub/good.ply").resolve()}"' in text and "ok.ply" not in text
 
     def test_the_command_checks_first(self, scene, capsys, monkeypatch):
         monkeypatch.setattr(xml_scene, "run_apart", None)

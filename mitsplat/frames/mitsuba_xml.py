@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import re
+import tempfile
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,15 +109,17 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     """
     ensure_variant()
     path, out = Path(path), Path(out)
-    check_xml(path, allow_outside=allow_outside)
+    checked = check_xml(path, allow_outside=allow_outside)
     picture = out if out.suffix.lower() in (".png", ".jpg", ".exr") else out / "picture.png"
     with storage_errors(picture):
         picture.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        scene = mi.load_file(str(path.resolve()))
-        image = np.array(_render(path, scene))
-    except RuntimeError as error:
-        raise InputError(one_sentence(path, str(error))) from error
+    with storage_errors(Path(tempfile.gettempdir())), tempfile.TemporaryDirectory() as folder:
+        names = checked.write(Path(folder))
+        try:
+            scene = mi.load_file(str(next(iter(names))))
+            image = np.array(_render(path, scene))
+        except RuntimeError as error:
+            raise InputError(one_sentence(path, str(error), names)) from error
     suffix = picture.suffix.lower()
     bitmap = mi.Bitmap(image[..., :3] if suffix == ".exr" else develop(image[..., :3], {}))
     kind = getattr(mi.Bitmap.FileFormat, {".exr": "OpenEXR", ".jpg": "JPEG", ".png": "PNG"}[suffix])
@@ -171,14 +175,18 @@ _UNKNOWN = re.compile(r'unreferenced propert\w+ in (?P<kind>\w+) plugin of type 
 _PROPERTY = re.compile(r'- \S+ "(?P<name>[^"]+)"')
 
 
-def one_sentence(path: Path, message: str) -> str:
-    """What Mitsuba says of a scene, as place, rule and value, without the stack that it went through."""
+def one_sentence(path: Path, message: str, stands_for: Mapping[Path, Path] | None = None) -> str:
+    """What Mitsuba says of a scene, as place, rule and value, without the stack that it went through.
+
+    Args:
+        path: The scene.
+        message: Text of Mitsuba's error.
+        stands_for: What the files that Mitsuba has read stand for.
+    """
     place = str(path)
-    found = _PLACE.search(message)
-    if found:
+    for found in _PLACE.finditer(message):  # an included file is named after the ones that include it
         file = Path(found["file"])
-        # As the user has named it, where it is that file.
-        place = f"{path if file == path.resolve() else file}:{found['line']}"
+        place = f"{(stands_for or {}).get(file, file)}:{found['line']}"
     unknown = _UNKNOWN.search(message)
     if unknown:
         names = ", ".join(repr(name) for name in _PROPERTY.findall(message[unknown.end() :]))

@@ -1,114 +1,297 @@
-"""What a Mitsuba scene file may say before Mitsuba sees it: no entities, and no file outside of its folder."""
+"""Reader of Mitsuba scenes of others: a scene is written anew, so that Mitsuba looks up no name in it itself.
+
+The new texts have no document types, no parameters and no folders to search, and name files by absolute paths that were
+checked.
+"""
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 from mitsplat.asset import ASSET_FILE
 from mitsplat.errors import InputError
 from mitsplat.files import is_inside
 
 MAX_BYTES = 64 << 20
+"""Of all files of a scene together, and of the texts that they become."""
 MAX_DEPTH = 64
 MAX_INCLUDES = 100
+MAX_TEXT = 1 << 20
+"""Characters of an attribute after parameters are substituted."""
 
-_TEXTS = ("string", "default", "spectrum", "alias")
-_PARAMETER = re.compile(r"\$\w+")
+_MAX_LEVELS = 15  # of includes: Mitsuba's own bound
+_NAMES_OF_FILES = ("filename", "asset", "proxy")
+"""Names of texts by which plugins of Mitsuba and of mitsplat are given files."""
+_RESOLVED = {"default": (("name", "value"), ()), "path": (("value",), ()), "include": (("filename",), ("name",))}
+"""Elements that are resolved here: attributes that they must have, and those that they may have."""
+_OUTSIDE = "must not name a file outside of the scene's folder"
+_PLUGIN = re.compile(r"[\w-]*", re.ASCII)
+_UNDEFINED = re.compile(r"(?<!\\)\$(\w*)", re.ASCII)
 
 
-def check_xml(path: Path, *, allow_outside: bool = False) -> None:
-    """Refuse a scene that would make Mitsuba read beyond its folder, or that is built to exhaust a parser.
+class CheckedXml(NamedTuple):
+    """Mitsuba scene that was written anew.
+
+    Attributes:
+        names: The scene, and every file that it includes, once for each time.
+        texts: Text of each, with elements on the lines where they were. They include each other as ``1.xml`` and so on.
+    """
+
+    names: tuple[Path, ...]
+    texts: tuple[str, ...]
+
+    def write(self, folder: Path) -> dict[Path, Path]:
+        """Write the texts into an empty folder, the scene as ``0.xml``.
+
+        Returns:
+            What each of the new files stands for.
+        """
+        names = {folder / f"{number}.xml": name for number, name in enumerate(self.names)}
+        for file, text in zip(names, self.texts, strict=True):
+            file.write_text(text, encoding="utf-8")
+        return names
+
+
+def check_xml(path: Path, *, allow_outside: bool = False) -> CheckedXml:
+    """Write a scene anew; refuse one that names files outside of its folder or is built to exhaust a parser.
 
     Document types are refused, and with them all entities, which no scene needs. Every text of the file is looked at,
-    not only those that Mitsuba's own plugins take for a file name.
+    not only those that plugins take for the name of a file.
+
+    Names are looked up in the folders of ``<path>`` elements, the last one first, in the scene's folder and in the
+    current one. For a file that is included or of a spectrum only the ``<path>`` elements before it count; the folder
+    of the file that includes comes first.
 
     Args:
-        path: The ``.xml`` file; what it includes is checked too.
+        path: The ``.xml`` file; what it includes is read too.
         allow_outside: Whether files anywhere may be named.
 
     Raises:
         InputError: With file, line, rule and value.
     """
-    folder = None if allow_outside else path.parent
-    waiting, seen = [path], set[Path]()
-    while waiting:
-        file = waiting.pop()
-        if file.resolve() in seen:
-            continue
-        seen.add(file.resolve())
-        if len(seen) > MAX_INCLUDES:
-            raise InputError(f"{path}: must not include more than {MAX_INCLUDES} files")
-        waiting += _check_file(file, path.parent, folder)
+    reader = _Reader(path, allow_outside=allow_outside)
+    folders = [path.parent, Path()]
+    reader.read(path, folders, 0)
+    return CheckedXml(tuple(reader.names), tuple(reader.text(pieces, folders) for pieces in reader.pieces))
 
 
-def _check_file(path: Path, base: Path, folder: Path | None) -> list[Path]:
-    """Check one file against ``folder``, None for no bounds; the files it includes."""
+class _FileName(NamedTuple):
+    """Name of a file, which is looked up when all folders of the scene are known; its place is a file and a line."""
+
+    name: str
+    place: str
+
+
+class _Reader:
+    """Reader of a scene with its includes, in the order of elements: parameters count from where they are set.
+
+    Args:
+        scene: The ``.xml`` file.
+        allow_outside: Whether files anywhere may be named.
+
+    Attributes:
+        names: Files that were begun.
+        pieces: New text of each.
+    """
+
+    def __init__(self, scene: Path, *, allow_outside: bool) -> None:
+        self._scene = scene
+        self._bounds = None if allow_outside else scene.parent
+        self._parameters: dict[str, str] = {}
+        self._unread = self._unwritten = MAX_BYTES
+        self.names: list[Path] = []
+        self.pieces: list[list[str | _FileName]] = []
+
+    def text(self, pieces: Sequence[str | _FileName], folders: Sequence[Path]) -> str:
+        """Join pieces, with names looked up in folders."""
+        return "".join(
+            piece if isinstance(piece, str) else _quoted(str(self._find(piece.name, folders, piece.place, "string")))
+            for piece in pieces
+        )
+
+    def read(self, path: Path, folders: list[Path], level: int) -> int:
+        """Read a file.
+
+        Args:
+            path: The file; it was checked to be inside.
+            folders: Where to look up names; the file's ``<path>`` elements add to them.
+            level: Number of files between this one and the scene, with the scene.
+
+        Returns:
+            Its number.
+        """
+        data = self._read_bytes(path)
+        number, pieces, parents = len(self.names), list[str | _FileName](), list[str]()
+        self.names.append(path)
+        self.pieces.append(pieces)
+        parser = expat.ParserCreate()
+        line = 1
+
+        def refuse(rule: str) -> InputError:
+            return InputError(f"{path}:{parser.CurrentLineNumber}: {rule}")
+
+        def doctype(name: str, *_: object) -> None:
+            raise refuse(f"must not have a document type (got {name})")
+
+        def write(piece: str | _FileName) -> None:
+            self._unwritten -= len(piece if isinstance(piece, str) else piece.name)
+            if self._unwritten < 0:
+                raise refuse(f"the scene must not be larger than {MAX_BYTES >> 20} MiB with its parameters replaced")
+            pieces.append(piece)
+
+        def start(name: str, given: dict[str, str]) -> None:
+            nonlocal line
+            place = f"{path}:{parser.CurrentLineNumber}"
+            if len(parents) == MAX_DEPTH:
+                raise refuse(f"must not nest deeper than {MAX_DEPTH} elements")
+            if not parents and (name in _RESOLVED or (level == 0 and name != "scene")):
+                raise refuse(f"must begin with <scene> (got <{name}>)")
+            if parents and parents[-1] in _RESOLVED:
+                raise refuse(f"<{parents[-1]}> must hold no elements (got <{name}>)")
+            parents.append(name)
+            values = {key: self._substitute(value, place) for key, value in given.items()}
+            if name in _RESOLVED:
+                _check_attributes(name, values, place)
+            if name == "default":
+                self._parameters.setdefault(values["name"], values["value"])
+            elif name == "path":
+                if len(parents) != 2:
+                    raise refuse("path must be directly in the first element")
+                found = self._find(values["value"], [path.parent, *folders], place, name)
+                if not found.is_dir():
+                    raise refuse(f"path: no such folder (got {values['value']})")
+                folders.insert(0, found)
+            else:
+                if name == "include":
+                    inner = [path.parent, *folders]
+                    found = self._find(values["filename"], inner, place, name)
+                    if not found.is_file():
+                        raise refuse(f"include: no such file (got {values['filename']})")
+                    if level + 1 == _MAX_LEVELS:
+                        raise refuse(f"must not include files on more than {_MAX_LEVELS} levels")
+                    values["filename"] = f"{self.read(found, inner, level + 1)}.xml"
+                write("\n" * (parser.CurrentLineNumber - line) + f"<{name}")
+                line = parser.CurrentLineNumber
+                for key, value in values.items():
+                    write(f" {key}=")
+                    write(self._value(name, key, value, values, folders, place))
+                write(">")
+
+        def end(name: str) -> None:
+            if parents.pop() not in ("default", "path"):
+                write(f"</{name}>")
+
+        parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = doctype, start, end
+        try:
+            parser.Parse(data, True)
+        except expat.ExpatError as error:
+            raise InputError(f"{path}:{error.lineno}: not XML ({expat.errors.messages[error.code]})") from error
+        return number
+
+    def _read_bytes(self, path: Path) -> bytes:
+        if len(self.names) > MAX_INCLUDES:
+            raise InputError(f"{self._scene}: must not include more than {MAX_INCLUDES} files")
+        try:
+            size = path.stat().st_size
+            if size > self._unread or not path.is_file():
+                raise InputError(
+                    f"{path}: must be a file of at most {MAX_BYTES >> 20} MiB, with all that are included before "
+                    f"(got {size} bytes)"
+                )
+            with path.open("rb") as file:
+                data = file.read(size)
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        self._unread -= len(data)
+        return data
+
+    def _substitute(self, text: str, place: str) -> str:
+        """Replace parameters, the longest name first, and dollar signs after backslashes by these alone."""
+        if "$" not in text:
+            return text
+        for name in sorted(self._parameters, key=len, reverse=True):
+            value = self._parameters[name]
+            if len(text) + text.count(f"${name}") * len(value) > MAX_TEXT:
+                raise InputError(
+                    f"{place}: text must not be longer than {MAX_TEXT} characters with parameters replaced"
+                )
+            text = re.sub(rf"(?<!\\)\${re.escape(name)}", value.replace("\\", r"\\"), text)
+        if undefined := _UNDEFINED.search(text):
+            raise InputError(f"{place}: undefined parameter: ${undefined[1]}")
+        return text.replace("\\$", "$")
+
+    def _value(
+        self, element: str, key: str, value: str, values: Mapping[str, str], folders: Sequence[Path], place: str
+    ) -> str | _FileName:
+        """An attribute as it is written, between quotes."""
+        if element == "spectrum" and key == "filename":
+            return _quoted(str(self._find(value, folders, place, element)))
+        if element == "string" and key == "value" and value and values.get("name") in _NAMES_OF_FILES:
+            return _FileName(value, place)
+        if key == "type" and not _PLUGIN.fullmatch(value):
+            raise InputError(f"{place}: type must be the name of a plugin (got {value})")
+        if self._bounds is not None and element != "include" and _names_outside(self._bounds, value):
+            raise InputError(f"{place}: {_OUTSIDE} (got {value}); --allow-outside lifts this")
+        return _quoted(value)
+
+    def _find(self, name: str, folders: Sequence[Path], place: str, element: str) -> Path:
+        """Look up a name: an absolute path without links. What is in no folder is sought in the scene's."""
+        found = next((path for folder in folders if _is_there(path := folder / name)), self._scene.parent / name)
+        if self._bounds is not None and not is_inside(self._bounds, os.path.realpath(found)):
+            rule = _OUTSIDE if element == "string" else f"{element} must be inside the scene's folder"
+            raise InputError(f"{place}: {rule} (got {name}); --allow-outside lifts this")
+        path = Path(os.path.realpath(found))
+        if path.suffix != found.suffix:  # by which readers choose a format
+            path = Path(os.path.realpath(found.parent), found.name)
+        if _is_there(path) and not (path.is_file() or path.is_dir()):
+            raise InputError(f"{place}: {element} must name a file or a folder (got {name})")
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{place}: {element} must have a path in UTF-8 (got {os.fsencode(path)!r})") from None
+        return path
+
+
+def _is_there(path: Path) -> bool:
     try:
-        if path.stat().st_size > MAX_BYTES or not path.is_file():
-            raise InputError(
-                f"{path}: must be a file of at most {MAX_BYTES >> 20} MiB (got {path.stat().st_size} bytes)"
-            )
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    parser = expat.ParserCreate()
-    depth, included = 0, list[Path]()
-
-    def refuse(rule: str) -> InputError:
-        return InputError(f"{path}:{parser.CurrentLineNumber}: {rule}")
-
-    def doctype(name: str, *_: object) -> None:
-        raise refuse(f"must not have a document type (got {name})")
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > MAX_DEPTH:
-            raise refuse(f"must not nest deeper than {MAX_DEPTH} elements")
-        if name == "include" and "$" not in attributes.get("filename", ""):
-            included.append(base / attributes.get("filename", ""))
-        if folder is not None:
-            for key, value in attributes.items():
-                if rule := _offence(folder, name, key, value):
-                    raise refuse(f"{rule} (got {value}); --allow-outside lifts this")
-
-    def end(name: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = doctype, start, end
-    try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
-        raise InputError(f"{path}:{error.lineno}: not XML ({expat.errors.messages[error.code]})") from error
-    return included
+        return path.exists()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
-def _offence(folder: Path, element: str, key: str, value: str) -> str:
-    """The rule that an attribute breaks, or nothing."""
-    named = key == "filename" or (element == "path" and key == "value")
-    if named and "$" in value:
-        return f"{element} must not be a parameter"
-    if element in _TEXTS and "$" in value and not _PARAMETER.fullmatch(value.strip()):
-        # What a default holds is looked at where it is set, but not what becomes of several.
-        return "text must not be put together from parameters"
-    if named and not is_inside(folder, value):
-        return f"{element} must be inside the scene's folder"
-    return "must not name a file outside of the scene's folder" if _names_outside(folder, value) else ""
+def _quoted(value: str) -> str:
+    return quoteattr(value.replace("$", "\\$"))
+
+
+def _check_attributes(element: str, values: Mapping[str, str], place: str) -> None:
+    """Refuse attributes that an element lacks or does not take, as Mitsuba does."""
+    needed, possible = _RESOLVED[element]
+    for key in needed:
+        if not values.get(key):
+            raise InputError(f'{place}: missing required attribute "{key}" in <{element}>')
+    for key in values:
+        if key not in (*needed, *possible):
+            raise InputError(f'{place}: unexpected attribute "{key}" in element <{element}>')
 
 
 def _names_outside(folder: Path, text: str) -> bool:
     """Whether a text names a file or an asset, seen from the scene or from here, that is not in the folder."""
+    if ".." in re.split(r"[/\\]", text):
+        return True
     if not text or "\0" in text or len(text) > 4096:
         return False
     try:
         return any(
             ((base / text).is_file() or (base / text / ASSET_FILE).is_file())
-            and not is_inside(folder, str(base / text))
+            and not is_inside(folder, os.path.realpath(base / text))
             for base in (folder, Path.cwd())
         )
     except OSError:

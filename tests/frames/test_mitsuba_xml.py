@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 from mitsplat.asset import Asset
@@ -158,6 +161,93 @@ def test_an_asset_outside_of_the_scenes_folder_is_refused(small: Path) -> None:
     with pytest.raises(InputError, match=r"scene\.xml:7: must not name a file outside of the scene's folder"):
         render_xml(write(small / "in", text), small / "out.png")
     check_xml(small / "in/scene.xml", allow_outside=True)
+
+
+PARTS = """<scene version="3.9.0">
+    <default name="radius" value="0.5"/> <default name="size" value="12"/> <default name="grey" value="0.5"/>
+    <path value="maps"/>
+    <integrator type="path"> <integer name="max_depth" value="3"/> </integrator>
+    <sensor type="perspective">
+        <film type="hdrfilm"> <integer name="width" value="$size"/> <integer name="height" value="$size"/> </film>
+        <transform name="to_world"> <lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/> </transform>
+    </sensor>
+    <include filename="parts/look.xml"/>
+    <alias id="look" as="same"/>
+    <shape type="sphere"> <float name="radius" value="$radius"/> <ref id="same"/> </shape>
+    <shape type="ply"> <string name="filename" value="$kind_ball.ply"/> <ref id="look"/> </shape>
+    <emitter type="envmap"> <string name="filename" value="sky.exr"/> </emitter>
+    <emitter type="point"> <point name="position" x="$side" y="1" z="2"/> <rgb name="intensity" value="1"/> </emitter>
+</scene>
+"""
+
+LOOK = """<scene version="3.9.0">
+    <integer name="of_the_included_file" value="1"/>
+    <include filename="deeper/names.xml"/>
+    <bsdf type="diffuse" id="look">
+        <texture type="bitmap" name="reflectance"> <string name="filename" value="parts/look.png"/> </texture>
+    </bsdf>
+</scene>
+"""
+
+NAMES = """<scene version="3.9.0">
+    <default name="kind" value="small"/> <default name="side" value="1.5"/> <default name="radius" value="9"/>
+    <emitter type="point"> <point name="position" value="3"/>
+        <spectrum name="intensity" filename="flat.spd"/> </emitter>
+</scene>
+"""
+
+
+def test_a_scene_of_parts_renders_as_mitsuba_alone_renders_it(tmp_path: Path) -> None:
+    ensure_variant()
+    for folder in ("maps", "parts/deeper"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "parts/look.xml").write_text(LOOK)
+    # Mitsuba adds only folders of files that include others to those where it looks up a spectrum.
+    (tmp_path / "parts/deeper/names.xml").write_text(NAMES)
+    (tmp_path / "parts/flat.spd").write_text("400 0.1\n500 0.2\n700 0.4\n")
+    grid = np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)
+    mi.Bitmap(grid).write(str(tmp_path / "maps/sky.exr"))
+    mi.Bitmap((grid * 255).astype(np.uint8)).write(str(tmp_path / "parts/look.png"))
+    trimesh.creation.icosphere(1, 0.8).export(tmp_path / "maps/small_ball.ply")
+    scene = write(tmp_path, PARTS)
+    render_xml(scene, tmp_path / "ours.exr")
+    alone = mi.load_file(str(scene))
+    mi.Bitmap(np.array(alone.integrator().render(alone, alone.sensors()[0]))[..., :3]).write(
+        str(tmp_path / "alone.exr")
+    )
+    assert (tmp_path / "ours.exr").read_bytes() == (tmp_path / "alone.exr").read_bytes()
+
+
+def test_an_error_in_an_included_file_names_its_line(small: Path) -> None:
+    (small / "parts").mkdir()
+    (small / "parts/more.xml").write_text(
+        '<scene version="3.9.0">\n\n<shape type="sphere"> <float name="b"/> </shape></scene>'
+    )
+    scene = write(small, SCENE.format('<include filename="parts/more.xml"/>'))
+    with pytest.raises(InputError, match=r'/parts/more\.xml:3: missing required attribute "value"'):
+        render_xml(scene, small / "out.png")
+
+
+@pytest.mark.parametrize("place", ["scene", "here"])
+def test_no_native_plugin_of_a_folder_is_loaded(small: Path, place: str) -> None:
+    """Mitsuba looks for plugins in the current folder and in that of the scene, before its own."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("needs a C compiler")
+    code = '#include <stdio.h>\n__attribute__((constructor)) void f(void) { fclose(fopen("%s", "w")); }' % (
+        small / "ran"
+    )
+    (small / "a.c").write_text(code)
+    here = small / "here"
+    for folder in (small, here) if place == "scene" else (here,):
+        (folder / "plugins").mkdir(parents=True)
+    library = (small if place == "scene" else here) / "plugins/sphere.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, small / "a.c"], check=True)
+    scene = write(small, SCENE.format('<shape type="sphere"/>'))
+    command = [Path(sys.executable).with_name("mitsplat"), "render", scene, "-o", small / "out.png"]
+    done = subprocess.run(command, cwd=here, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not (small / "ran").exists()
 
 
 def test_the_documented_scene_renders_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

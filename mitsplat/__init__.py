@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsplat.gpu_memory import hide_full_gpus
@@ -114,4 +115,18 @@ def _register_plugins() -> None:
         register(mi.variant())
 
 
+def _load_no_plugins_from_here() -> None:
+    """Remove the current folder from those in which Mitsuba looks for native plugins; it would look there first.
+
+    Other files are still found there: names that no folder has count from the current one.
+    """
+    import mitsuba as mi
+
+    folders, here = mi.file_resolver(), str(mi.filesystem.current_path())
+    for number in reversed(range(len(folders))):
+        if str(folders[number]) == here != str(Path(mi.__file__).parent):
+            del folders[number]
+
+
+after_mitsuba(_load_no_plugins_from_here)
 after_mitsuba(_register_plugins)

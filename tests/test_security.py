@@ -4,11 +4,15 @@ import gzip
 import os
 import resource
 import struct
+import sys
 import time
 import zipfile
 
 import pytest
 
+from benchmarks.scale.attack.__main__ import all_attacks
+from benchmarks.scale.attack.attack import SECRET_COLOUR, SECRET_WORD, Attack, judge
+from benchmarks.scale.attack.samples import Place, Samples
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.frames import mitsuba_xml as xml_scene
@@ -347,3 +351,58 @@ class TestArchives:
         (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 12\n", b"vertex 99999999999\n"))
         with pytest.raises(InputError, match="the header promises 99999999999 Gaussians"):
             Splats.load(tmp_path / "a.ply")
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    return Samples(tmp_path_factory.mktemp("samples"))
+
+
+class TestAttacks:
+    """A few attacks of ``python -m benchmarks.scale.attack``, and that its verdicts find what goes wrong."""
+
+    @pytest.fixture
+    def place(self, samples, tmp_path):
+        return Place.make(tmp_path / "place", samples, SECRET_COLOUR, SECRET_WORD)
+
+    @pytest.mark.parametrize(
+        "name", ["exr: panorama, deep", "splats: SPZ bomb", "xml: absolute path", "yaml: aliases that multiply"]
+    )
+    def test_is_held_off(self, place, name):
+        (attack,) = (attack for attack in all_attacks() if attack.name == name)
+        assert judge(attack, place).faults == ()
+
+    def test_names_are_unique(self):
+        names = [attack.name for attack in all_attacks()]
+        assert len(set(names)) == len(names)
+
+    @pytest.mark.parametrize(
+        ("script", "fault"),
+        [
+            ("true", None),
+            ("echo 'mitsplat: a.ply: not a PLY file' >&2; exit 2", None),
+            ("exit 2", "does not end in a sentence"),
+            ("exit 70", "exits with status 70"),
+            ("kill -SEGV $$", "exits with status -11"),
+            ("echo 'Traceback (most recent call last):' >&2", "prints a traceback"),
+            ("touch {outside}/made", "outside/made was changed"),
+            ("echo > {outside}/folder/keep.txt", "outside/folder/keep.txt was changed"),
+            ("rm {outside}/secret.jpg", "outside/secret.jpg was changed"),
+            ("cat {outside}/secret.txt", "prints text of a file outside"),
+            ("cp {outside}/secret.png made.png", "made.png shows what lies outside"),
+            ("cat {outside}/secret.yaml > made.txt", "made.txt shows what lies outside"),
+            ("echo >> kept", "kept was changed"),
+            ("sleep 60", "did not end within"),
+            ("sleep 60 & exit 0", "leaves 1 processes"),
+            ("{python} -c 'a = bytearray(80 << 20); a[::4096] = a[::4096]; input()' < pipe", "takes more than 60 MiB"),
+        ],
+    )
+    def test_verdicts(self, place, script, fault):
+        def build(place):
+            place.write("kept", "a")
+            os.mkfifo(place.inside / "pipe")
+
+        command = ("sh", "-c", script.replace("{python}", sys.executable).replace("< pipe", "<> pipe"))
+        attack = Attack("a", "b", build, [command], seconds=5, mebibytes=60, keep=("kept",))
+        faults = judge(attack, place).faults
+        assert (fault is None and faults == ()) or any(fault in found for found in faults), faults

@@ -1,0 +1,108 @@
+"""Attack mitsplat with hostile files and machines, and print what came of each attack.
+
+    python -m benchmarks.scale.attack [--list] [--only PATTERN] [--quick] [--jobs N]
+
+An attack is held off if its commands end with a status and a sentence of theirs, within bounds of time and memory, and
+neither change nor show anything outside of their folder. The exit status is 1 if one was not held off. The commands are
+those of ``mitsplat`` in the environment of this Python. It needs Linux.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import importlib
+import pkgutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
+
+import benchmarks.scale.attack as package
+from benchmarks.record import figure, recording
+from benchmarks.scale.attack.attack import SECRET_COLOUR, SECRET_WORD, Attack, Verdict, judge
+from benchmarks.scale.attack.samples import Place, Samples
+
+_OWN = ("__main__", "attack", "samples")
+
+
+def all_attacks() -> list[Attack]:
+    """Attacks of every module, in the order of the modules' names."""
+    names = sorted(module.name for module in pkgutil.iter_modules(package.__path__) if module.name not in _OWN)
+    modules = [importlib.import_module(f"{package.__name__}.{name}") for name in names]
+    return [attack for module in modules for attack in module.ATTACKS]
+
+
+def verdicts(attacks: Sequence[Attack], jobs: int = 1) -> Iterator[tuple[Attack, Verdict]]:
+    """Attacks and what came of them, each in a folder of its own, which is removed."""
+    with tempfile.TemporaryDirectory(prefix="mitsplat-attack-") as folder, ThreadPoolExecutor(jobs) as pool:
+        valid = Samples(Path(folder) / "samples")
+        if not all(attack.quick for attack in attacks):
+            valid.render_dataset()
+
+        def held(attack: Attack) -> Verdict:
+            with tempfile.TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as own:
+                return judge(attack, Place.make(Path(own), valid, SECRET_COLOUR, SECRET_WORD))
+
+        yield from zip(attacks, pool.map(held, attacks), strict=True)
+
+
+def main() -> None:
+    """Choose the attacks, run them and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", metavar="PATTERN", help="attacks whose name contains or matches it, such as 'xml*'")
+    parser.add_argument("--quick", action="store_true", help="only attacks that render nothing")
+    parser.add_argument("--list", action="store_true", help="print the attacks and run none")
+    parser.add_argument("--jobs", type=int, default=2, help="attacks at a time")
+    options = parser.parse_args()
+    wanted = [
+        attack
+        for attack in all_attacks()
+        if (attack.quick or not options.quick)
+        and (not options.only or options.only in attack.name or fnmatch.fnmatch(attack.name, options.only))
+    ]
+    if not wanted:
+        parser.error(f"no attack is named like {options.only}")
+    if options.list:
+        for attack in wanted:
+            print(f"{attack.name}: tries to {attack.tries}")
+        return
+    # A part that was chosen by name is no result.
+    with nullcontext() if options.only else recording("scale.attack", parser, options, ignore=("list", "jobs")):
+        failed = measure(wanted, options.jobs)
+    sys.exit(1 if failed else 0)
+
+
+def measure(wanted: Sequence[Attack], jobs: int) -> int:
+    """Run attacks, print a line for each, record the counts; returns how many were not held off."""
+    begun = time.monotonic()
+    absent = [attack for attack in wanted if attack.missing]
+    done: list[tuple[Attack, Verdict]] = []
+    print(f"{'attack':<64} {'verdict':<8} {'s':>6} {'MiB':>6}")
+    for attack, verdict in verdicts([attack for attack in wanted if not attack.missing], jobs):
+        done.append((attack, verdict))
+        word = "FAILED" if verdict.faults else "held"
+        print(f"{attack.name:<64} {word:<8} {verdict.seconds:>6.1f} {verdict.mebibytes:>6.0f}", flush=True)
+        for fault in verdict.faults:
+            print(f"    {fault}", flush=True)
+    for attack in absent:
+        print(f"{attack.name:<64} not run: {attack.missing}")
+    failed = sum(bool(verdict.faults) for _, verdict in done)
+    figure(len(done), "", "attacks")
+    figure(failed, "", "failed")
+    figure(len(absent), "", "not run")
+    kinds = sorted({attack.name.partition(":")[0] for attack, _ in done})
+    for kind in kinds:
+        figure(sum(attack.name.partition(":")[0] == kind for attack, _ in done), "", "of kind", kind)
+    figure(max((verdict.seconds for _, verdict in done), default=0), "s", "longest")
+    figure(max((verdict.mebibytes for _, verdict in done), default=0), "MiB", "largest")
+    minutes = (time.monotonic() - begun) / 60
+    print(f"attacks: {len(done)}; failed: {failed}; not run: {len(absent)}; minutes: {minutes:.1f}")
+    return failed
+
+
+if __name__ == "__main__":
+    main()

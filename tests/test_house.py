@@ -145,6 +145,20 @@ def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
         yield first, said
 
 
+def test_one_module_builds_command_lines_of_python() -> None:
+    """Elsewhere a child could start without safe-path mode, and run Python files of the current folder."""
+    starts = ("sys.executable", "sys._base_executable", "ProcessPoolExecutor", "set_executable", "forkserver")
+    found = {f"{module}: {start}" for module, path in MODULES.items() for start in starts if start in path.read_text()}
+    assert found == {"mitsplat.child_process: sys.executable"}
+
+
+def test_processes_of_multiprocessing_start_safely() -> None:
+    starts = [module for module, path in MODULES.items() if "import multiprocessing" in path.read_text()]
+    assert starts == ["mitsplat.engine.pool"]
+    source = MODULES["mitsplat.engine.pool"].read_text()
+    assert "with starting_safely(), starting_on(" in source and source.count("process.start()") == 1
+
+
 def test_imports_inside_of_functions_say_why() -> None:
     silent = [
         f"{path.relative_to(ROOT)}:{line}"

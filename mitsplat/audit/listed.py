@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -20,6 +19,7 @@ from mitsplat.audit.described import Cursor, is_close
 from mitsplat.audit.owned import YOLO_FOLDERS
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
+from mitsplat.child_process import python_command, python_environment
 from mitsplat.files import SPLITS, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
@@ -132,15 +132,10 @@ class ColmapReader:
         self._images = Cursor("colmap/images.txt", iter(()) if self._missing else self._read())
 
     def _read(self) -> Iterator[tuple[int, Any]]:
-        command = [
-            sys.executable,
-            "-m",
-            "mitsplat.audit.colmap_worker",
-            str(self._model.resolve()),
-            json.dumps(_POINTS.tolist()),
-        ]
+        points = json.dumps(_POINTS.tolist())
+        command = python_command("-m", "mitsplat.audit.colmap_worker", self._model.resolve(), points)
         with tempfile.TemporaryFile("w+") as said:
-            child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True)
+            child = subprocess.Popen(command, env=python_environment(), stdout=subprocess.PIPE, stderr=said, text=True)
             try:
                 for line in child.stdout or ():
                     image = json.loads(line)

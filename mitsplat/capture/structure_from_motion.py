@@ -10,7 +10,6 @@ import json
 import os
 import sqlite3
 import subprocess
-import sys
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from mitsplat.arrays import Float64Array, Int32Array
 from mitsplat.camera import Camera
 from mitsplat.capture.photos import Prepared
+from mitsplat.child_process import python_command, python_environment
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.files import write_text
 from mitsplat.progress import Progress
@@ -221,7 +221,8 @@ def _run(job: Mapping[str, Any], folder: Path, progress: Progress | None) -> dic
         (folder / name).unlink(missing_ok=True)
     with (folder / "log.txt").open("wb") as log:
         child = subprocess.Popen(
-            [sys.executable, "-m", "mitsplat.capture.sfm_worker", str(file.resolve())],
+            python_command("-m", "mitsplat.capture.sfm_worker", file.resolve()),
+            env=python_environment(),
             stdin=subprocess.PIPE,  # closes when this process ends, and the child with it
             stdout=log,
             stderr=subprocess.STDOUT,

@@ -16,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from mitsplat.cache import cache_folder
+from mitsplat.child_process import python_command, python_environment
 from mitsplat.device import Lack, gpu_environment, visible_gpus
 from mitsplat.engine.resources import unused_memory
 from mitsplat.findings import Finding
@@ -63,8 +64,9 @@ def _llvm() -> Finding:
 
 def _try(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
     """The version of LLVM, and what is wrong with the picture of a trial on a device, if anything is."""
-    command = [sys.executable, "-m", "mitsplat.checks.trial", device]
-    done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+    command = python_command("-m", "mitsplat.checks.trial", device)
+    environment = python_environment(environment)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
         return "", f"does not render ({re.sub('^mitsplat[.]errors[.][A-Za-z]+: ', '', said)})"

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from mitsplat.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.version import __version__
@@ -62,11 +63,14 @@ def main(args: Sequence[str] | None = None) -> None:
     Args:
         args: Arguments; those of the process if None.
     """
+    if args is None:
+        leave_current_folder()
     try:
         app(args)
     except Exception as error:  # noqa: BLE001 - the last one who can tell the user
         if args is None and isinstance(error, LateDeviceError):
-            os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | error.environment)
+            command = python_command(*sys.orig_argv[1:])
+            os.execve(command[0], command, python_environment(error.environment))
         status = exit_status(error)
         typer.echo(f"mitsplat: {fault.tell_fault(error) if status is None else sentence_of(error)}", err=True)
         sys.exit(fault.STATUS if status is None else status)

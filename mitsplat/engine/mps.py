@@ -10,10 +10,10 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 from contextlib import suppress
 
+from mitsplat.child_process import python_command, python_environment
 from mitsplat.gpu_memory import VISIBLE
 
 CONTROL = "nvidia-cuda-mps-control"
@@ -87,8 +87,8 @@ class SharedGpu:
             if started.returncode:
                 raise OSError(_last_line(started.stdout + started.stderr))
             trial = subprocess.run(
-                [sys.executable, "-c", _TRIAL],
-                env=os.environ | self.environment,
+                python_command("-c", _TRIAL),
+                env=python_environment(self.environment),
                 capture_output=True,
                 text=True,
                 check=False,

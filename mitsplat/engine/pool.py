@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
+from mitsplat.child_process import starting_safely
 from mitsplat.cores import usable_cores
 from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
 from mitsplat.engine.mps import MOST_CLIENTS, SharedGpu
@@ -51,6 +52,15 @@ _WINDOW = 6
 """Frames of each worker over which speed is measured."""
 _FEW = 16
 """Frames up to which starting worker processes does not pay."""
+
+_START = 300.0
+"""Time limit for the start of a worker [s]: on an idle machine it takes about two seconds of imports."""
+
+_LOOK = 1.0
+"""Interval at which the start of workers is timed [s]."""
+
+_END = 30.0
+"""Time limit for the end of a worker that has closed its pipe [s]."""
 
 _SENTENCES: tuple[type[Exception], ...] = (InputError, MissingResourceError, PartialResultError)
 
@@ -121,6 +131,11 @@ class Lost:
     """A worker is gone, with its frame; ``how`` continues "the process making frame 3 ..."."""
 
     how: str
+
+
+@dataclass(frozen=True)
+class Started:
+    """A worker has been started, and takes frames now."""
 
 
 Answer = Status | Finished[Result] | Failure | Lost
@@ -451,7 +466,12 @@ class _Growth:
 
 
 class _Processes(Generic[Result]):
-    """Workers that are processes of this machine."""
+    """Workers that are processes of this machine.
+
+    Nothing here waits for a worker that does not start. :mod:`multiprocessing` writes what a process begins with into a
+    pipe, and would wait for ever for a process that is gone before it has read more than the pipe holds (64 KiB): so
+    that is little, and the work itself is in a file, see :class:`SharedArrays`.
+    """
 
     def __init__(
         self, make: MakeFrame[Result], device: Device | None, environment: Mapping[str, str] | None = None
@@ -463,6 +483,7 @@ class _Processes(Generic[Result]):
         self._taken: dict[int, Gpu] = {}
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: dict[int, tuple[BaseProcess, Connection]] = {}
+        self._starting: dict[int, float] = {}
         self._count = 0
 
     def start(self) -> int:
@@ -472,16 +493,17 @@ class _Processes(Generic[Result]):
         process = self._spawn.Process(target=_work, args=arguments, name=f"mitsplat-{worker}", daemon=True)
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
-        resource_tracker.ensure_running()  # starting it with the first worker would unblock what is blocked here
-        # Ctrl-C goes to all processes of a terminal, but is for this one only: workers inherit what is blocked.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            with starting_on(gpu, **self._environment):
+        with starting_safely(), starting_on(gpu, **self._environment):
+            resource_tracker.ensure_running()  # starting it with the first worker would unblock what is blocked here
+            # Ctrl-C goes to all processes of a terminal, but is for this one only: workers inherit what is blocked.
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
                 process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         far_end.close()  # so that the death of the worker ends the pipe
         self._workers[worker] = process, pipe
+        self._starting[worker] = _START
         if gpu is not None:
             self._taken[worker] = gpu
         return worker
@@ -489,43 +511,65 @@ class _Processes(Generic[Result]):
     def stop(self, worker: int) -> None:
         process, pipe = self._workers.pop(worker)
         self._taken.pop(worker, None)
-        process.terminate()
+        self._starting.pop(worker, None)
+        process.kill()  # a signal that also ends a stopped process
         process.join()
         pipe.close()
 
     def give(self, worker: int, frame: int, layout: int) -> None:
-        with suppress(BrokenPipeError):  # a worker that died is found when its answer is received
+        with suppress(BrokenPipeError, ConnectionResetError):  # a worker that died is found when its answer is received
             self._workers[worker][1].send(frame)
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
-        ready = set(wait([pipe for _, pipe in self._workers.values()]))
+        begun = time.monotonic()
+        ready = set(wait([pipe for _, pipe in self._workers.values()], _LOOK if self._starting else None))
+        # No more than an interval counts: this process may have been stopped, and its workers with it.
+        waited = min(time.monotonic() - begun, _LOOK)
         for worker, (process, pipe) in list(self._workers.items()):
             if pipe not in ready:
+                if worker in self._starting:
+                    self._starting[worker] -= waited
+                    if self._starting[worker] <= 0:
+                        self.stop(worker)
+                        yield worker, Lost(f"did not start within {_START:g} s")
                 continue
             try:
-                yield worker, pipe.recv()
+                answer = pipe.recv()
             except (EOFError, OSError):
-                process.join()
-                code = process.exitcode or 0
-                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+                how = _ending(process)
                 self.stop(worker)
                 yield worker, Lost(how)
+                continue
+            if isinstance(answer, Started):
+                self._starting.pop(worker, None)
+            else:
+                yield worker, answer
 
     def openings(self) -> int:
         return 0
 
     def close(self) -> None:
         for process, _ in self._workers.values():
-            process.terminate()
+            process.kill()
         for worker in list(self._workers):
             self.stop(worker)
         self._make.close()
+
+
+def _ending(process: BaseProcess) -> str:
+    """How a process has ended that has closed its pipe."""
+    process.join(_END)
+    code = process.exitcode
+    if code is None:
+        return "answers no more"
+    return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
 
 
 def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> None:
     """Main function of a worker: frames come in, notes and results go out, until it is stopped."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError):
+        pipe.send(Started())
         while True:
             index = pipe.recv()
             try:

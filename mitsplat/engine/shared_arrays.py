@@ -1,7 +1,7 @@
-"""What is sent to worker processes, with arrays that all of them share: one copy in memory, which nobody can change.
+"""Values for worker processes, with arrays that all of them share: one copy in memory, which nobody can change.
 
-The arrays are taken out of the pickle (PEP 574) and put into a file that every worker maps. It has no name, so that the
-system frees it with the last process, however that ends.
+The arrays are taken out of the pickle (PEP 574) and put into a file that every worker maps, the pickle after them, and
+a table of their places. The file has no name, so that the system frees it with the last process, however that ends.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ import mmap
 import os
 import pickle
 import tempfile
+from array import array
+from collections.abc import Sequence
 from contextlib import suppress
+from itertools import accumulate, chain
 from multiprocessing.reduction import DupFd
 from typing import IO, Any, Generic, TypeVar
 
@@ -28,7 +31,7 @@ _logger = logging.getLogger(__name__)
 class SharedArrays(Generic[Value]):
     """A value that processes can be started with; there it is unpickled where it stands, as that value.
 
-    Where no file can be written, each process gets a copy.
+    Where no file can be written, they share memory that the system cannot put aside.
 
     Attributes:
         size: What the processes share [bytes].
@@ -36,47 +39,55 @@ class SharedArrays(Generic[Value]):
 
     def __init__(self, value: Value) -> None:
         buffers: list[pickle.PickleBuffer] = []
-        self._pickled = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
-        self._places: list[tuple[int, int]] = []
-        self._file: IO[bytes] | None = None
-        self.size = 0
-        if not buffers:
-            return
+        pickled = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
+        parts = [*(buffer.raw() for buffer in buffers), memoryview(pickled)]
+        *starts, self.size = accumulate((-(-part.nbytes // _LINE) * _LINE for part in parts), initial=0)
+        table = array("q", chain.from_iterable((start, part.nbytes) for start, part in zip(starts, parts, strict=True)))
+        places = list(zip([*starts, self.size], [*parts, memoryview(table)], strict=True))
         try:
-            folder = cache_folder()
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close()
-            for buffer in buffers:
-                with buffer.raw() as raw:
-                    self._file.seek(self.size)
-                    self._file.write(raw)
-                    self._places.append((self.size, raw.nbytes))
-                    self.size += -(-raw.nbytes // _LINE) * _LINE
-            self._file.truncate(max(self.size, _LINE))  # what is empty cannot be mapped
-            self._file.flush()
+            self._file = _filled(_in_cache(), places)
         except OSError as error:
-            _logger.warning("%s: arrays are not shared (%s): each worker has a copy", cache_folder(), error)
-            self.close()
-            self._pickled, self._places, self.size = pickle.dumps(value), [], 0
+            _logger.warning("%s: cannot be written (%s): workers share memory instead", cache_folder(), error)
+            self._file = _filled(_in_memory(), places)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        handle = None if self._file is None else DupFd(self._file.fileno())
-        return _open, (self._pickled, handle, self._places)
+        return _open, (DupFd(self._file.fileno()), self.size)
 
     def close(self) -> None:
         """Let go of the file; processes that were started keep it."""
-        if self._file is not None:
-            with suppress(OSError):  # of a full disk, which is told of already
-                self._file.close()
-            self._file = None
+        self._file.close()
 
 
-def _open(pickled: bytes, handle: Any, places: list[tuple[int, int]]) -> Any:
-    if handle is None:
-        return pickle.loads(pickled)
+def _filled(file: IO[bytes], places: Sequence[tuple[int, memoryview]]) -> IO[bytes]:
+    """The file with its parts written, or closed where there is no room for them."""
+    try:
+        for start, part in places:
+            file.seek(start)
+            file.write(part)
+        file.flush()
+    except BaseException:
+        with suppress(OSError):  # it writes what is left again
+            file.close()
+        raise
+    return file
+
+
+def _in_cache() -> IO[bytes]:
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    return tempfile.TemporaryFile(dir=folder)
+
+
+def _in_memory() -> IO[bytes]:
+    return os.fdopen(os.memfd_create("mitsplat"), "w+b")
+
+
+def _open(handle: Any, end: int) -> Any:
     number = handle.detach()
     try:
         mapped = memoryview(mmap.mmap(number, 0, access=mmap.ACCESS_READ))
     finally:
         os.close(number)
-    return pickle.loads(pickled, buffers=[mapped[start : start + size] for start, size in places])
+    table = mapped[end:].cast("q").tolist()  # of starts and sizes
+    *buffers, pickled = (mapped[start : start + size] for start, size in zip(table[::2], table[1::2], strict=True))
+    return pickle.loads(pickled, buffers=buffers)

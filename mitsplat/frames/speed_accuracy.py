@@ -9,14 +9,12 @@ from __future__ import annotations
 import csv
 import io
 import math
-import multiprocessing
 import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,12 +25,13 @@ import numpy.typing as npt
 from mitsplat.arrays import Float32Array
 from mitsplat.camera import Camera
 from mitsplat.colour import encode_srgb
-from mitsplat.device import Device, Kind, current_device, starting_on, use_device
+from mitsplat.device import Device, current_device
+from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.files import storage_errors, write_file, write_text
 from mitsplat.frames.frame import render_frame
 from mitsplat.frames.volprim import render_volprim, volprim_scene
-from mitsplat.progress import Progress
+from mitsplat.progress import Note, Progress
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.render.layers import Layers, ensure_variant, render_splats
 from mitsplat.scene.scene import load_scene
@@ -219,20 +218,28 @@ def _is_splats(path: Path) -> bool:
 def _run_alone(
     path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool, device: Device
 ) -> _Shots:
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    job = _Shoot(path, step.quality, frames, dict(overrides), allow_outside)
+    with closing(run_apart(job, device)) as results:
         try:
-            with starting_on(next(iter(device.gpus), None)):
-                shots = pool.submit(_shoot, path, step.quality, frames, dict(overrides), allow_outside, device.kind)
-            return shots.result()
-        except BrokenProcessPool as error:
+            return next(results)
+        except LostWorkersError as error:
             raise MissingResourceError(f"{path}: the process of '{step.name}' died; is there enough memory?") from error
 
 
-def _shoot(
-    path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool, device: Kind
-) -> _Shots:
+@dataclass(frozen=True)
+class _Shoot:
+    path: Path
+    quality: Quality | None
+    frames: int
+    overrides: dict[str, Any]
+    allow_outside: bool
+
+    def __call__(self, _index: int, _note: Note, /) -> _Shots:
+        return _shoot(self.path, self.quality, self.frames, self.overrides, self.allow_outside)
+
+
+def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool) -> _Shots:
     """Make the pictures; the first one twice, because it compiles or loads kernels."""
-    use_device(device)
     if quality is None:
         shoot = _volprim_shooter(path, frames, overrides)
     elif _is_splats(path):

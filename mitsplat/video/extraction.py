@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mitsplat.child_process import python_command, python_environment
 from mitsplat.content_hash import file_hash
 from mitsplat.errors import InputError
 from mitsplat.files import write_text
@@ -116,9 +115,9 @@ def _chosen(video: Path, folder: Path, found: dict[str, Any]) -> ChosenFrames:
 
 def _run(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> dict[str, Any]:
     """What the child found of the video whose frames it wrote."""
-    command = [sys.executable, "-m", "mitsplat.video.worker", str(video), str(folder), str(most), str(least)]
+    command = python_command("-m", "mitsplat.video.worker", video, folder, str(most), str(least))
     # A list of files to play is no video.
-    environment = {**os.environ, "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file"}
+    environment = python_environment({"OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file"})
     found, error = None, None
     with (
         (folder / "log.txt").open("wb") as log,

@@ -79,10 +79,11 @@ class TestDevice:
         assert run(*command) == 2
         assert "set CUDA_VISIBLE_DEVICES=GPU-1 before" in capsys.readouterr().err
         begun = Calls(error=SystemExit(0))
+        monkeypatch.setenv("PYTHONSAFEPATH", "1")  # main sets it
         monkeypatch.setattr("mitsplat.cli.os.execve", begun)
         monkeypatch.setattr("sys.argv", ["mitsplat", *command])
         monkeypatch.setattr("sys.orig_argv", ["python", "/bin/mitsplat", *command])
         with pytest.raises(SystemExit):
             main()
-        assert begun.args[1][1:] == ["/bin/mitsplat", *command]
+        assert begun.args[1][1:] == ["-P", "/bin/mitsplat", *command]
         assert {"CUDA_VISIBLE_DEVICES": "GPU-1", "MITSPLAT_GPU": "1"}.items() <= begun.args[2].items()

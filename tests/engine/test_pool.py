@@ -7,6 +7,7 @@ import sys
 import time
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker, spawn
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -108,6 +109,65 @@ def test_frames_of_lost_workers_are_made_again(tmp_path, workers):
     assert sorted(made) == list(range(9))
     told = [note for note in notes if "made again" in note]
     assert sorted(told) == [f"the process making frame {i} was killed by SIGKILL: it is made again" for i in (1, 7)]
+
+
+@pytest.fixture
+def interpreter(tmp_path, monkeypatch):
+    """Starts worker processes by a shell script in place of Python."""
+    resource_tracker.ensure_running()  # by Python
+
+    def use(script):
+        path = tmp_path / "python"
+        path.write_text(f"#!/bin/sh\n{script}\n")
+        path.chmod(0o700)
+        monkeypatch.setattr(spawn, "_python_exe", os.fsencode(path))
+
+    return use
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("exit 7", "ended with status 7"),
+        ("kill -9 $$", "was killed by SIGKILL"),
+        ("kill -STOP $$", "did not start within 0.5 s"),
+        ("sleep 60", "did not start within 0.5 s"),
+    ],
+)
+def test_the_start_of_a_worker_is_bounded(monkeypatch, interpreter, script, words):
+    """However large the work is that it does not take."""
+    monkeypatch.setattr(engine, "_START", 0.5)
+    interpreter(script)
+    begun, notes = time.monotonic(), []
+    large = Make(how="x" * 10_000_000)
+    with pytest.raises(LostWorkersError, match=rf"making frame 0 {words}, 3 times"):
+        run(large, 2, {0: [0], 1: [1]}, notes.append)
+    assert time.monotonic() - begun < 20
+    assert notes[0] == f"the process making frame 0 {words}: it is made again"
+
+
+def test_others_make_the_frame_of_a_worker_that_does_not_start(monkeypatch, tmp_path, interpreter):
+    monkeypatch.setattr(engine, "_START", 15.0)
+    mark = tmp_path / "first"
+    interpreter(f'if [ ! -e {mark} ]; then touch {mark}; kill -STOP $$; fi; exec {sys.executable} "$@"')
+    notes = []
+    made = run(Make(), 2, note=notes.append)
+    assert sorted(index for index, _ in made) == list(range(9))
+    assert "the process making frame 0 did not start within 15 s: it is made again" in notes
+
+
+def test_stopped_workers_are_ended(tmp_path):
+    """SIGTERM would wait until they go on."""
+    (tmp_path / "pids").mkdir()
+    with closing(engine._Processes(Linger(tmp_path / "pids"), None)) as pool:
+        for index in range(2):
+            pool.give(pool.start(), index, 0)
+        wait_for(lambda: len(list((tmp_path / "pids").iterdir())) == 2)
+        for path in (tmp_path / "pids").iterdir():
+            os.kill(int(path.name), signal.SIGSTOP)
+        begun = time.monotonic()
+    assert time.monotonic() - begun < 10
+    assert all(ended(path.name) for path in (tmp_path / "pids").iterdir())
 
 
 @dataclass(frozen=True)
@@ -256,6 +316,7 @@ def test_a_gpu_that_does_not_start_costs_a_worker(monkeypatch, kind, exhausted):
     monkeypatch.setattr(engine, "use_share", fail)
     monkeypatch.setattr(engine, "_end_with_parent", lambda: None)
     engine._work(SimpleNamespace(recv=receive, send=said.append), kind, Variant())
+    assert isinstance(said.pop(0), engine.Started)
     assert [(answer.exhausted, answer.message) for answer in said] == [(exhausted, "cuInit() failed")] * 2
 
 

@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -79,7 +80,7 @@ def test_workers_map_one_copy_of_what_was_sent(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("reason", ["read-only", "full"])
-def test_without_a_file_each_has_a_copy(tmp_path, monkeypatch, reason):
+def test_without_a_file_they_share_memory(tmp_path, monkeypatch, caplog, reason):
     if reason == "full":
         monkeypatch.setattr(shared_arrays.tempfile, "TemporaryFile", lambda dir: Path("/dev/full").open("wb"))  # noqa: SIM115
     else:
@@ -87,7 +88,19 @@ def test_without_a_file_each_has_a_copy(tmp_path, monkeypatch, reason):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     splats = splats_of(10)
     packed = shared_arrays.SharedArrays(Describe(splats, box_asset("nut")))
-    opened, arguments = packed.__reduce__()
-    copy = opened(*arguments)
-    assert packed.size == 0 and arguments[1] is None
+    handed = SimpleNamespace(detach=lambda: os.dup(packed._file.fileno()))
+    copy = shared_arrays._open(handed, packed.size)
+    packed.close()
+    assert "workers share memory instead" in caplog.text
     assert total_of(copy.splats) == total_of(splats)
+    assert "/memfd:mitsplat" in Path("/proc/self/maps").read_text()
+
+
+def test_what_a_process_begins_with_is_small():
+    """However much is shared, and in however many arrays: more than a pipe holds would be waited for."""
+    value = [np.arange(3) for _ in range(20_000)], "text" * 100_000
+    with closing(shared_arrays.SharedArrays(value)) as packed:
+        assert packed.size > 20_000 * 64
+        assert packed.__reduce__()[1][1:] == (packed.size,)
+        arrays, text = shared_arrays._open(SimpleNamespace(detach=lambda: os.dup(packed._file.fileno())), packed.size)
+    assert len(arrays) == 20_000 and arrays[-1].tolist() == [0, 1, 2] and text == value[1]

@@ -1,0 +1,145 @@
+"""Child processes in a folder that holds Python files: none of these is run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+NAMES = """
+    argparse ast base64 cgitb codecs collections contextlib copy copyreg csv ctypes dataclasses datetime
+    drjit enum functools gaussforge importlib inspect io json logging math mitsuba multiprocessing newton
+    numpy os pathlib pickle platform pycolmap queue random re resource scipy select selectors shutil signal
+    site sitecustomize socket ssl string struct subprocess tempfile threading traceback trimesh types typing
+    usercustomize uuid warnings warp weakref yaml zipfile zlib
+"""
+
+
+PARENT = """
+import os, sys, shutil
+from contextlib import closing, suppress
+from pathlib import Path
+
+
+def worker():
+    import operator
+    from mitsplat.engine.pool import run_frames
+    print(list(run_frames(operator.is_, {0: [0], 1: [1]}, workers=2, note=print)))
+
+
+def image():
+    from mitsplat.untrusted_images import check_images
+    Path("picture.png").write_bytes(b"no picture")
+    print(check_images([Path("picture.png")]))
+
+
+def splats():
+    from mitsplat import splat_files
+    print(splat_files._convert(b"nothing", "ksplat", "ply"))
+
+
+def doctor():
+    from mitsplat.checks.doctor import _try
+    print(_try("cpu", {}))
+
+
+def colmap():
+    from mitsplat.audit.listed import ColmapReader
+    Path("colmap").mkdir()
+    for name in ("cameras", "images", "points3D"):
+        Path("colmap", f"{name}.txt").write_text("")
+    print(list(ColmapReader(Path.cwd())._read()))
+
+
+def cameras():
+    from mitsplat.capture import structure_from_motion
+    structure_from_motion._run({"images": "none", "groups": [["a.jpg"]]}, Path("sfm"), None)
+
+
+def video():
+    from mitsplat.video.extraction import choose_frames
+    Path("video.mp4").write_bytes(b"no video")
+    choose_frames(Path("video.mp4"), Path("frames"), most=10, least=3)
+
+
+def service():
+    from mitsplat.engine import mps
+    Path("bin").mkdir()
+    control = Path("bin", mps.CONTROL)
+    control.write_text('#!/bin/sh\\n[ "$1" = -d ]\\n')
+    control.chmod(0o700)
+    os.environ["PATH"] = f"{control.parent.resolve()}:{os.environ['PATH']}"
+    with closing(mps.SharedGpu()) as shared:
+        print(shared.lack)
+
+
+def presets():
+    from mitsplat.frames.speed_accuracy import measure_steps
+    measure_steps(Path("missing.ply"), [])
+
+
+def nothing():
+    import subprocess
+    subprocess.run([sys.executable, "-c", "import random"])
+
+
+if __name__ == "__main__":
+    from mitsplat.errors import InputError, MissingResourceError
+    try:
+        globals()[sys.argv[1]]()
+    except (InputError, MissingResourceError) as error:
+        print(error)
+"""
+
+KINDS = {
+    "worker": "[False, False]",
+    "image": "not a readable image",
+    "splats": "not a valid ksplat file",
+    "doctor": "('",
+    "colmap": "[]",
+    "cameras": "'task'",
+    "video": "video.mp4: ",
+    "service": "does not serve",
+    "presets": "missing.ply: ",
+}
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch):
+    """Runs a part of the parent in a folder with hostile modules; what it says, and which of these were run."""
+    folder, run = tmp_path / "downloaded", tmp_path / "run"
+    folder.mkdir(), run.mkdir()
+    for name in NAMES.split():
+        (folder / f"{name}.py").write_text(f"open({str(run / name)!r}, 'w').close()\n")
+    (tmp_path / "script").mkdir()
+    (tmp_path / "script/parent.py").write_text(PARENT)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+
+    def start(*command):
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+        return done.stdout + done.stderr, sorted(path.name for path in run.iterdir())
+
+    return start
+
+
+def test_a_child_without_safe_path_mode_would_run_them(start, tmp_path):
+    assert "random" in start(sys.executable, tmp_path / "script/parent.py", "nothing")[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_child_runs_python_files_of_the_current_folder(start, tmp_path, kind):
+    said, run = start(sys.executable, tmp_path / "script/parent.py", kind)
+    assert run == []
+    assert KINDS[kind] in said
+
+
+@pytest.mark.parametrize("command", [["doctor"], ["check", "scene.yaml"]])
+def test_no_command_runs_python_files_of_the_current_folder(start, command):
+    program = Path(sys.executable).with_name("mitsplat")
+    if not program.exists():
+        pytest.skip("mitsplat is not installed as a command")
+    said, run = start(program, *command)
+    assert run == []
+    assert "scene.yaml" in said or "LLVM" in said

@@ -1,101 +1,146 @@
-"""Who may open the page: whoever is on this machine, or has the token, and no other site's script in their browser.
+"""Access to the page: a token in its address, no other site's script, no frame around it, and few browsers at a time.
 
 viser answers everyone who reaches its port, and has no hook for a check. Its server is made by ``websockets``, which
-has one, ``process_request``: it is given a check of ours, which runs before viser's own.
+has two: ``process_request`` is called with every request, and ``create_connection`` makes the connections. The address
+of the page is also that of its websocket: viser's client derives the one from the other. So a token in the path reaches
+both, and no cookie is needed, which every port of a host would be sent.
 """
 
 from __future__ import annotations
 
 import http
+import re
 import secrets
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
+from functools import partial
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
 
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.view.client_messages import LARGEST, Connection, Pool
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-COOKIE = "mitsplat-view"
+MOST_BROWSERS = 16
+"""Most browsers that are connected at a time: each is sent all that is shown, and holds it until it has read it."""
+
+_LOCAL = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?")
+_HOST = re.compile(r"([\w.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?", re.ASCII)
+_POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        # viser's page is one file that unpacks its script, and sorts splats in WASM whose bindings are made by eval.
+        "script-src 'unsafe-inline' 'unsafe-eval' blob:",
+        "worker-src blob: data:",
+        "style-src 'unsafe-inline'",
+        "img-src 'self' blob: data:",
+        "font-src data:",
+        "connect-src 'self' ws://{host} wss://{host} blob: data:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
 
 
 @dataclass(frozen=True)
 class Guard:
-    """What a request must have.
+    """Conditions of a request.
 
     Attributes:
-        token: That the page's address ends in, and that the browser sends back as a cookie from then on. None where
-            only this machine can ask: then a request must name it as its host, so that no foreign name that was made to
-            lead here is answered.
+        token: Path of the page's address.
+        local: Whether a request must also name this machine as its host, so that no foreign name that was made to lead
+            here is answered.
     """
 
-    token: str | None = None
+    token: str
+    local: bool
 
     @classmethod
     def of_host(cls, host: str) -> Guard:
-        """A new token, unless only this machine is bound to."""
-        return cls(None if host in LOOPBACK else secrets.token_urlsafe(16))
+        """Make a new token for a server that listens on a host."""
+        return cls(secrets.token_urlsafe(16), host in LOOPBACK)
 
-    def refusal(self, path: str, host: str, origin: str | None, cookies: str) -> str | None:
-        """Why a request is refused, or None.
+    def refusal(self, path: str, host: str, origin: str | None) -> str | None:
+        """Say why a request is refused, or None if it is not.
 
         Args:
             path: With what follows ``?``.
             host: Header ``Host``.
             origin: Header ``Origin``, which browsers send with scripts' requests.
-            cookies: Header ``Cookie``.
         """
-        if origin is not None and urlsplit(origin).netloc != host:
+        if (_LOCAL if self.local else _HOST).fullmatch(host) is None:
+            return "not asked for by the name of this machine" + (", localhost" if self.local else "")
+        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
             return "asked for by another site"
-        if self.token is None:
-            name = urlsplit(f"//{host}").hostname
-            return None if name in LOOPBACK else "not asked for by the name of this machine, localhost"
-        if self.invited(path) or secrets.compare_digest(_cookie(cookies).encode(), self.token.encode()):
-            return None
-        return "the address must end in ?token= and the token that `mitsplat view` printed"
+        place, _, query = path.partition("?")
+        page = f"/{self.token}"
+        if not secrets.compare_digest(_bytes(place.removesuffix("/")), _bytes(page)):
+            return "the address must end in the token that `mitsplat view` printed"
+        # viser's client adds the address of its own websocket, and connects to whichever it finds there.
+        if query and query not in (f"websocket=ws://{host}{page}", f"websocket=wss://{host}{page}"):
+            return "the address must have nothing behind the token"
+        return None
 
-    def invited(self, path: str) -> bool:
-        """Whether an address has the token."""
-        given = parse_qs(urlsplit(path).query).get("token", [""])[0]
-        return self.token is not None and secrets.compare_digest(given.encode(), self.token.encode())
+    def answer_headers(self, host: str) -> dict[str, str]:
+        """Headers of the page: it connects to its own server alone, and is shown in no other page."""
+        return {
+            "Content-Security-Policy": _POLICY.format(host=host),
+            "X-Frame-Options": "DENY",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+        }
 
 
 @contextmanager
-def guarded(guard: Guard) -> Iterator[None]:
-    """Servers of ``websockets`` that start within ask the guard first.
+def guarded(guard: Guard) -> Iterator[Pool]:
+    """Make servers of ``websockets`` that start within ask the guard first.
+
+    Yields:
+        The pool whose jobs connections wait for, to be filled in once there is one.
 
     Raises:
         MissingResourceError: If none started, which leaves a page without a guard.
     """
     import websockets.asyncio.server as server  # optional: of the extra `view`
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request
 
-    start, started = server.serve, []
+    start, started, pool = server.serve, [], Pool()
 
     def serve(*args: Any, process_request: Callable[[Any, Request], Response | None], **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Response | None:
-            headers = request.headers
-            reason = guard.refusal(
-                request.path, headers.get("Host", ""), headers.get("Origin"), headers.get("Cookie", "")
-            )
-            if reason is not None:
+            def header(name: str) -> str | None:
+                return ", ".join(request.headers.get_all(name)) or None
+
+            host = header("Host") or ""
+            if reason := guard.refusal(request.path, host, header("Origin")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"mitsplat view: {reason}\n")
-            response = process_request(connection, request)
-            if response is not None and guard.invited(request.path):
-                response.headers["Set-Cookie"] = f"{COOKIE}={guard.token}; HttpOnly; SameSite=Strict; Path=/"
+            if len(connection.server.connections) >= MOST_BROWSERS:
+                text = f"mitsplat view: {MOST_BROWSERS} browsers have this page open, which is the most\n"
+                return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
+            if header("Upgrade") is not None:
+                return None  # the websocket
+            page = Request("/", Headers({"Accept-Encoding": header("Accept-Encoding") or ""}))
+            response = process_request(connection, page)
+            if response is not None:
+                response.headers.update(guard.answer_headers(host))
             return response
 
         started.append(True)
-        return start(*args, process_request=ask, **options)
+        connect = partial(Connection, pool=pool)
+        return start(*args, **options | {"process_request": ask, "create_connection": connect, "max_size": LARGEST})
 
     server.serve = serve
     try:
-        yield
+        yield pool
     finally:
         server.serve = start
     if not started:
@@ -120,9 +165,6 @@ def check_address(host: str, port: int) -> None:
         raise InputError(f"--host and --port must be free to listen on (got {host}, {port}: {reason})") from error
 
 
-def _cookie(header: str) -> str:
-    try:
-        found = SimpleCookie(header).get(COOKIE)
-    except CookieError:
-        return ""
-    return found.value if found is not None else ""
+def _bytes(text: str) -> bytes:
+    """Text of a request, which may hold bytes that are no text."""
+    return text.encode("utf-8", "surrogateescape")

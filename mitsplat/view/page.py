@@ -61,7 +61,7 @@ class Page:
     Attributes:
         gui: viser's controls.
         port: TCP port that it is served on.
-        url: What to open, with the token where one is needed.
+        url: Address to open, which ends in a token.
 
     Raises:
         InputError: If the address cannot be listened on.
@@ -70,11 +70,12 @@ class Page:
     def __init__(self, title: str, address: Address, *, gaussians: int) -> None:
         check_address(address.host, address.port)
         guard = Guard.of_host(address.host)
-        with _silence(), guarded(guard):
+        with _silence(), guarded(guard) as pool:
             self._server = viser.ViserServer(address.host, address.port, label=title, verbose=False)
+        pool.threads = self._server._thread_executor
         self.port = self._server.get_port()
-        self.url = f"http://{address.host}:{self.port}/" + (f"?token={guard.token}" if guard.token else "")
-        self._forbid_tunnels()
+        host = f"[{address.host}]" if ":" in address.host else address.host
+        self.url = f"http://{host}:{self.port}/{guard.token}"
         self._gaussians = gaussians
         self._shown: dict[str, Part] = {}
         self._handles: dict[str, Any] = {}
@@ -93,12 +94,6 @@ class Page:
         self._alert = self.gui.add_html("", visible=False)
         self._groups = self.gui.add_folder("Show", order=1000, visible=False)
         self._boxes: dict[str, Any] = {}
-
-    def _forbid_tunnels(self) -> None:
-        """A browser may not ask for a public address: viser would open a tunnel to a server of its makers."""
-        server = self._server._websock_server
-        for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
-            server.unregister_handler(message)
 
     def close(self) -> None:
         """Stop serving."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
@@ -211,7 +212,11 @@ class ScenePage:
             if number is None:
                 return
             light = self._lights_now()[number]
-            moved = changed_light(light, **changed)
+            try:
+                moved = changed_light(light, **changed)
+            except ValidationError:  # no browser's own control sends such a value
+                self._choose_light()
+                return
             if moved == light:
                 return
             self._lights[number] = moved
@@ -234,8 +239,8 @@ class ScenePage:
 
     @property
     def _chosen(self) -> int | None:
-        name = self._light.value
-        return None if name == _NO_LIGHT else int(name.partition(":")[0])
+        names, name = self._light.options, self._light.value
+        return None if name == _NO_LIGHT or name not in names else names.index(name) - 1
 
     def _light_names(self) -> tuple[str, ...]:
         return (_NO_LIGHT, *(f"{i}: {light.kind}" for i, light in enumerate(self._lights_now())))
@@ -333,7 +338,11 @@ def _draws_looks(scene: Scene) -> bool:
 
 
 def changed_light(light: LightSpec, *, position: Any = None, target: Any = None, strength: Any = None) -> LightSpec:
-    """A light of a frame elsewhere, or of another strength; what it has not is left out."""
+    """A light of a frame elsewhere, or of another strength; what it has not is left out.
+
+    Raises:
+        ValidationError: If no light has such a place or strength.
+    """
     update: dict[str, Any] = {}
     if position is not None and not isinstance(light, EnvironmentLight):
         update["position"] = rounded(position)
@@ -341,7 +350,7 @@ def changed_light(light: LightSpec, *, position: Any = None, target: Any = None,
         update["target"] = rounded(target)
     if strength is not None:
         update[_strength_of(light)] = float(strength)
-    return light.model_copy(update=update)
+    return type(light).model_validate(light.model_dump() | update)
 
 
 def told_error(preview: Preview) -> str:

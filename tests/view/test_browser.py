@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import http.server
 import io
+import select
 import shutil
 import signal
+import socket
+import socketserver
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +25,7 @@ from PIL import Image
 from ruamel.yaml import YAML
 
 from mitsplat.splats import Splats
+from mitsplat.view.page import Address, Page
 from tests.conftest import box_asset, small_scene
 from tests.isolation.balls import capture_of_balls
 
@@ -46,6 +52,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     options.binary_location = chromium
     for option in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('browser')}"):
         options.add_argument(option)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     started = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
     yield started
     started.quit()
@@ -113,6 +120,117 @@ def served(browser: Any, path: Path) -> Iterator[None]:
 def test_the_page_of_a_scene(browser, scene_file):
     with served(browser, scene_file):
         use_page(browser, scene_file)
+
+
+def faults(browser: Any) -> list[str]:
+    """What the browser has refused or failed to do since it was asked last."""
+    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+@contextmanager
+def foreign_site(page_body: str) -> Iterator[tuple[str, str, list[str]]]:
+    """A page of another port with this body, its websocket, which is {own} there, and requests that reach that one."""
+    from websockets.sync.server import serve
+
+    class Site(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    visits: list[str] = []
+    sockets = serve(
+        lambda connection: visits.append(connection.request.path),
+        *("localhost", 0),
+        select_subprotocol=lambda _, offered: offered[0] if offered else None,
+    )
+    own = f"ws://localhost:{sockets.socket.getsockname()[1]}"
+    body = page_body.format(own=own).encode()
+    site = http.server.ThreadingHTTPServer(("localhost", 0), Site)
+    for server in (sockets, site):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+    with site:
+        yield f"http://localhost:{site.server_port}/", own, visits
+        site.shutdown()
+    sockets.shutdown()
+
+
+CONNECT = """
+const [address, done] = arguments;
+const socket = new WebSocket(address);
+socket.onopen = () => done("open");
+socket.onerror = () => done("refused");
+"""
+
+
+def test_a_foreign_page_neither_frames_the_page_nor_connects_it_elsewhere(browser):
+    page = Page("test", Address(port=0), gaussians=10)
+    foreign = "websocket={own}"
+    addresses = [page.url, f"{page.url}?{foreign}", f"{page.url.rpartition('/')[0]}/?{foreign}"]
+    frames = "".join(f'<iframe src="{address}"></iframe>' for address in addresses)
+    links = "".join(f'<p><a href="{address}">{address}</a></p>' for address in addresses)
+    try:
+        with foreign_site(frames + links) as (address, own, visits):
+            for number in (1, 2):
+                browser.get(address)
+                time.sleep(1)
+                browser.find_elements("css selector", "a")[number].click()
+                until(lambda: "mitsplat view:" in browser.page_source)
+            browser.get_log("browser")
+            browser.get(address)
+            until(lambda: any("frame-ancestors" in fault for fault in faults(browser)))
+            assert not page._server.get_clients()
+            browser.find_elements("css selector", "a")[0].click()  # but a link with the token is followed
+            until(page._server.get_clients)
+            browser.refresh()
+            until(lambda: page._server.get_clients() and "websocket=" in browser.current_url)
+            assert faults(browser) == []
+            assert browser.execute_async_script(CONNECT, own) == "refused"
+            assert any("Content Security Policy" in fault for fault in faults(browser))
+            assert visits == []
+    finally:
+        page.close()
+
+
+def test_a_page_is_reached_through_another_port(browser):
+    """As by ``ssh -L 9090:localhost:8080``."""
+    page = Page("test", Address(port=0), gaussians=10)
+    try:
+        with forwarded(page.port) as port:
+            browser.get("about:blank")
+            browser.get_log("browser")
+            browser.get(page.url.replace(f":{page.port}/", f":{port}/"))
+            until(page._server.get_clients)
+            assert faults(browser) == []
+    finally:
+        page.close()
+
+
+@contextmanager
+def forwarded(target: int) -> Iterator[int]:
+    """A port of this machine that leads to another one."""
+
+    class Pipe(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            with socket.create_connection(("localhost", target)) as there:
+                ends = {self.request: there, there: self.request}
+                while True:
+                    for end in select.select(list(ends), [], [])[0]:
+                        if not (data := end.recv(1 << 16)):
+                            return
+                        ends[end].sendall(data)
+
+    class Server(socketserver.ThreadingTCPServer):
+        daemon_threads = True
+
+    with Server(("localhost", 0), Pipe) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_address[1]
+        server.shutdown()
 
 
 def test_a_click_on_a_capture_picks_what_is_there(browser, tmp_path):

@@ -3,68 +3,105 @@
 from __future__ import annotations
 
 import http.client
+import re
+import socket
 from collections.abc import Iterator
-from contextlib import closing
-from pathlib import Path
+from contextlib import ExitStack, closing
 
 import pytest
+import viser
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.view.guard import COOKIE, Guard, check_address, guarded
+from mitsplat.view.guard import MOST_BROWSERS, Guard, check_address, guarded
 from mitsplat.view.page import Address, Page
 
 TOKEN = "a-token"
+PAGE = f"/{TOKEN}"
 
 
 @pytest.mark.parametrize(
-    ("path", "host", "origin", "refused"),
+    ("host", "origin", "refused"),
     [
-        ("/", "localhost:8080", None, False),
-        ("/", "127.0.0.1:8080", "http://127.0.0.1:8080", False),
-        ("/", "[::1]:8080", None, False),
-        ("/", "evil.example:8080", "http://evil.example:8080", True),  # a name that was made to lead here
-        ("/", "localhost:8080", "http://evil.example", True),
-        ("/", "localhost:8080", "http://localhost:3000", True),
-        ("/", "localhost:8080", "null", True),
-        ("/", "", None, True),
+        ("localhost:8080", None, False),
+        ("localhost", "http://localhost", False),
+        ("localhost:9090", "http://localhost:9090", False),  # a tunnel from another port
+        ("127.0.0.1:8080", "http://127.0.0.1:8080", False),
+        ("[::1]:8080", None, False),
+        ("evil.example:8080", "http://evil.example:8080", True),  # a name that was made to lead here
+        ("localhost:8080", "http://evil.example", True),
+        ("localhost:8080", "http://localhost:3000", True),
+        ("localhost:8080", "null", True),
+        ("localhost:8080", "http://[", True),
+        ("localhost:8080, localhost:8080", None, True),
+        ("[", None, True),
+        ("[::1", None, True),
+        ("localhost:8080; script-src *", None, True),
+        ("", None, True),
     ],
 )
-def test_without_a_token_this_machine_alone_may_ask(path, host, origin, refused):
-    assert (Guard().refusal(path, host, origin, "") is not None) == refused
+def test_a_local_page_is_asked_for_by_the_name_of_this_machine(host, origin, refused):
+    assert (Guard(TOKEN, local=True).refusal(PAGE, host, origin) is not None) == refused
 
 
 @pytest.mark.parametrize(
-    ("path", "origin", "cookies", "refused"),
+    ("host", "origin", "refused"),
     [
-        ("/", None, "", True),
-        (f"/?token={TOKEN}", None, "", False),
-        ("/?token=", None, "", True),
-        ("/?token=ä", None, "", True),
-        ("/", None, f"other=1; {COOKIE}={TOKEN}", False),
-        ("/", None, f"{COOKIE}=x{TOKEN}", True),
-        ("/", None, "\x00=;;", True),
-        ("/", "http://host:1", f"{COOKIE}={TOKEN}", False),
-        ("/", "http://evil.example", f"{COOKIE}={TOKEN}", True),
+        ("host:1", None, False),
+        ("host.example", "https://host.example", False),
+        ("[fe80::1]:80", None, False),
+        ("host:1", "http://evil.example", True),
+        ("host:1; script-src *", None, True),
+        ("[", None, True),
+        ("", None, True),
     ],
 )
-def test_elsewhere_a_token_is_asked_for(path, origin, cookies, refused):
-    assert (Guard(TOKEN).refusal(path, "host:1", origin, cookies) is not None) == refused
+def test_a_page_on_the_network_is_asked_for_by_any_name(host, origin, refused):
+    assert (Guard(TOKEN, local=False).refusal(PAGE, host, origin) is not None) == refused
 
 
-def test_only_this_machine_needs_none():
-    assert Guard.of_host("localhost") == Guard.of_host("127.0.0.1") == Guard(None)
-    one, other = Guard.of_host("0.0.0.0"), Guard.of_host("0.0.0.0")
-    assert len(one.token) >= 20
-    assert one != other
+@pytest.mark.parametrize("local", [True, False])
+@pytest.mark.parametrize(
+    ("path", "refused"),
+    [
+        (PAGE, False),
+        (f"{PAGE}/", False),
+        (f"{PAGE}?websocket=ws://localhost:1{PAGE}", False),  # what viser's script writes there
+        ("/", True),
+        (f"/?token={TOKEN}", True),
+        (f"{PAGE}x", True),
+        (f"/x{PAGE}", True),
+        ("//[", True),
+        ("/\udcff", True),
+        (f"{PAGE}?websocket=ws://evil.example", True),
+        (f"{PAGE}?websocket=ws://localhost:2{PAGE}", True),
+        (f"{PAGE}?%77ebsocket=ws://evil.example", True),
+        (f"{PAGE}?websocket=ws://localhost:1{PAGE}&websocket=ws://evil.example", True),
+        (f"{PAGE}?playbackPath=http://evil.example/x.viser", True),
+    ],
+)
+def test_the_address_has_the_token_and_nothing_else(path, refused, local):
+    assert (Guard(TOKEN, local).refusal(path, "localhost:1", None) is not None) == refused
 
 
-@pytest.fixture
-def page() -> Iterator[Page]:
-    page = Page("test", Address("0.0.0.0", 0), gaussians=10)
+def test_every_page_has_a_token_of_its_own():
+    guards = [Guard.of_host(host) for host in ("localhost", "localhost", "127.0.0.1", "0.0.0.0")]
+    assert [guard.local for guard in guards] == [True, True, True, False]
+    assert len({guard.token for guard in guards}) == 4
+    assert all(len(guard.token) >= 20 for guard in guards)
+
+
+@pytest.fixture(params=["localhost", "0.0.0.0"])
+def page(request) -> Iterator[Page]:
+    page = Page("test", Address(request.param, 0), gaussians=10)
     yield page
     page.close()
+
+
+def place(page: Page) -> str:
+    """Path of the page's address."""
+    return "/" + page.url.rpartition("/")[2]
 
 
 def answer(page: Page, path: str, **headers: str) -> http.client.HTTPResponse:
@@ -75,28 +112,93 @@ def answer(page: Page, path: str, **headers: str) -> http.client.HTTPResponse:
         return response
 
 
+def status(page: Page, *lines: bytes) -> int:
+    """Status that is answered to a request as it is written."""
+    with closing(socket.create_connection(("127.0.0.1", page.port), timeout=20)) as connection:
+        connection.sendall(b"\r\n".join((*lines, b"", b"")))
+        return int(connection.recv(100).split()[1])
+
+
+def browser(page: Page, path: str, **options: object) -> ClientConnection:
+    address = f"ws://127.0.0.1:{page.port}{path}"
+    return connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, **options)
+
+
 def test_a_server_asks_its_visitors(page):
-    token = page.url.partition("token=")[2]
     assert answer(page, "/").status == 403
-    first = answer(page, f"/?token={token}")
-    assert first.status == 200
-    cookie = first.headers["Set-Cookie"]
-    assert "HttpOnly" in cookie
-    assert "SameSite=Strict" in cookie
-    known = {"Cookie": cookie.partition(";")[0]}
-    assert answer(page, "/", **known).status == 200
-    for path in ("/../../../../../../etc/passwd", "/%2e%2e/%2e%2e/pyproject.toml", "/etc/passwd"):
-        assert answer(page, path, **known).status == 404
-    address = f"ws://127.0.0.1:{page.port}/"
+    assert answer(page, place(page)).status == 200
+    for path in ("/../../../../../../etc/passwd", "/%2e%2e/%2e%2e/pyproject.toml", "/etc/passwd", "/index.html"):
+        assert answer(page, path).status == 403
+        assert answer(page, place(page) + path).status == 403
     with pytest.raises(InvalidStatus, match="403"):
-        connect(address)
+        browser(page, "/")
     with pytest.raises(InvalidStatus, match="403"):
-        connect(address, additional_headers=known, origin="http://evil.example")
-    connect(address, additional_headers=known, subprotocols=["viser-v0"]).close()
+        browser(page, place(page), origin="http://evil.example")
+    browser(page, place(page)).close()
+
+
+def test_the_page_connects_to_its_own_server_and_is_shown_in_no_frame(page):
+    headers = answer(page, place(page)).headers
+    policy = dict(rule.split(" ", 1) for rule in headers["Content-Security-Policy"].split("; "))
+    own = f"127.0.0.1:{page.port}"
+    assert policy["connect-src"] == f"'self' ws://{own} wss://{own} blob: data:"
+    assert policy["frame-ancestors"] == policy["default-src"] == policy["base-uri"] == "'none'"
+    assert headers["X-Frame-Options"] == "DENY"
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert headers["Set-Cookie"] is None
+
+
+def test_the_page_of_one_server_does_not_end_that_of_another(page):
+    """Cookies are those of a host and not of a port, so neither page may need one."""
+    other = Page("other", Address("0.0.0.0", 0), gaussians=10)
+    try:
+        assert [answer(one, place(one)).status for one in (page, other, page)] == [200] * 3
+        assert [answer(one, place(two)).status for one, two in ((page, other), (other, page))] == [403] * 2
+        for one in (page, other):
+            browser(one, place(one)).close()
+    finally:
+        other.close()
+
+
+def test_an_odd_request_is_refused_and_no_fault_of_the_server(page):
+    get = b"GET " + place(page).encode() + b" HTTP/1.1"
+    host = b"Host: localhost:1"
+    assert status(page, get, host) == 200
+    assert status(page, get, b"Host: [") == 403
+    assert status(page, get) == 403
+    assert status(page, get, host, host) == 403
+    assert status(page, get, host, b"Origin: http://[") == 403
+    assert status(page, get, host, b"Origin: http://localhost:1", b"Origin: null") == 403
+    assert status(page, get, host, b"Accept-Encoding: gzip", b"Accept-Encoding: br") == 200
+    assert status(page, b"GET //[ HTTP/1.1", host) == 403
+    assert status(page, b"GET /\xff HTTP/1.1", host) == 403
+    assert status(page, b"GET /%00 HTTP/1.1", host) == 403
+    assert status(page, get.replace(b" HTTP", b"?a=" + b"x" * 7000 + b" HTTP"), host) == 403
+    assert status(page, get, host, b"Upgrade: websocket", b"Upgrade: websocket") in (400, 426)
+    assert status(page, get, host, b"Upgrade: h2c") in (400, 426)
+
+
+def test_only_so_many_browsers_are_connected(page):
+    with ExitStack() as opened:
+        first = [opened.enter_context(browser(page, place(page))) for _ in range(MOST_BROWSERS)]
+        with pytest.raises(InvalidStatus, match="503"):
+            browser(page, place(page))
+        assert answer(page, place(page)).status == 503
+        first[0].close()
+        browser(page, place(page)).close()
+
+
+def test_the_address_of_a_number_of_version_6_has_brackets():
+    try:
+        page = Page("test", Address("::1", 0), gaussians=10)
+    except InputError as error:
+        pytest.skip(f"this machine has no such address: {error}")
+    page.close()
+    assert re.fullmatch(r"http://\[::1\]:\d+/[\w-]{20,}", page.url)
 
 
 def test_a_page_that_is_not_guarded_is_not_served():
-    with pytest.raises(MissingResourceError, match="cannot be guarded"), guarded(Guard()):
+    with pytest.raises(MissingResourceError, match="cannot be guarded"), guarded(Guard.of_host("localhost")):
         pass
 
 
@@ -105,10 +207,3 @@ def test_what_cannot_be_listened_on_is_refused(page):
         check_address("0.0.0.0", page.port)
     with pytest.raises(InputError, match="from 0 to 65535"):
         check_address("localhost", 65536)
-
-
-def test_no_browser_makes_the_server_open_a_tunnel(page):
-    import viser
-
-    assert not page._server._websock_server._incoming_handlers.get(viser._messages.ShareUrlRequest)
-    assert Path(viser.__file__).is_file()

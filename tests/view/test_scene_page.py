@@ -21,6 +21,7 @@ from mitsplat.view.page import Address, Page
 from mitsplat.view.previews import SceneRenders, ViewRequest
 from mitsplat.view.scene_page import ScenePage
 from tests.conftest import box_asset, small_scene
+from tests.view.test_client_messages import CAMERA, joined, packed
 
 LONG = 60
 
@@ -145,6 +146,53 @@ def test_a_light_is_moved_and_told_as_a_line(shown):
     assert np.abs(after.astype(int) - before).mean() > 2
     shown.scene_page._reset_lights()
     assert np.abs(shown.picture().astype(int) - before).mean() < 1
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"position": (0.1, 0.2)},
+        {"target": (0.1, float("nan"), 0)},
+        {"strength": -1.0},
+        {"strength": float("inf")},
+        {"strength": 0.0},
+    ],
+    ids=str,
+)
+def test_a_light_that_cannot_be_is_not_taken(shown, changed):
+    shown.scene_page._light.value = "0: area"
+    before = shown.scene_page._lights_now()
+    shown.scene_page._move_light(**changed)
+    assert shown.scene_page._lights_now() == before
+    shown.scene_page._light.value = "no light"
+    assert shown.scene_page._chosen is None
+    shown.scene_page._light.value = "none"
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        CAMERA | {"look_at": [float("nan"), 0, 0]},
+        CAMERA | {"look_at": CAMERA["position"]},
+        CAMERA | {"up_direction": [0, 0, 0]},
+        CAMERA | {"wxyz": [0, 0, 0, 0]},
+        CAMERA | {"position": [1e300, 0, 0]},
+        CAMERA | {"position": [1e6, -1e6, 1e6], "look_at": [1e6, -1e6, 1e6 - 0.01]},  # taken, and far away
+    ],
+    ids=str,
+)
+def test_no_camera_of_a_browser_ends_the_page(shown, camera):
+    shown.scene_page._look_at_frame(0)
+    shown.picture()
+    with joined(shown.page) as browser:
+        shown.wait(shown.page._server.get_clients)
+        browser.send(packed(camera))
+        time.sleep(0.2)
+        shown.picture()
+        shown.scene_page._look_at_frame(1)  # moves the browser's camera
+        shown.picture()
+    shown.wait(lambda: not shown.page._server.get_clients())
+    shown.scene_page._look_at_frame(0)
 
 
 def test_another_drop_moves_objects(shown):

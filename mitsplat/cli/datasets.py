@@ -380,7 +380,7 @@ def view(
         typer.Argument(metavar="PATH", help="Scene file (.yaml), asset, capture or dataset folder, or a splat file."),
     ],
     host: Annotated[
-        str, typer.Option(help="Address to listen on; any but localhost asks visitors for a token.")
+        str, typer.Option(help="Address to listen on; any but localhost is reached from other machines.")
     ] = "localhost",
     port: Annotated[int, typer.Option(help="TCP port to listen on.")] = 8080,
     gaussians: Annotated[

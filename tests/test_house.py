@@ -159,6 +159,11 @@ def test_processes_of_multiprocessing_start_safely() -> None:
     assert "with starting_safely(), starting_on(" in source and source.count("process.start()") == 1
 
 
+def test_opencv_opens_no_picture_by_itself() -> None:
+    """It ends the process where a path is not UTF-8."""
+    assert [module for module, path in MODULES.items() if "cv2.imread(" in path.read_text()] == []
+
+
 def test_imports_inside_of_functions_say_why() -> None:
     silent = [
         f"{path.relative_to(ROOT)}:{line}"

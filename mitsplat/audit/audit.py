@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from mitsplat.arrays import Float64Array
@@ -34,6 +33,7 @@ from mitsplat.audit.truth import TrueFrame
 from mitsplat.content_hash import file_hash
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.files import SPLITS, Record, splits_of
+from mitsplat.picture_files import read_picture
 
 _SHARE = 1e-5
 """Difference of shares that are stored with six decimals."""
@@ -147,7 +147,7 @@ def _check_files(root: Path, record: Record) -> Violations:
 def _check_rest(root: Path) -> Violations:
     """What belongs to no format."""
     sheet = root / "contact_sheet.jpg"
-    if not sheet.is_file() or cv2.imread(str(sheet)) is None:
+    if not sheet.is_file() or read_picture(sheet) is None:
         yield sheet.name, "is missing or cannot be read as an image"
     if not any((root / "scene").glob("*")):
         yield "scene", "does not hold the scene file"

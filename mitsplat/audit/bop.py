@@ -24,6 +24,7 @@ from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
 from mitsplat.errors import InputError
 from mitsplat.json_stream import read_entries
+from mitsplat.picture_files import read_picture
 
 _PARTS = ("camera", "gt", "gt_info")
 _MODEL_ROUNDED = 0.01
@@ -78,7 +79,7 @@ class BopReader:
                 self._try_on(frame, label, found.get("camera", {}), pose)
         if "gt_info" in found:
             picture = self._root / f"{frame.bop_folder}/depth/{frame.index:06d}.png"
-            depth = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED) if picture.is_file() else None
+            depth = read_picture(picture, cv2.IMREAD_UNCHANGED) if picture.is_file() else None
             for label, info in zip(frame.instances, found["gt_info"], strict=True):
                 yield from self._said("gt_info", frame, _check_info(frame, label, info, depth))
 

@@ -16,6 +16,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.audit.conveyor import BeltTruth
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
+from mitsplat.picture_files import read_picture
 
 _FLOW_ROUNDED = 0.02
 """Difference that single precision and lens models make in optical flow [px]."""
@@ -222,7 +223,7 @@ def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
 
 
 def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] | None:
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture = read_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None or picture.dtype != np.uint16 or picture.shape != shape:
         return None
     return picture.astype(np.uint16, copy=False)

@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.audit.truth import TrueFrame, TrueInstance, bounds_of
+from mitsplat.picture_files import read_picture
 
 POLYGON_IOU = 0.99
 """Least IoU of a mask in one part and its polygon, for masks of more than :data:`POLYGON_AREA` pixels."""
@@ -30,7 +31,7 @@ Violations = Iterator[tuple[str, str]]
 
 def check_image(frame: TrueFrame, path: Path) -> Iterator[str]:
     """What is wrong with the frame's picture."""
-    image = cv2.imread(str(path))
+    image = read_picture(path)
     width, height = frame.size
     if image is None:
         yield "cannot be read as an image"
@@ -185,7 +186,7 @@ def _check_voc(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 def read_grey(path: Path, frame: TrueFrame) -> Int64Array | None:
     """A grey picture of 8 or 16 bits, None if it is none of the frame's size."""
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture = read_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None or picture.shape != frame.size[::-1]:
         return None
     return picture.astype(np.int64)
@@ -212,7 +213,7 @@ def _check_semantic(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 def segment_picture(frame: TrueFrame, path: Path) -> Int64Array | None:
     """Ids of a panoptic picture, R + 256 G + 65536 B as panopticapi reads them."""
-    picture = cv2.imread(str(path))
+    picture = read_picture(path)
     if picture is None or picture.shape[:2] != frame.size[::-1]:
         return None
     blue, green, red = (picture[..., channel].astype(np.int64) for channel in range(3))
@@ -235,7 +236,7 @@ def _check_panoptic(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 
 def _check_depth(frame: TrueFrame, path: Path) -> Iterator[str]:
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture = read_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None or picture.dtype != np.uint16 or picture.shape != frame.size[::-1]:
         yield "cannot be read as a 16-bit image of the frame's size"
     elif (missing := np.count_nonzero((frame.ids > 0) & (picture == 0))) and _from_splats(frame):
@@ -266,7 +267,7 @@ def check_bop(frame: TrueFrame, damaged: Collection[str]) -> Violations:
 
 
 def _check_mask(expected: BoolArray, path: Path) -> Iterator[str]:
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture = read_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None or picture.shape != expected.shape:
         yield "cannot be read as a grey image of the frame's size"
     elif ((picture > 0) != expected).any():

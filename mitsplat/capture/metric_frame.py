@@ -18,6 +18,7 @@ from mitsplat.boards.targets import Board, find_tags
 from mitsplat.camera import Camera
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
+from mitsplat.picture_files import read_picture
 
 DEFAULT_BOARD = Board()
 """What `mitsplat board` prints by default."""
@@ -351,7 +352,7 @@ def _find_targets(model: SparseModel, images: Mapping[str, Path], board: Board, 
     corner_views: _Views = {}
     tag_views: _Views = {}
     for name, camera in model.cameras.items():
-        grey = cv2.imread(str(images[name]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        grey = read_picture(images[name], cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
         if grey is None:
             raise InputError(f"{images[name]}: not a readable image")
         pixels = np.asarray(grey, dtype=np.uint8)

@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from mitsplat.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
-from mitsplat.errors import LateDeviceError, exit_status, sentence_of
+from mitsplat.errors import InputError, LateDeviceError, exit_status, sentence_of
 from mitsplat.version import __version__
 
 app = typer.Typer(
@@ -66,6 +67,7 @@ def main(args: Sequence[str] | None = None) -> None:
     if args is None:
         leave_current_folder()
     try:
+        _check_text([*(sys.argv[1:] if args is None else args), os.fspath(Path.cwd())])
         app(args)
     except Exception as error:  # noqa: BLE001 - the last one who can tell the user
         if args is None and isinstance(error, LateDeviceError):
@@ -74,6 +76,15 @@ def main(args: Sequence[str] | None = None) -> None:
         status = exit_status(error)
         typer.echo(f"mitsplat: {fault.tell_fault(error) if status is None else sentence_of(error)}", err=True)
         sys.exit(fault.STATUS if status is None else status)
+
+
+def _check_text(texts: Sequence[str]) -> None:
+    """Refuse names that are not UTF-8, which native libraries do not take or end this process by."""
+    for text in texts:
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            raise InputError(f"names of files and folders must be UTF-8 (got {os.fsencode(text)!r})") from None
 
 
 def _show_version(wanted: bool) -> None:

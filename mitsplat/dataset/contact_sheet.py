@@ -12,6 +12,7 @@ from mitsplat.files import Record, write_file
 from mitsplat.formats.coco import image_file
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import draw_labels
+from mitsplat.picture_files import read_picture
 
 _COLUMNS = 4
 _TILE_WIDTH = 480
@@ -58,7 +59,7 @@ class ContactSheet:
 
 def _tile(root: Path, record: Record) -> ByteImage:
     file = root / image_file(record)
-    image = cv2.imread(str(file))
+    image = read_picture(file)
     if image is None:
         raise OSError(f"{file} cannot be read as an image")
     rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)

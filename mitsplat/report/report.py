@@ -22,6 +22,7 @@ from mitsplat.html import inline_image, make_page, mask_path
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour
 from mitsplat.masks import Silhouette
+from mitsplat.picture_files import read_picture
 from mitsplat.report.variety import Variety
 from mitsplat.svg_charts import HeatMap, Histogram, bars, columns
 
@@ -171,7 +172,7 @@ def _samples(root: Path, records: Iterable[Record]) -> str:
 
 
 def _sample(root: Path, record: Record) -> str:
-    image = cv2.imread(str(root / image_file(record)))
+    image = read_picture(root / image_file(record))
     if image is None:
         return f"<figure><figcaption>Frame {record['index']}: its image cannot be read</figcaption></figure>"
     labels = Labels.from_json(record["labels"])
@@ -214,7 +215,7 @@ def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, Hist
     """Counts of pixels by luma in 32 bins, and of images by their mean luma."""
     counts, means = np.zeros(32, dtype=np.int64), Histogram((0, 255))
     for record in records:
-        grey = cv2.imread(str(root / image_file(record)), cv2.IMREAD_GRAYSCALE)
+        grey = read_picture(root / image_file(record), cv2.IMREAD_GRAYSCALE)
         if grey is not None:
             counts += np.histogram(grey, bins=32, range=(0, 256))[0]
             means.add(grey.mean())

@@ -15,6 +15,7 @@ from mitsplat.errors import InputError
 from mitsplat.files import Record, file_inside
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour, draw_labels
+from mitsplat.picture_files import read_picture
 
 OverlayName = Literal["labels", "silhouettes", "none"]
 OVERLAYS: tuple[OverlayName, ...] = get_args(OverlayName)
@@ -108,7 +109,7 @@ class DatasetIndex:
             path = file_inside(self._root, name)
         except InputError as error:
             raise InputError(f"{self._root}: frame {index}: {error}") from error
-        stored = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        stored = read_picture(path, cv2.IMREAD_COLOR)
         height, width = record["labels"]["size"][::-1]
         if stored is None or stored.shape[:2] != (height, width):
             raise InputError(f"{path}: must be a readable image of {width}x{height} px")

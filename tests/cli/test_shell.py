@@ -30,6 +30,7 @@ from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.scene import load_scene
 from mitsplat.surfels import place_surfels
 from tests import rendered
+from tests.cli.typed import run as type_in
 from tests.conftest import box_asset
 from tests.lighting import room
 
@@ -275,3 +276,20 @@ def test_videos_become_captures_as_documented(tmp_path: Path) -> None:
         assert (made / "capture.png").stat().st_size
         assert len(list((made / "images").iterdir())) >= 0.75 * len(list((made / "frames").glob("*.jpg"))) > 12
     assert FILMED
+
+
+@pytest.mark.parametrize("command", ["audit", "report", "render", "check", "schema"])
+def test_a_name_that_is_not_utf_8_is_one_sentence(command, capsys):
+    """Native libraries end the process instead, or take it for no text."""
+    assert type_in(command, os.fsdecode(b"bad\xff/scene.yaml")) == 2
+    assert capsys.readouterr().err == (
+        "mitsplat: names of files and folders must be UTF-8 (got b'bad\\xff/scene.yaml')\n"
+    )
+
+
+def test_a_current_folder_that_is_not_utf_8_is_one_sentence(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / os.fsdecode(b"bad\xff")
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    assert type_in("check", "scene.yaml") == 2
+    assert "must be UTF-8" in capsys.readouterr().err

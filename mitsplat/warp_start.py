@@ -8,6 +8,9 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from mitsplat.cache import prepare_caches
+from mitsplat.errors import FULL
+
 _started = False
 _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 
@@ -16,7 +19,8 @@ _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 def quiet_warp() -> Iterator[None]:
     """Warp, started, telling of nothing but errors; a function may be decorated by this.
 
-    That a machine has no GPU is no news: the warning, which no setting mutes, is left out.
+    That a machine has no GPU is no news: the warning, which no setting mutes, is left out. An error that a disk is full
+    names the folder of Warp's kernels, because nothing else is written here.
     """
     import warp as wp  # takes a third of a second, which only physics needs
 
@@ -25,10 +29,15 @@ def quiet_warp() -> Iterator[None]:
     wp.config.log_level = wp.LOG_ERROR
     try:
         if not _started:
+            prepare_caches()
             with _stderr_without(_NO_GPU):
                 wp.init()  # type: ignore[no-untyped-call]
             _started = True
         yield
+    except OSError as error:
+        if error.errno in FULL and error.filename is None:
+            error.filename = wp.config.kernel_cache_dir
+        raise
     finally:
         wp.config.log_level = kept
 

@@ -9,13 +9,12 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from mitsplat.cache import cache_folder
+from mitsplat.cache import cache_folder, drjit_folder, warp_folder, why_unusable
 from mitsplat.child_process import python_command, python_environment
 from mitsplat.device import Lack, gpu_environment, visible_gpus
 from mitsplat.engine.resources import unused_memory
@@ -40,10 +39,10 @@ def examine() -> Iterator[Finding]:
     yield _processor()
     yield _llvm()
     yield _cuda()
+    yield _cache()
     yield _warp()
     yield _memory()
     yield _disk()
-    yield _cache()
 
 
 def _package(name: str) -> Finding:
@@ -119,15 +118,12 @@ def _disk() -> Finding:
 
 
 def _cache() -> Finding:
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        remedy = "make it writable, or set XDG_CACHE_HOME: layouts are settled and pieces made in every run else"
-        return Finding("cache", False, f"{folder}: {error.strerror}", remedy)
-    return Finding("cache", True, f"{folder} can be written")
+    folders = (cache_folder(), warp_folder(), drjit_folder())
+    lacks = [f"{folder}: {lack}" for folder in folders if (lack := why_unusable(folder))]
+    if lacks:
+        remedy = "set HOME or XDG_CACHE_HOME to a folder with room: kernels, layouts and pieces are made anew else"
+        return Finding("cache", False, "; ".join(lacks), remedy)
+    return Finding("cache", True, f"{', '.join(map(str, folders))} can be written")
 
 
 def _warp() -> Finding:
@@ -139,8 +135,6 @@ def _warp() -> Finding:
             devices = ", ".join(str(device) for device in warp.get_devices())
     except (ImportError, RuntimeError) as error:
         return Finding("warp", False, str(error), remedy)
-    except OSError as error:
-        return Finding("warp", False, str(error), "make its cache writable, or set XDG_CACHE_HOME")
     return Finding("warp", True, f"{version('warp-lang')} on {devices}")
 
 

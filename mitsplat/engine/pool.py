@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
+from mitsplat.cache import prepare_caches
 from mitsplat.child_process import starting_safely
 from mitsplat.cores import usable_cores
 from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
@@ -476,6 +477,7 @@ class _Processes(Generic[Result]):
     def __init__(
         self, make: MakeFrame[Result], device: Device | None, environment: Mapping[str, str] | None = None
     ) -> None:
+        prepare_caches()  # workers inherit the folders
         self._make = SharedArrays(make)
         self._environment = environment or {}
         self._kind = None if device is None else device.kind

@@ -22,7 +22,7 @@ def found():
 
 def test_a_healthy_machine(monkeypatch):
     first = found()
-    names = ["Python", "mitsuba", "drjit", "newton", "processor", "LLVM", "GPU", "warp", "memory", "disk", "cache"]
+    names = ["Python", "mitsuba", "drjit", "newton", "processor", "LLVM", "GPU", "cache", "warp", "memory", "disk"]
     assert list(first) == names
     assert all(finding.ok for finding in first.values())
     assert all(finding.remedy or finding.name in ("mitsuba", "drjit", "newton", "warp", "cache", "LLVM")

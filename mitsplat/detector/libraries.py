@@ -26,6 +26,9 @@ UNREADABLE = (
 )
 """What reading a damaged file of weights raises."""
 
+OLDEST_TORCH = "2.6"
+"""First release of PyTorch that lists the classes of a file before it reads it, as the safe loader needs."""
+
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,2})?")
 
 
@@ -44,22 +47,35 @@ def load_libraries() -> None:
 
     ``YOLO_CONFIG_DIR`` and ``YOLO_VERBOSE`` keep the values that a user has given them.
 
+    Weights are pickles, which the safe loader of Ultralytics reads as classes that it knows. It cannot be turned off.
+
     Raises:
-        MissingResourceError: If it is not installed.
+        MissingResourceError: If it is not installed, or PyTorch is too old for the safe loader.
     """
     missing = [name for name in ("torch", "torchvision", "ultralytics") if find_spec(name) is None]
     if missing:
         raise MissingResourceError(f"detectors need {' and '.join(missing)}: pip install 'mitsplat[train]'")
+    import torch
+
+    # Without it Ultralytics silently falls back to a loader that executes code.
+    if not hasattr(torch.serialization, "get_unsafe_globals_in_checkpoint"):
+        raise MissingResourceError(
+            f"detectors need PyTorch {OLDEST_TORCH} or newer, which reads weights without executing code from them "
+            f"(got {torch.__version__}): pip install 'torch>={OLDEST_TORCH}'"
+        )
     os.environ["YOLO_OFFLINE"] = "true"
     os.environ["YOLO_AUTOINSTALL"] = "false"
     os.environ.setdefault("YOLO_VERBOSE", "false")
-    os.environ.setdefault("ULTRALYTICS_SAFE_LOAD", "true")  # weights are pickles: only classes that it knows
+    os.environ["ULTRALYTICS_SAFE_LOAD"] = "true"
     if "YOLO_CONFIG_DIR" not in os.environ:
         folder = tempfile.mkdtemp(prefix="mitsplat-ultralytics-")
         os.environ["YOLO_CONFIG_DIR"] = folder
         atexit.register(_remove, folder, os.getpid())
-    from ultralytics.utils.events import events  # reads these variables as it is imported, if it was not before
+    from ultralytics.nn import tasks
+    from ultralytics.utils.events import events
 
+    # Ultralytics reads the variables when it is imported, which may have been before.
+    tasks.SAFE_LOAD = True
     events.enabled = False
 
 

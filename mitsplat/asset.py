@@ -32,6 +32,7 @@ from mitsplat.errors import InputError
 from mitsplat.files import MESH_ERRORS, file_inside, storage_errors
 from mitsplat.format_version import FORMAT_VERSIONS
 from mitsplat.mesh import check_faces
+from mitsplat.spec_types import Name
 from mitsplat.splats import Splats
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
@@ -64,8 +65,8 @@ class AssetSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
     format_version: int = Field(1, ge=1, description="Version of what this file says; 1 if absent.")
-    name: str = Field(min_length=1, description="Name of the asset.")
-    class_name: str | None = Field(None, alias="class", min_length=1, description="Class to learn; else the name.")
+    name: Name = Field(description="Name of the asset.")
+    class_name: Name | None = Field(None, alias="class", description="Class to learn; else the name.")
     kind: Literal["object", "environment"] = "object"
     splats: str = Field(description="Splat file.")
     mesh: str | None = Field(None, description="Mesh file, or 'hull': the convex hull of the opaque splats.")
@@ -81,7 +82,7 @@ class AssetSpec(BaseModel):
     roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of the highlight.")
     specular: float = Field(0.04, ge=0, le=1, description="Specular reflectance at normal incidence.")
     capture_light: Literal["uniform", "scene"] = "uniform"
-    keypoints: dict[str, tuple[float, float, float]] | None = Field(
+    keypoints: dict[Name, tuple[float, float, float]] | None = Field(
         None, description="Named points in the units and axes of the files, for pose labels."
     )
     white: Positive | None = Field(

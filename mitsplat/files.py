@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
+import re
 import shutil
+import stat
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+import numpy as np
 from PIL import Image
 
 from mitsplat.content_hash import file_hash
@@ -48,6 +52,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
+        temporary.unlink(missing_ok=True)  # a link of this name would be followed
         write(temporary)
         with temporary.open("rb") as file:
             digest = file_hash(file)
@@ -72,7 +77,8 @@ class GrowingFile:
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._path, self._temporary = path, path.with_name(f".{path.name}.{os.getpid()}.part")
-        self._file = self._temporary.open("w+b", buffering=1 << 16)
+        self._temporary.unlink(missing_ok=True)
+        self._file = self._temporary.open("x+b", buffering=1 << 16)
         self._named = False
 
     def write(self, text: str) -> None:
@@ -111,6 +117,102 @@ class GrowingFile:
         self._file.close()
         if not self._named:
             self._temporary.unlink(missing_ok=True)
+
+
+def open_in_place(path: Path, mode: str) -> IO[Any]:
+    """Open a file that is written where it lies, and is made if the mode says so.
+
+    Raises:
+        OSError: If it cannot be opened, or another file would be written with it: it is a link, or has a second name.
+    """
+    file: IO[Any] = open(path, mode, opener=_open_unlinked)  # noqa: SIM115 - the caller's
+    return file
+
+
+def _open_unlinked(name: str, flags: int) -> int:
+    try:
+        number = os.open(name, flags & ~os.O_TRUNC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(errno.ELOOP, "must not be a link: remove it", str(name)) from error
+        raise
+    try:
+        _check_regular(number, name)
+        if os.fstat(number).st_nlink > 1:
+            raise OSError(errno.EMLINK, "must not have a second name (a hard link): remove it, or copy it", str(name))
+        if flags & os.O_TRUNC:
+            os.ftruncate(number, 0)
+    except BaseException:
+        os.close(number)
+        raise
+    return number
+
+
+def open_regular(path: Path) -> IO[bytes]:
+    """Open a regular file to read, through links too; others, such as a pipe, could be waited for without end.
+
+    Raises:
+        OSError: If it is none, or cannot be opened.
+    """
+    number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _check_regular(number, path)
+        return os.fdopen(number, "rb")
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def _check_regular(number: int, path: str | Path) -> None:
+    mode = os.fstat(number).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "must be a regular file", str(path))
+
+
+MOST_JSON = 1 << 28
+"""Largest JSON file that is read as a whole [bytes]."""
+DEEPEST_JSON = 64
+"""Most levels of JSON; what mitsplat and others write has about ten."""
+_NO_BRACKETS = bytes(set(range(256)) - set(b'[]{}"'))
+
+
+def read_json(path: Path, most: int = MOST_JSON) -> Any:
+    """The value of a JSON file that need not be trusted: a regular one of ``most`` bytes, bounded in depth.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If it is too large, too deep, or no JSON.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise ValueError(f"must have at most {most} bytes (got {size})")
+        return parse_json(file.read())
+
+
+def parse_json(data: bytes) -> Any:
+    """The value of JSON as UTF-8.
+
+    Raises:
+        ValueError: If it has more than :data:`DEEPEST_JSON` levels, or is no JSON.
+    """
+    text = data.decode("utf-8-sig")
+    if data.count(b"[") + data.count(b"{") > DEEPEST_JSON:
+        bare = re.sub(rb"\\.", b"", data, flags=re.DOTALL) if b"\\" in data else data
+        brackets = re.sub(rb'"[^"]*"', b"", bare.translate(None, _NO_BRACKETS))
+        steps = np.frombuffer(brackets, dtype=np.uint8) & 2  # of [ and {, but not of ] and }
+        if np.cumsum(steps.astype(np.int64) - 1).max(initial=0) > DEEPEST_JSON:
+            raise ValueError(f"must not be nested deeper than {DEEPEST_JSON} levels")
+    return json.loads(text)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder, if it is there, or a link of its name, but not what the link leads to."""
+    if folder.is_symlink():
+        folder.unlink()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> str:
@@ -197,6 +299,6 @@ def copied(source: Path, target: Path) -> Path:
 def link_file(source: Path, target: Path) -> None:
     """Give a file a second name, or copy it where the file system has no hard links."""
     try:
-        os.link(source, target)
+        os.link(os.path.realpath(source), target)
     except OSError:
         shutil.copyfile(source, target)

@@ -6,12 +6,13 @@ one element after the other, which are small here; only one is held at a time.
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from mitsplat.files import GrowingFile
+from mitsplat.files import GrowingFile, open_regular
 
 _BLOCK = 1 << 16
 _LOOK_AHEAD = 3
@@ -118,7 +119,7 @@ def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
-    with path.open(encoding="utf-8") as file:
+    with io.TextIOWrapper(open_regular(path), encoding="utf-8") as file:
         window = _Window(file)
         window.expect("{")
         if window.peek() == "}":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, ValidationError
@@ -41,6 +42,20 @@ def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
         raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
     return bounds
+
+
+def plain(name: str) -> str:
+    """Refuse a name that files of labels cannot hold on a line: XML has no control characters, and text has lines."""
+    for character in name:
+        if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or ord(character) & 0xFFFE == 0xFFFE:
+            raise ValueError(
+                f"must have no control characters or line breaks (got U+{ord(character):04X} in {name[:60]!a})"
+            )
+    return name
+
+
+Name = Annotated[str, Field(min_length=1), AfterValidator(plain)]
+"""A name in files of labels: of a class, an asset or a keypoint."""
 
 
 def _each_ordered(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:

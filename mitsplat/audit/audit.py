@@ -11,6 +11,7 @@ The manifest and the files that describe all frames are read in step, a frame at
 
 from __future__ import annotations
 
+import os
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +33,7 @@ from mitsplat.audit.scene import SceneReader
 from mitsplat.audit.truth import TrueFrame
 from mitsplat.content_hash import file_hash
 from mitsplat.dataset.schema import Records, read_content
+from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, splits_of
 from mitsplat.picture_files import read_picture
 
@@ -78,6 +80,7 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
     """
     root = Path(root)
     content = read_content(root)
+    _refuse_special(root)
     records = Records(root, content)
     readers, whole, owned = _readers(root, content), _Whole(), Owned(content)
     violations: list[tuple[str, str]] = []
@@ -112,6 +115,19 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
     violations += owned.orphans(root)
     violations += _check_rest(root)
     return Audit(frames, instances, files, tuple(violations), low, dict(marked), dict(dropped))
+
+
+def _refuse_special(root: Path) -> None:
+    """Refuse what is neither a file nor a folder: who reads a pipe could wait without end.
+
+    Raises:
+        InputError: With the first of them.
+    """
+    for folder, _, _ in os.walk(root):
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if not entry.is_file() and not entry.is_dir() and os.access(entry.path, os.F_OK):
+                    raise InputError(f"{entry.path}: must be a regular file or a folder")
 
 
 def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
@@ -246,6 +262,7 @@ def _is_rigid(pose: Float64Array) -> bool:
     return bool(
         pose.shape == (4, 4)
         and np.isfinite(pose).all()
+        and np.abs(rotation).max() < 2  # products of larger ones may overflow
         and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5
         and np.linalg.det(rotation) > 0
         and (pose[3] == (0, 0, 0, 1)).all()

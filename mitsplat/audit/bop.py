@@ -6,7 +6,6 @@ lengths in millimetres, boxes (x, y, x_max - x_min, y_max - y_min), pixel centre
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from mitsplat.audit.owned import labelled_assets
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
 from mitsplat.errors import InputError
+from mitsplat.files import read_json
 from mitsplat.json_stream import read_entries
 from mitsplat.picture_files import read_picture
 
@@ -126,7 +126,7 @@ class BopReader:
         """Whether the models are there and measure what is said of them."""
         file = "bop/models/models_info.json"
         try:
-            info = json.loads((self._root / file).read_bytes())
+            info = read_json(self._root / file)
         except FileNotFoundError:
             yield file, "is missing"
             info = None

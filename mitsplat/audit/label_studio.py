@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,13 @@ import numpy as np
 from mitsplat.arrays import BoolArray
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
+from mitsplat.files import read_json
 
 
 def check_task(frame: TrueFrame, path: Path) -> Iterator[str]:
     """What is wrong with a frame's task."""
     try:
-        task = json.loads(path.read_bytes())
+        task = read_json(path)
         image, regions = task["data"]["image"], task["annotations"][0]["result"]
         strokes = {region["id"]: decode_brush(region["value"]["rle"], frame.size) for region in regions}
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -195,7 +195,9 @@ class _Fit:
 
     @property
     def rms(self) -> float:
-        """What is left of an equation in the mean."""
+        """What is left of an equation in the mean; infinite if sums overflow, as of poses that are none."""
+        if not (np.isfinite(self._square).all() and np.isfinite(self._product).all()):
+            return np.inf
         point = np.linalg.lstsq(self._square, self._product, rcond=1e-12)[0]
         return float(np.sqrt(max(0.0, self._total - float(self._product @ point)) / max(1, self.count)))
 

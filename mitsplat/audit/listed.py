@@ -20,7 +20,7 @@ from mitsplat.audit.owned import YOLO_FOLDERS
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
 from mitsplat.child_process import python_command, python_environment
-from mitsplat.files import SPLITS, splits_of
+from mitsplat.files import SPLITS, read_json, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""
@@ -195,7 +195,7 @@ class LayoutReader:
         if index != self._index:
             self._index, self._found = index, {}
             try:
-                stored = json.loads((self._root / file).read_bytes())
+                stored = read_json(self._root / file)
                 self._found = {entry["id"]: entry for entry in stored["instances"]}
                 if stored["index"] != index:
                     yield file, f"is of layout {stored['index']}"
@@ -227,9 +227,12 @@ class LayoutReader:
 
     def _at_moment(self, stored: Any, frame: TrueFrame) -> Any:
         """A pose as it is at the moment of a frame, carried by a belt or not."""
-        if np.shape(stored) != (4, 4):
+        try:
+            pose = np.array(stored, dtype=np.float64)
+        except (TypeError, ValueError):
             return stored
-        pose = np.array(stored, dtype=np.float64)
+        if pose.shape != (4, 4):
+            return stored
         pose[:3, 3] += self._belt.way(pose, frame)
         return pose
 

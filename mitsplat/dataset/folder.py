@@ -5,51 +5,56 @@ from __future__ import annotations
 import errno
 import fcntl
 import importlib.metadata
+import io
 import json
 import os
 import platform
-import re
 import shlex
 import shutil
 import socket
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from pydantic import BaseModel, ConfigDict
 from ruamel.yaml import YAML
 
 from mitsplat.dataset.contact_sheet import ContactSheet
 from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.dataset.manifest import Manifest, append_line, cut_torn_line
+from mitsplat.dataset.own_files import (
+    CONTENT,
+    LOCK,
+    MANIFEST,
+    RUNS,
+    SHARD,
+    SHEET,
+    TIMINGS,
+    is_unfinished,
+    refuse_links,
+    remove_dataset,
+    remove_partial,
+)
+from mitsplat.dataset.schema import check_record
 from mitsplat.errors import InputError, PartialResultError
-from mitsplat.files import Record, storage_errors, write_file, write_text
+from mitsplat.files import Record, open_in_place, open_regular, read_json, storage_errors, write_file, write_text
 from mitsplat.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
-from mitsplat.formats.registry import TABLE, Catalogue, CollectionWriter
-from mitsplat.formats.yolo import TASKS
+from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.version import __version__
 
 if TYPE_CHECKING:
     from mitsplat.device import Kind
     from mitsplat.scene.scene import Scene
 
-CONTENT = "dataset.json"
 IMPLIED = {FORMAT_VERSION: 1, "device": "cpu"}
-"""What it means where it does not say so."""
-MANIFEST = "manifest.jsonl"
-TIMINGS = "timings.jsonl"
-RUNS = "runs.jsonl"
-SHEET = "contact_sheet.jpg"
-SHARD = "shard.json"
-LOCK = ".lock"
-_UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
-"""Names of what may be in a folder before ``dataset.json`` is."""
-_PARTIAL = re.compile(r"\..+\.\d+\.part")
-"""Of what :func:`mitsplat.files.write_file` has not finished."""
-_ENTRIES = ("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK)
+"""What ``dataset.json`` means where it does not say so."""
+_LOCK_TEXT = 200
+"""Most characters of a lock that are shown."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,16 @@ class Shard:
         return {"shard": self.number, "of": self.count, "frames": total}
 
 
+class _StoredShard(BaseModel):
+    """Content of ``shard.json``."""
+
+    model_config = ConfigDict(strict=True)
+
+    shard: int
+    of: int
+    frames: int
+
+
 @contextmanager
 def open_folder(
     out: Path,
@@ -126,9 +141,9 @@ def open_folder(
     _check_own(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        lock = (out / LOCK).open("a+")
+        lock = open_in_place(out / LOCK, "a+")
     except OSError as error:
-        raise InputError(f"cannot write into {out}: {error.strerror}") from error
+        raise InputError(_lock_sentence(out, error)) from error
     with lock:
         _take_lock(out, lock)
         try:
@@ -136,36 +151,53 @@ def open_folder(
                 lock.truncate(0)
                 lock.write(f"process {os.getpid()} on {socket.gethostname()}")
                 lock.flush()
+                refuse_links(out)
                 if overwrite:
-                    _remove_dataset(out)
+                    remove_dataset(out)
                 _check_resumable(out, content, shard, resume=resume, any_device=any_device)
                 _prepare(out, scene_file, content, shard)
-                yield Manifest(out / MANIFEST, keep=lambda record: missing_file(out, record) is None)
+                yield Manifest(
+                    out / MANIFEST,
+                    keep=lambda record: missing_file(out, record) is None,
+                    check=partial(check_record, content=content),
+                )
         finally:
-            _remove_partial(out)
+            remove_partial(out)
+
+
+def _lock_sentence(out: Path, error: OSError) -> str:
+    if error.errno in (errno.ELOOP, errno.EMLINK, errno.EINVAL):
+        return f"{error.filename}: {error.strerror}"
+    return f"cannot write into {out}: {error.strerror}"
 
 
 @contextmanager
-def open_finished(out: Path) -> Iterator[Manifest]:
+def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iterator[Manifest]:
     """The manifest of a dataset that nobody is writing, and nobody is as long as this is open.
 
-    It may lie where nothing can be written, as on a share of another machine: then nobody writes it from here.
+    Args:
+        out: The dataset. It may lie where nothing can be written, as on a share of another machine.
+        content: Of its ``dataset.json``.
+        write: Whether files are added to it. If not, nothing in it is changed or made.
 
     Raises:
-        InputError: If it is in use or damaged.
+        InputError: If it is in use or damaged, or a link would be written through.
     """
-    path, lock = out / LOCK, None
+    lock: IO[str] | None = None
     try:
-        lock = path.open("a+")
+        if write:
+            lock = open_in_place(out / LOCK, "a+")
+        else:
+            with suppress(FileNotFoundError):  # nobody has begun to write it here
+                lock = io.TextIOWrapper(open_regular(out / LOCK), errors="replace")
     except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise InputError(f"{path}: {error.strerror}") from error
-        if path.is_file():
-            lock = path.open()
+        raise InputError(_lock_sentence(out, error)) from error
     with lock or nullcontext():
         if lock is not None:
             _take_lock(out, lock)
-        yield Manifest(out / MANIFEST)
+        if write:
+            refuse_links(out)
+        yield Manifest(out / MANIFEST, check=partial(check_record, content=content), grow=False)
 
 
 def _take_lock(out: Path, lock: IO[str]) -> None:
@@ -177,7 +209,7 @@ def _take_lock(out: Path, lock: IO[str]) -> None:
         fcntl.flock(lock, (fcntl.LOCK_EX if lock.writable() else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.seek(0)
-        raise InputError(f"{out} is being written by another run ({lock.read()})") from None
+        raise InputError(f"{out} is being written by another run ({lock.read(_LOCK_TEXT)})") from None
 
 
 def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] = ()) -> None:
@@ -235,10 +267,10 @@ def _check_own(out: Path) -> None:
     """Refuse a folder that holds something other than a dataset of mitsplat, which must not be mixed up or removed."""
     present: Any = None
     try:
-        present = json.loads((out / CONTENT).read_bytes())
+        present = read_json(out / CONTENT)
         own = isinstance(present, dict) and "mitsplat" in present
     except (FileNotFoundError, NotADirectoryError):
-        own = not out.is_dir() or all(_UNFINISHED.fullmatch(entry.name) for entry in out.iterdir())
+        own = not out.is_dir() or all(is_unfinished(entry.name) for entry in out.iterdir())
     except (OSError, ValueError) as error:
         raise InputError(f"{out / CONTENT} cannot be read ({error})") from error
     if not own:
@@ -254,7 +286,7 @@ def _check_resumable(
         return
     if not resume:
         raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
-    present = {**IMPLIED, **json.loads((out / CONTENT).read_bytes())}
+    present = {**IMPLIED, **read_json(out / CONTENT)}
     elsewhere: dict[str, Any] = {"libraries": None, "device": None}
     if difference := first_difference({**present, **elsewhere}, {**content, **elsewhere}):
         key, before, now = difference
@@ -281,18 +313,18 @@ def read_shard(out: Path) -> dict[str, int] | None:
     """
     path = out / SHARD
     try:
-        stored: dict[str, int] = json.loads(path.read_bytes())
-        Shard(stored["shard"], stored["of"]).frames(stored["frames"], 1)
+        stored = _StoredShard.model_validate(read_json(path))
+        Shard(stored.shard, stored.of).frames(stored.frames, 1)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: must say which shard this is ({error!r})") from error
-    return stored
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: must say which shard this is ({' '.join(str(error).split())})") from error
+    return stored.model_dump()
 
 
 def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[str, int] | None) -> None:
     """Make what describes the run, by which the folder is known for a dataset, then the rest; clear what is torn."""
-    _remove_partial(out)
+    remove_partial(out)
     if not (out / CONTENT).exists():
         if shard is not None:
             write_text(out / SHARD, json.dumps(shard) + "\n")
@@ -300,6 +332,9 @@ def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[s
     (out / "layouts").mkdir(exist_ok=True)
     if not (out / "scene" / scene_file.name).exists():
         write_file(out / "scene" / scene_file.name, lambda temporary: _write_scene(scene_file, content, temporary))
+    for file in (out / name for name in (MANIFEST, TIMINGS, RUNS)):
+        if file.is_file() and file.stat().st_nlink > 1:  # as in a copy by hard links, whose original must stay
+            write_file(file, partial(shutil.copyfile, file))
     cut_torn_line(out / TIMINGS)
     cut_torn_line(out / RUNS)
 
@@ -310,46 +345,6 @@ def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
         shutil.copyfile(scene_file, path)
     else:
         YAML(typ="safe", pure=True).dump(content["scene"], path)
-
-
-def _remove_dataset(out: Path) -> None:
-    """Remove what mitsplat writes and nothing else; its mark last, so that an interruption can be repeated."""
-    remove_folds(out)
-    for entry in (out / name for name in (*_entries(out), *_ENTRIES)):
-        name = entry.name
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        elif name not in (LOCK, CONTENT):
-            entry.unlink(missing_ok=True)
-    (out / CONTENT).unlink(missing_ok=True)
-
-
-def _entries(out: Path) -> list[str]:
-    """What the formats of a dataset have in its folder, or all formats where it does not say which it has."""
-    try:
-        formats = json.loads((out / CONTENT).read_bytes())["scene"]["output"]["formats"]
-        return [entry for name in formats for entry in TABLE[name].entries]
-    except (OSError, ValueError, KeyError, TypeError):
-        return [entry for format in TABLE.values() for entry in format.entries]
-
-
-def remove_folds(out: Path) -> bool:
-    """Remove the lists of a division for cross-validation; whether there were any."""
-    found = False
-    for folder in {out / task.folder for task in TASKS.values()}:
-        for split in ("train", "val"):
-            for file in folder.glob(f"fold[0-9]*_{split}.txt"):
-                file.unlink()
-                found = True
-        shutil.rmtree(folder / "folds", ignore_errors=True)
-    return found
-
-
-def _remove_partial(out: Path) -> None:
-    for folder, _, names in os.walk(out):
-        for name in names:
-            if _PARTIAL.fullmatch(name):
-                (Path(folder) / name).unlink(missing_ok=True)
 
 
 def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsplat.dataset.folder import open_finished, remove_folds
+from mitsplat.dataset.folder import open_finished
+from mitsplat.dataset.own_files import remove_folds
 from mitsplat.dataset.schema import read_content
 from mitsplat.errors import InputError
 from mitsplat.files import GrowingFile, storage_errors, write_text
@@ -57,7 +58,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
     formats = content["scene"]["output"]["formats"]
     classes, keypoints = content["classes"], content["keypoints"]
     tasks = [task for task in TASKS if task in formats]
-    with open_finished(root) as records, storage_errors(root), ExitStack() as undone:
+    with open_finished(root, content, write=True) as records, storage_errors(root), ExitStack() as undone:
         layouts: defaultdict[int, Counter[str]] = defaultdict(Counter)
         images = Counter[int]()
         for record in records:

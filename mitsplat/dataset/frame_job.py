@@ -15,9 +15,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mitsplat.dataset.folder import LOCK
+from mitsplat.dataset.own_files import LOCK
 from mitsplat.errors import InputError, PartialResultError
-from mitsplat.files import Record, link_file, storage_errors, write_file, write_text
+from mitsplat.files import (
+    Record,
+    link_file,
+    open_in_place,
+    open_regular,
+    parse_json,
+    storage_errors,
+    write_file,
+    write_text,
+)
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
 from mitsplat.scene.layout import Layout, NothingRests
@@ -74,12 +83,12 @@ class FrameMaker:
         if self._kept is not None and self._kept.index == index:
             return self._kept
         path = self.out / f"layouts/{index:04d}.json"
-        with storage_errors(self.out), (path.parent / LOCK).open("ab") as lock:
+        with storage_errors(self.out), open_in_place(path.parent / LOCK, "ab") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; freed with the file or the process
             if not path.exists():
                 write_text(path, self.settled(index, note))
-            with layout_errors(path):
-                return self.keep(path.read_bytes())
+            with layout_errors(path), open_regular(path) as file:
+                return self.keep(file.read())
 
     def keep(self, text: str | bytes) -> Layout:
         """The layout that JSON describes, the same object as before if it is the same.
@@ -87,7 +96,7 @@ class FrameMaker:
         It is always read back, so that a resumed run works with the very same numbers, and stays the same object from
         view to view, by which the renderer knows that nothing moved.
         """
-        stored = json.loads(text)
+        stored = parse_json(text.encode() if isinstance(text, str) else text)
         if self._kept is None or self._kept.index != stored["index"]:
             self._kept = Layout.from_json(stored)
         return self._kept

@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mitsplat.dataset.folder import TIMINGS, append_run, content_of, finish_folder, open_folder
+from mitsplat.dataset.folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
+from mitsplat.dataset.own_files import TIMINGS
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.device import current_device
 from mitsplat.errors import InputError

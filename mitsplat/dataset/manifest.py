@@ -10,13 +10,16 @@ import os
 import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import Record, write_file
+from mitsplat.files import Record, open_in_place, open_regular, write_file
 
+LONGEST_LINE = 1 << 26
+"""Most bytes of a line that are read at once; no frame needs as many."""
 _CHECKED = re.compile(rb'(\{.*),"check":"([0-9a-f]{16})"\}')
 
 
@@ -28,33 +31,45 @@ class Manifest:
     Args:
         path: The file; made if missing. A last line that is not whole is cut off: whoever wrote it was stopped.
         keep: Whether a record counts, asked once while the file is read; all do if None.
+        check: Raises ValueError for a line that is as it was written, but no record of the dataset.
+        grow: Whether the file may be changed. If not, a last line that is not whole stays, and does not count.
 
     Raises:
         InputError: If any other line is not as it was written.
     """
 
-    def __init__(self, path: Path, keep: Callable[[Record], bool] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        keep: Callable[[Record], bool] | None = None,
+        check: Callable[[bytes, Record], object] = lambda line, record: None,
+        *,
+        grow: bool = True,
+    ) -> None:
         self.path = path
         self._places = _Places()
         self._in_order = True
-        cut_torn_line(path)
+        if grow:
+            cut_torn_line(path)
         place = 0
         last = -1
         torn: InputError | None = None
-        with path.open("rb") as file:
-            for number, line in enumerate(file, start=1):
+        with open_regular(path) as file:
+            for number, line in enumerate(read_lines(file), start=1):
                 if torn is not None:
                     raise torn
                 try:
+                    if not line.endswith(b"\n"):
+                        raise ValueError("it has no end")
                     record = parse_line(line)
-                    index = int(record["index"])
                 except ValueError as error:
-                    torn = InputError(
-                        f"{path}, line {number}: must be the record of a frame ({error}); "
-                        "without that line its frame is made again"
-                    )
-                    torn.__cause__ = error
+                    torn = _damaged(path, number, error)
                 else:
+                    try:
+                        check(line, record)
+                        index = _index_of(record)
+                    except ValueError as error:
+                        raise _damaged(path, number, error) from error
                     self._in_order &= index > last
                     last = max(last, index)
                     if keep is None or keep(record):
@@ -63,8 +78,9 @@ class Manifest:
                         self._in_order = False
                         self._places.pop(index)
                     place += len(line)
-        if torn is not None:
-            os.truncate(path, place)
+        if torn is not None and grow:
+            with open_in_place(path, "r+b") as file:
+                file.truncate(place)
         self._end, self._last = place, last
 
     def __len__(self) -> int:
@@ -124,7 +140,7 @@ class Manifest:
         self._places, self._end, self._in_order = places, self.path.stat().st_size, True
 
     def _lines(self) -> Iterator[tuple[int, bytes]]:
-        with self.path.open("rb") as file:
+        with open_regular(self.path) as file:
             position = 0
             for index, place in self._places:
                 if place != position:  # seeking throws away what was read ahead
@@ -132,6 +148,21 @@ class Manifest:
                 line = file.readline()
                 position = place + len(line)
                 yield index, line
+
+
+def _damaged(path: Path, number: int, error: ValueError) -> InputError:
+    damaged = InputError(
+        f"{path}, line {number}: must be the record of a frame ({error}); without that line its frame is made again"
+    )
+    damaged.__cause__ = error
+    return damaged
+
+
+def _index_of(record: Record) -> int:
+    index = record.get("index")
+    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < 2**31:
+        raise ValueError(f"index must be a number from 0 to {2**31 - 1} (got {str(index)[:20]})")
+    return index
 
 
 class _Places:
@@ -189,8 +220,16 @@ def parse_line(line: bytes) -> Record:
     text = found[1] + b"}"
     if _checksum(text) != found[2].decode():
         raise ValueError(f"its checksum must be {_checksum(text)} (got {found[2].decode()})")
-    record: Record = json.loads(text)
+    try:
+        record: Record = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
     return record
+
+
+def read_lines(file: IO[bytes]) -> Iterator[bytes]:
+    """Lines of a file; one of more than :data:`LONGEST_LINE` comes in pieces."""
+    return iter(partial(file.readline, LONGEST_LINE), b"")
 
 
 def append_line(path: Path, record: Mapping[str, Any]) -> None:
@@ -204,7 +243,7 @@ def _checksum(text: bytes) -> str:
 
 def _append(path: Path, line: bytes) -> int:
     """Append a line; it is on disk when this returns its place in the file."""
-    with path.open("ab") as file:
+    with open_in_place(path, "ab") as file:
         place = file.tell()
         file.write(line)
         file.flush()
@@ -213,13 +252,8 @@ def _append(path: Path, line: bytes) -> int:
 
 
 def cut_torn_line(path: Path) -> None:
-    """Make the file if it is missing; cut it behind its last newline if a line was not written to its end.
-
-    One that is whole need not be writable.
-    """
-    if not path.exists():
-        path.touch()
-    with path.open("rb") as file:
+    """Make the file if it is missing; cut it behind its last newline if a line was not written to its end."""
+    with open_in_place(path, "a+b") as file:
         size = end = file.seek(0, os.SEEK_END)
         tail = b""
         while end and b"\n" not in tail:
@@ -227,6 +261,6 @@ def cut_torn_line(path: Path) -> None:
             file.seek(start)
             tail = file.read(end - start)
             end = start
-    whole = end + tail.rfind(b"\n") + 1
-    if whole < size:
-        os.truncate(path, whole)
+        whole = end + tail.rfind(b"\n") + 1
+        if whole < size:
+            file.truncate(whole)

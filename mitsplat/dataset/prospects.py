@@ -17,7 +17,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.camera import Camera
-from mitsplat.dataset.folder import MANIFEST
+from mitsplat.dataset.own_files import MANIFEST
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding

@@ -15,14 +15,15 @@ from itertools import chain
 from pathlib import Path
 from typing import SupportsIndex
 
-from mitsplat.dataset.folder import CONTENT, IMPLIED, MANIFEST, content_of, first_difference
+from mitsplat.dataset.folder import IMPLIED, content_of, first_difference
 from mitsplat.dataset.frame_job import FrameMaker, Render, Settle
-from mitsplat.dataset.manifest import parse_line
+from mitsplat.dataset.manifest import parse_line, read_lines
+from mitsplat.dataset.own_files import CONTENT, MANIFEST, is_written, refuse_links
 from mitsplat.dataset.prospects import count_faults, image_faults, layout_faults, refuse
-from mitsplat.dataset.schema import read_content
+from mitsplat.dataset.schema import check_record, read_content
 from mitsplat.device import Device, current_device, use_device
 from mitsplat.errors import InputError
-from mitsplat.files import Record, storage_errors, write_text
+from mitsplat.files import Record, open_regular, read_json, storage_errors, write_text
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
@@ -82,6 +83,7 @@ def remake_frame(
     refuse(scene, chain(count_faults(scene), layout_faults(scene), image_faults(scene, 1)))
     if out.exists() and not (out / FRAME).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} must be absent, empty, or hold a frame that was made again (it holds other files)")
+    refuse_links(out)
     chosen = current_device() if device is None else use_device(device)
     place = f"layouts/{layout:04d}.json"
     maker = FrameMaker(scene, catalogue, out, render, settle)
@@ -98,10 +100,9 @@ def remake_frame(
     differing = sorted(file for file in {*before, *now} if before.get(file) != now.get(file))
     if known != {**json.loads(json.dumps(record)), "files": before}:
         differing.append(MANIFEST)
-    if (Path(dataset) / place).is_file() and (Path(dataset) / place).read_text() != text:
+    if (Path(dataset) / place).is_file() and (Path(dataset) / place).read_bytes() != text.encode():
         differing.append(place)
-    read_content(Path(dataset))  # checks what the file itself, read next, says
-    present = {**IMPLIED, **json.loads((Path(dataset) / CONTENT).read_bytes())}
+    present = {**IMPLIED, **read_json(Path(dataset) / CONTENT)}
     found = first_difference(present, content_of(scene, catalogue, chosen.kind))
     cause = "" if found is None else "{} was {} and is {}".format(*found)
     return RemadeFrame(out, record, len(before), tuple(differing), cause)
@@ -110,12 +111,12 @@ def remake_frame(
 def _remove_frame(out: Path) -> None:
     """Remove the files of a frame that was made before."""
     try:
-        names = list(json.loads((out / FRAME).read_bytes())["files"])
+        names = list(map(str, read_json(out / FRAME)["files"]))
     except (OSError, ValueError, KeyError, TypeError):
         return
-    for file in [*(out / str(name) for name in names), *(out / "layouts").glob("[0-9]*.json")]:
-        if file.resolve().is_relative_to(out.resolve()):
-            file.unlink(missing_ok=True)
+    for name in [*names, *(str(path.relative_to(out)) for path in (out / "layouts").glob("[0-9]*.json"))]:
+        if is_written(name):
+            (out / name).unlink(missing_ok=True)
 
 
 def _frame_of(dataset: Path, index: int) -> Record | None:
@@ -126,12 +127,17 @@ def _frame_of(dataset: Path, index: int) -> Record | None:
     """
     if not (dataset / CONTENT).is_file() or not (dataset / MANIFEST).is_file():
         return None
+    content = read_content(dataset)
     start, found = f'{{"index":{index},'.encode(), None
-    with (dataset / MANIFEST).open("rb") as file:
-        for line in file:
+    with open_regular(dataset / MANIFEST) as file:
+        for line in read_lines(file):
             if line.startswith(start) and line.endswith(b"\n"):
                 found = line  # of two, the later counts
     try:
-        return None if found is None else parse_line(found)
+        if found is None:
+            return None
+        record = parse_line(found)
+        check_record(found, record, content)
+        return record
     except ValueError as error:
         raise InputError(f"{dataset / MANIFEST}: must hold the record of frame {index} ({error})") from error

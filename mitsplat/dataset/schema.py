@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,12 +18,13 @@ from pycocotools import mask as coco_mask
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsplat.camera import Camera, Lens
-from mitsplat.dataset.manifest import parse_line
+from mitsplat.dataset.manifest import LONGEST_LINE, parse_line, read_lines
 from mitsplat.errors import InputError
-from mitsplat.files import Record, splits_of
+from mitsplat.files import Record, open_regular, read_json, splits_of
 from mitsplat.format_version import FORMAT_VERSIONS, check_format_version
 from mitsplat.spec.camera import CameraSpec
 from mitsplat.spec.spec import LabelRules, Output
+from mitsplat.spec_types import Name
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]
@@ -52,9 +53,9 @@ class _Scene(_Stored):
 class _Content(_Stored):
     mitsplat: str
     scene: _Scene
-    classes: list[str]
-    keypoints: list[list[str]]
-    assets: list[str]
+    classes: list[Name]
+    keypoints: list[list[Name]]
+    assets: list[Name]
     distractors: list[Count] = []
     libraries: dict[str, str]
     device: Literal["cpu", "cuda"] = "cpu"
@@ -247,8 +248,7 @@ def read_content(root: Path) -> dict[str, Any]:
             version.
     """
     try:
-        data = (root / "dataset.json").read_bytes()
-        content: dict[str, Any] = json.loads(data)
+        content: dict[str, Any] = read_json(root / "dataset.json")
     except OSError as error:
         reason = f"dataset.json: {error.strerror}" if root.is_dir() else "no such folder"
         raise InputError(f"{root} must be a dataset of mitsplat ({reason})") from error
@@ -256,7 +256,7 @@ def read_content(root: Path) -> dict[str, Any]:
         raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
     check_format_version(content, FORMAT_VERSIONS["dataset.json"], root / "dataset.json")
     try:
-        checked = _Content.model_validate_json(data)
+        checked = _Content.model_validate_json(json.dumps(content))
     except ValidationError as error:
         reason = f"dataset.json: {_first(error)}"
         raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
@@ -282,8 +282,8 @@ class Records:
         self._path, self._content = root / "manifest.jsonl", content
         self.violations: list[tuple[str, str]] = []
         indices, places, place = array("q"), array("q"), 0
-        with self._path.open("rb") as file:
-            for line in file:
+        with open_regular(self._path) as file:
+            for line in read_lines(file):
                 found = _INDEX.match(line)
                 indices.append(int(found[1]) if found else -1)
                 places.append(place)
@@ -309,19 +309,17 @@ class Records:
         yield from self._read(self._order[self._indices[self._order] == index])
 
     def _read(self, numbers: npt.NDArray[np.intp]) -> Iterator[Record]:
-        with self._path.open("rb") as file:
+        with open_regular(self._path) as file:
             end = 0
             for number in map(int, numbers):
                 if self._places[number] != end:
                     file.seek(self._places[number])
-                line = file.readline()
+                line = file.readline(LONGEST_LINE)
                 end = self._places[number] + len(line)
                 try:
-                    _Record.model_validate_json(line)
                     record = parse_line(line)
-                    _check_record(record, self._content)
-                except ValidationError as error:
-                    self._blame(number, _first(error))
+                    check_record(line, record, self._content)
+                    _check_masks(record)
                 except ValueError as error:
                     self._blame(number, str(error))
                 else:
@@ -331,12 +329,24 @@ class Records:
         self.violations.append(("manifest.jsonl", f"line {number + 1} is not the record of a frame ({text})"))
 
 
-def _check_record(record: Record, content: dict[str, Any]) -> None:
-    """Refuse what no type tells: an image that is not listed, positions beyond their lists, masks beyond their boxes.
+def check_record(line: bytes, record: Record, content: Mapping[str, Any]) -> None:
+    """Refuse a line whose record has other keys and types than a frame's, but for its masks.
+
+    Args:
+        line: Of the manifest.
+        record: What it says.
+        content: Of ``dataset.json``.
 
     Raises:
         ValueError: With the reason.
     """
+    try:
+        _Record.model_validate_json(line)
+    except ValidationError as error:
+        raise ValueError(_first(error)) from error
+    for file in record["files"]:
+        if not file or "\0" in file or file.startswith("/") or ".." in file.split("/"):
+            raise ValueError(f"files must be named relative to the dataset, and lie in it (got {file[:80]!r})")
     if not any(file.startswith("images/") for file in record["files"]):
         raise ValueError("files must list the frame's image")
     if record["split"] not in splits_of(content["scene"]["output"]):
@@ -358,11 +368,15 @@ def _check_record(record: Record, content: dict[str, Any]) -> None:
                 raise ValueError(f"{name}: {key} must be below {len(among)} (got {label[key]})")
         if len(label["keypoints"]) not in (0, len(content["keypoints"][label["class_index"]])):
             raise ValueError(f"{name}: keypoints must be those of its class (got {len(label['keypoints'])})")
+
+
+def _check_masks(record: Record) -> None:
+    for label in record["labels"]["instances"]:
         for code, box in (("rle", "box"), ("amodal_rle", "amodal_box")):
             try:
                 _check_mask(label[code], label[box], *record["labels"]["size"])
             except ValueError as error:
-                raise ValueError(f"{name}: {code}: {error}") from error
+                raise ValueError(f"instance {label['id']}: {code}: {error}") from error
 
 
 def _check_mask(code: str, box: list[int], width: int, height: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -14,19 +13,18 @@ from typing import Any
 from mitsplat.content_hash import file_hash
 from mitsplat.dataset.folder import (
     IMPLIED,
-    RUNS,
-    TIMINGS,
     finish_folder,
     first_difference,
     open_finished,
     open_folder,
     read_shard,
 )
-from mitsplat.dataset.manifest import Manifest
+from mitsplat.dataset.manifest import Manifest, read_lines
+from mitsplat.dataset.own_files import CONTENT, RUNS, TIMINGS
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
-from mitsplat.files import Record, file_inside, link_file, splits_of, write_file
+from mitsplat.files import Record, file_inside, link_file, open_regular, read_json, splits_of, write_file
 from mitsplat.formats.registry import Catalogue
 from mitsplat.progress import Progress
 
@@ -56,11 +54,11 @@ def merge_shards(
     content = _common_content(folders)
     stated = _check_complete(folders)
     with ExitStack() as stack:
-        manifests = {folder: stack.enter_context(open_finished(folder)) for folder in folders}
+        manifests = {folder: stack.enter_context(open_finished(folder, content, write=False)) for folder in folders}
         total = _check_frames(manifests, stated)
         splits = splits_of(content["scene"]["output"])
         catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], (), splits=splits)
-        scene_file = next((folders[0] / "scene").iterdir())
+        scene_file = _scene_file(folders[0])
         _check_layouts(folders)
         if overwrite:  # before what is there goes
             for folder, part in manifests.items():
@@ -76,14 +74,14 @@ def merge_shards(
                 if progress is not None:
                     progress(len(manifest), total, f"frame {index}")
         for folder in folders:
-            for layout in sorted((folder / "layouts").glob("*.json")):
+            for layout in _layouts(folder):
                 write_file(out / "layouts" / layout.name, partial(link_file, layout))
         for name in (TIMINGS, RUNS):
             write_file(out / name, partial(_join_lines, [folder / name for folder in folders]))
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
-        if (models := folders[0] / "bop/models").is_dir():
-            for model in sorted(models.iterdir()):
+        if "bop" in content["scene"]["output"]["formats"]:
+            for model in _models(folders[0], content):
                 write_file(out / "bop/models" / model.name, partial(shutil.copyfile, model))
         return counts.summary(out, rendered=0)
 
@@ -93,7 +91,7 @@ def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
     contents: list[dict[str, Any]] = []
     for folder in folders:
         read_content(folder)  # checks what the file itself, read next, says
-        contents.append({**IMPLIED, **json.loads((folder / "dataset.json").read_bytes())})
+        contents.append({**IMPLIED, **read_json(folder / CONTENT)})
         if difference := first_difference(contents[0], contents[-1]):
             key, one, other = difference
             raise InputError(
@@ -155,18 +153,46 @@ def _join_lines(files: Sequence[Path], whole: Path) -> None:
     """Write the lines of several files that may be missing, and may end in a torn line."""
     with whole.open("wb") as out:
         for file in files:
-            with suppress(FileNotFoundError), file.open("rb") as lines:
-                out.writelines(line for line in lines if line.endswith(b"\n"))
+            with suppress(FileNotFoundError), open_regular(file) as lines:
+                out.writelines(line for line in read_lines(lines) if line.endswith(b"\n"))
 
 
 def _check_layouts(folders: Sequence[Path]) -> None:
     """A layout that two shards show must be the same in both."""
     seen: dict[str, Path] = {}
     for folder in folders:
-        for layout in sorted((folder / "layouts").glob("*.json")):
+        for layout in _layouts(folder):
             other = seen.setdefault(layout.name, layout)
-            if other.read_bytes() != layout.read_bytes():
+            if other != layout and other.read_bytes() != layout.read_bytes():
                 raise InputError(f"{other} and {layout} must be the same: one layout was settled in two ways")
+
+
+def _layouts(folder: Path) -> list[Path]:
+    """The files of a shard's layouts."""
+    return [_inside(folder, path) for path in sorted((folder / "layouts").glob("[0-9]*.json"))]
+
+
+def _models(folder: Path, content: Mapping[str, Any]) -> list[Path]:
+    """The files of BOP's models."""
+    numbers = sorted(set(range(1, len(content["assets"]) + 1)) - {one + 1 for one in content.get("distractors", ())})
+    names = ["models_info.json", *(f"obj_{number:06d}.ply" for number in numbers)]
+    return [_inside(folder, folder / "bop/models" / name) for name in names]
+
+
+def _scene_file(folder: Path) -> Path:
+    """The scene that a dataset keeps."""
+    names = sorted((folder / "scene").glob("[!.]*"))
+    if len(names) != 1:
+        raise InputError(f"{folder / 'scene'}: must hold the scene file alone (got {len(names)} files)")
+    return _inside(folder, names[0])
+
+
+def _inside(folder: Path, path: Path) -> Path:
+    """A file of a shard, which must not be elsewhere."""
+    try:
+        return file_inside(folder, str(path.relative_to(folder)))
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from error
 
 
 def _check_files(folder: Path, record: Record) -> None:

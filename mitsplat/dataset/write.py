@@ -19,7 +19,6 @@ Shards are datasets of their own that share everything but their frames; :mod:`m
 
 from __future__ import annotations
 
-import json
 import logging
 from collections import Counter
 from collections.abc import Generator, Sequence
@@ -27,25 +26,17 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mitsplat.dataset.folder import (
-    SHEET,
-    TIMINGS,
-    Shard,
-    append_run,
-    content_of,
-    finish_folder,
-    open_folder,
-    remove_folds,
-)
+from mitsplat.dataset.folder import Shard, append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle, layout_errors
 from mitsplat.dataset.manifest import append_line
+from mitsplat.dataset.own_files import SHEET, TIMINGS, remove_folds
 from mitsplat.dataset.prospects import refuse, run_faults
 from mitsplat.device import Device, current_device, find_device
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL
 from mitsplat.errors import InputError
-from mitsplat.files import SPLITS, Record, storage_errors
+from mitsplat.files import SPLITS, Record, read_json, storage_errors
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
@@ -227,9 +218,8 @@ class Shortfall:
     def read(self, path: Path) -> None:
         """Count a layout that an earlier run settled, if it did."""
         with suppress(FileNotFoundError):
-            text = path.read_bytes()
             with layout_errors(path):
-                layout = Layout.from_json(json.loads(text))
+                layout = Layout.from_json(read_json(path))
             self.add(layout.index, [(self._scene.assets[one.asset].name, one.reason) for one in layout.left_out])
 
     def add(self, layout: int, left_out: Sequence[tuple[str, str]]) -> None:

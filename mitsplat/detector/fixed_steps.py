@@ -149,6 +149,7 @@ def train_job(
 def finish_checkpoint(run: Path) -> Path:
     """The final weights of a run, made of its last checkpoint."""
     final, part = run / "weights.pt", run / ".weights.pt.part"
+    part.unlink(missing_ok=True)  # a link of this name would be followed
     strip_optimizer(run / LAST, str(part))
     part.replace(final)
     return final

@@ -38,7 +38,7 @@ from mitsplat.detector.mix import plan_images
 from mitsplat.detector.sets import STRIDE, LabelledSet, check_masks, in_classes, read_set
 from mitsplat.detector.tiles import cut_photographs
 from mitsplat.errors import InputError
-from mitsplat.files import storage_errors, write_text
+from mitsplat.files import open_in_place, read_json, remove_folder, storage_errors, write_text
 from mitsplat.progress import Progress
 
 RUN = "run.json"
@@ -197,7 +197,7 @@ def train_detector(
         finished = _train(sets, photographs, out, settings, masks=masks, device=device, progress=progress)
         write_text(out / RUN, json.dumps(record | {"finished": finished}, indent=2) + "\n")
         for name in ("data", _TILES, "weights"):
-            shutil.rmtree(out / name, ignore_errors=True)
+            remove_folder(out / name)
         return Run(out, record | {"finished": finished})
 
 
@@ -245,7 +245,7 @@ def write_data(sets: Sequence[LabelledSet], folder: Path) -> Path:
     Returns:
         The list of the images, in the order of the sets.
     """
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_folder(folder)
     (folder / "images").mkdir(parents=True)
     (folder / "labels").mkdir()
     polygons = all(i.has_mask for found in sets for sample in found.samples for i in sample.instances)
@@ -285,7 +285,7 @@ def _train(
 
     rendered = sum(len(found.samples) for found in sets)
     if photographs is not None and settings.real_size is not None and settings.real_size > settings.size:
-        shutil.rmtree(out / _TILES, ignore_errors=True)
+        remove_folder(out / _TILES)
         photographs = cut_photographs(photographs, settings.real_size, settings.size, out / _TILES)
     plan = plan_images(
         rendered,
@@ -336,7 +336,7 @@ def _read_run(path: Path) -> Run | None:
     if not (path / RUN).is_file():
         return None
     try:
-        record = json.loads((path / RUN).read_bytes())
+        record = read_json(path / RUN)
     except (OSError, ValueError) as error:
         raise InputError(f"{path / RUN}: cannot be read ({error})") from error
     if not isinstance(record, dict) or not {"settings", "classes", "masks"} <= record.keys():
@@ -397,9 +397,11 @@ def _clear(out: Path) -> None:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     out.mkdir(parents=True, exist_ok=True)
-    with (out / ".lock").open("w") as lock:
+    with open_in_place(out / ".lock", "w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(f"{out}: another training is at work in it") from error
+        if links := [out / name for name in sorted(_OWN) if (out / name).is_symlink()]:
+            raise InputError(f"{links[0]}: must not be a link, for a run is written in its own folder; remove it")
         yield

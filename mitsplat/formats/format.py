@@ -14,6 +14,7 @@ import numpy.typing as npt
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, Record, link_file, splits_of, write_file
 from mitsplat.formats import maps
+from mitsplat.spec_types import plain
 
 if TYPE_CHECKING:
     import trimesh
@@ -58,6 +59,11 @@ class Catalogue:
         Raises:
             InputError: If assets of one class name different keypoints, or a format cannot show what the scene has.
         """
+        for name in scene.class_names:
+            try:
+                plain(name)
+            except ValueError as error:
+                raise InputError(f"{scene.path}: class: {error}") from error
         points: dict[str, tuple[str, tuple[str, ...]]] = {}
         kinds = [scene.class_index(position) for position in range(len(scene.assets))]
         for asset, kind in zip(scene.assets, kinds, strict=True):

@@ -52,6 +52,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     number = layout_of(scene, index)
     layout = carried(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
+    if files.is_symlink():
+        raise InputError(f"{files}: must not be a link, for files are written into it; remove it")
     files.mkdir(parents=True, exist_ok=True)
     shapes: dict[str, Any] = {}
     place = draw_place(scene.spec, index)
@@ -219,8 +221,12 @@ def _write_asset(asset: Asset, stem: Path) -> Path:
     """Write splats and mesh as ``stem.ply`` and ``stem_proxy.ply``; ``stem``."""
     asset.splats.save(stem.with_suffix(".ply"))
     if asset.mesh is not None:
-        asset.mesh.export(stem.with_name(f"{stem.name}_proxy.ply"))
+        _write_mesh(asset.mesh, stem.with_name(f"{stem.name}_proxy.ply"))
     return stem
+
+
+def _write_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
+    write_file(path, lambda part: mesh.export(part, file_type="ply"))
 
 
 def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, instance: int) -> dict[str, Any]:
@@ -245,17 +251,19 @@ def _describe_shape(
     if finish is not None:
         image, texture = texture_image(finish, scene.images), None
         if image is not None:
-            mi.Bitmap(image).write(str(stem.with_suffix(".png")))
+            bitmap = mi.Bitmap(image)
+            write_file(stem.with_suffix(".png"), lambda part: bitmap.write(str(part), mi.Bitmap.FileFormat.PNG))
             texture = {"type": "bitmap", "filename": f"{path.parent.name}/{stem.name}.png"}
         travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
-        finished_mesh(mesh, shape, finish, image, travel=travel).write_ply(str(path))
+        finished = finished_mesh(mesh, shape, finish, image, travel=travel)
+        write_file(path, lambda part: finished.write_ply(str(part)))
         return {
             "type": "ply",
             "filename": f"{path.parent.name}/{path.name}",
             "face_normals": True,
             "bsdf": material(finish, texture),
         }
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+    _write_mesh(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), path)
     return {
         "type": "ply",
         "filename": f"{path.parent.name}/{path.name}",

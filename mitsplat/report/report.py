@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
@@ -15,8 +16,9 @@ import cv2
 import numpy as np
 
 from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
+from mitsplat.dataset.manifest import read_lines
 from mitsplat.dataset.schema import Records, read_content
-from mitsplat.files import Record, write_text
+from mitsplat.files import Record, open_regular, parse_json, write_text
 from mitsplat.formats.coco import image_file
 from mitsplat.html import inline_image, make_page, mask_path
 from mitsplat.labels.labels import Labels
@@ -117,7 +119,7 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
         "Labels from": content["scene"]["labels"]["source"],
         "Formats": ", ".join(content["scene"]["output"]["formats"]),
         "Seed": str(content["scene"]["seed"]),
-        "Command": " ; ".join(run["command"] for run in runs) or "unknown",
+        "Command": " ; ".join(str(run.get("command", "unknown")) for run in runs) or "unknown",
         "Device": content.get("device", "cpu"),
         "mitsplat": content["mitsplat"],
     }
@@ -227,7 +229,7 @@ def _seconds(root: Path) -> dict[str, float]:
     stages: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
     for line in _lines(root / "timings.jsonl"):
         for stage, seconds in line.items():
-            if stage != "index":
+            if stage != "index" and isinstance(seconds, int | float) and math.isfinite(seconds):
                 stages[stage].append(seconds)
     return {stage: round(float(np.median(values)), 4) for stage, values in stages.items()}
 
@@ -278,8 +280,12 @@ def _details(content: dict[str, Any]) -> str:
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    with suppress(FileNotFoundError), path.open("rb") as file:
-        yield from map(json.loads, file)
+    """The objects that lines of a file hold, which may be missing or torn."""
+    with suppress(FileNotFoundError), open_regular(path) as file:
+        for line in read_lines(file):
+            with suppress(ValueError):
+                if isinstance(found := parse_json(line), dict):
+                    yield found
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from mitsplat.spec_types import (
     CountRange,
+    Name,
     Positive,
     Scale,
     StrictModel,
@@ -120,7 +121,7 @@ class ObjectSpec(StrictModel):
         description="Uniform scale applied to the asset, its mass with its volume; or a range, of which each object "
         f"has one of {SIZES} sizes evenly spaced in ratio.",
     )
-    class_name: str | None = Field(None, min_length=1, description="Class to label it as, if not the asset's own.")
+    class_name: Name | None = Field(None, description="Class to label it as, if not the asset's own.")
     region: str | tuple[str, ...] | None = Field(
         None,
         exclude_if=lambda region: region is None,

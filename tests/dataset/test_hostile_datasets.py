@@ -1,0 +1,339 @@
+"""Datasets of strangers: links, pipes, deep JSON and records of other types harm no other file and are no fault."""
+
+import copy
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from mitsplat.audit.audit import audit_dataset
+from mitsplat.dataset.folds import write_folds
+from mitsplat.dataset.manifest import Manifest, encode_line
+from mitsplat.dataset.own_files import is_written
+from mitsplat.dataset.shards import merge_shards
+from mitsplat.detector.sets import read_set
+from mitsplat.detector.training import write_data
+from mitsplat.errors import InputError, PartialResultError
+from mitsplat.files import DEEPEST_JSON, open_in_place, parse_json, read_json, write_file
+from mitsplat.report.report import write_report
+from mitsplat.scene.scene import load_scene
+from mitsplat.view.dataset_index import DatasetIndex
+from tests.conftest import BOTH, nut_and_bolt, small_scene
+from tests.dataset.test_write import contents, write
+
+FORMATS = ["yolo", "yolo-detect", "coco", "voc", "label-studio", "depth", "exr"]
+PRECIOUS = "years of work\n"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return small_scene(tmp_path_factory.mktemp("scene"), nut_and_bolt(), BOTH, layouts=3, views=2, formats=FORMATS)
+
+
+@pytest.fixture(scope="module")
+def made(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "out"
+    write(scene, folder)
+    return folder
+
+
+@pytest.fixture
+def out(made, tmp_path):
+    return Path(shutil.copytree(made, tmp_path / "out"))
+
+
+@pytest.fixture
+def outside(tmp_path):
+    folder = tmp_path / "outside"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text(PRECIOUS)
+    return folder
+
+
+def write_again(scene, out):
+    for layer in out.glob("layers/*/000003.exr"):
+        layer.unlink()
+    write(scene, out)
+
+
+WRITERS = {
+    "render": write_again,
+    "render --overwrite": lambda scene, out: write(scene, out, overwrite=True),
+    "split": lambda scene, out: write_folds(out, 2),
+    "merge": lambda scene, out: merge_shards([out.parent / "shard"], out),
+}
+
+
+class TestLinks:
+    @pytest.mark.parametrize("command", WRITERS)
+    @pytest.mark.parametrize("name", ["manifest.jsonl", "timings.jsonl", "runs.jsonl", ".lock", "dataset.json"])
+    def test_a_file_that_is_a_link_is_not_written_through(self, scene, out, outside, name, command):
+        shutil.copytree(out, out.parent / "shard")
+        target = outside / name
+        (out / name).rename(target)
+        with target.open("ab") as file:
+            file.write(b"torn")
+        if name == "dataset.json":
+            target.write_bytes(target.read_bytes()[:-4])
+        (out / name).symlink_to(target)
+        before = target.read_bytes()
+        with pytest.raises(InputError, match=rf"{name}: must not be a link"):
+            WRITERS[command](scene, out)
+        assert target.read_bytes() == before
+        assert (out / name).is_symlink()
+
+    @pytest.mark.parametrize("command", WRITERS)
+    @pytest.mark.parametrize("name", ["images", "images/train", "labels", "layouts", "yolo-detect", "folds"])
+    def test_a_folder_that_is_a_link_is_not_written_into(self, scene, out, outside, name, command):
+        shutil.copytree(out, out.parent / "shard")
+        target = outside / "folder"
+        if (out / name).exists():
+            (out / name).rename(target)
+        else:
+            target.mkdir()
+        (target / "fold1_train.txt").write_text(PRECIOUS)
+        (out / name).symlink_to(target)
+        before = contents(outside, without=())
+        with pytest.raises(InputError, match=rf"{name}: must not be a link"):
+            WRITERS[command](scene, out)
+        assert contents(outside, without=()) == before
+
+    @pytest.mark.parametrize("command", WRITERS)
+    def test_a_folder_that_is_reached_through_a_link_is_written(self, scene, out, command):
+        shutil.copytree(out, out.parent / "shard")
+        (out.parent / "reached").symlink_to(out)
+        WRITERS[command](scene, out.parent / "reached")
+        assert (out.parent / "reached").is_symlink()
+        assert len(Manifest(out / "manifest.jsonl")) == 6
+
+    def test_a_link_in_the_place_of_a_page_or_picture_is_replaced(self, scene, out, outside):
+        for name in ("report.html", "labels/train/000000.txt"):
+            target = outside / Path(name).name
+            target.write_text(PRECIOUS)
+            (out / name).unlink(missing_ok=True)
+            (out / name).symlink_to(target)
+        write_report(out)
+        assert not (out / "report.html").is_symlink()
+        assert {path.read_text() for path in outside.iterdir()} == {PRECIOUS}
+
+    def test_links_of_the_names_of_files_in_the_making_are_not_followed(self, tmp_path, outside):
+        path = tmp_path / "picture.png"
+        (tmp_path / f".picture.png.{os.getpid()}.part").symlink_to(outside / "thesis.txt")
+        write_file(path, lambda part: part.write_bytes(b"picture"))
+        assert path.read_bytes() == b"picture"
+        assert (outside / "thesis.txt").read_text() == PRECIOUS
+
+    def test_a_copy_by_hard_links_leaves_its_original_alone(self, scene, tmp_path):
+        write(scene, tmp_path / "one", frames=3)
+        before = contents(tmp_path / "one", without=())
+        shutil.copytree(tmp_path / "one", tmp_path / "two", copy_function=os.link)
+        (tmp_path / "two/.lock").unlink()
+        (tmp_path / "two/layouts/.lock").unlink()
+        write(scene, tmp_path / "two")
+        assert contents(tmp_path / "one", without=()) == before
+
+    @pytest.mark.parametrize("link", [os.symlink, os.link])
+    def test_a_file_with_another_name_is_not_opened_to_write(self, outside, tmp_path, link):
+        link(outside / "thesis.txt", tmp_path / "name")
+        for mode in ("w", "a", "r+b"):
+            with pytest.raises(OSError, match="must not"):
+                open_in_place(tmp_path / "name", mode)
+        assert (outside / "thesis.txt").read_text() == PRECIOUS
+
+    def test_folders_of_a_training_are_made_anew(self, scene, out, outside):
+        found = read_set(out, "train")
+        (out.parent / "data").symlink_to(outside)
+        write_data([found], out.parent / "data")
+        assert [path.name for path in outside.iterdir()] == ["thesis.txt"]
+
+
+def test_merging_does_not_change_its_inputs(scene, out):
+    with (out / "manifest.jsonl").open("ab") as file:
+        file.write(b'{"index":6,"torn')
+    (out / ".lock").unlink()
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.rglob("*") if path.is_file()}
+    assert merge_shards([out], out.parent / "merged").frames == 6
+    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.rglob("*") if path.is_file()} == before
+    assert len(Manifest(out.parent / "merged/manifest.jsonl")) == 6
+
+
+def test_merging_takes_no_files_from_outside(scene, out, outside):
+    for name in ("layouts/0000.json", "scene/scene.yaml"):
+        kept = (out / name).read_bytes()
+        (out / name).unlink()
+        (out / name).symlink_to(outside / "thesis.txt")
+        with pytest.raises(InputError, match="must be a file inside"):
+            merge_shards([out], out.parent / "merged")
+        (out / name).unlink()
+        (out / name).write_bytes(kept)
+
+
+class TestOverwriting:
+    def test_files_of_others_stay(self, scene, out):
+        own = ["labels/notes.txt", "labels/train/corrected.txt", "images/train/photo.jpg", "notes.md", "scene/why.md"]
+        for name in own:
+            (out / name).write_text(PRECIOUS)
+        assert write(load_scene(scene.path, overrides={"output.formats": ["exr"]}), out, frames=2, overwrite=True)
+        for name in own:
+            assert (out / name).read_text() == PRECIOUS
+        assert sorted(path.name for path in (out / "labels").rglob("*.txt")) == ["corrected.txt", "notes.txt"]
+        assert len(list((out / "images").rglob("*.png"))) == 2
+
+    def test_every_file_of_every_format_is_known(self, clean):
+        files = [path.relative_to(clean).as_posix() for path in clean.rglob("*") if path.is_file()]
+        inner = [name for name in files if "/" in name]
+        assert len(inner) > 100
+        assert [name for name in inner if not is_written(name)] == []
+
+
+DEEP = "[" * 100_000 + "]" * 100_000
+READERS = {
+    "audit": audit_dataset,
+    "report": write_report,
+    "merge": lambda out: merge_shards([out], out.parent / "merged"),
+    "split": lambda out: write_folds(out, 2),
+    "view": DatasetIndex,
+    "train": lambda out: read_set(out, "train"),
+}
+
+
+class TestJson:
+    @pytest.mark.parametrize("command", ["audit", "report", "merge", "split", "view"])
+    @pytest.mark.parametrize("text", [DEEP, f'{{"mitsplat": {DEEP}}}', '{"a":' * 900 + "0" + "}" * 900, "[]", "0"])
+    def test_a_description_of_any_depth_is_refused(self, out, command, text):
+        (out / "dataset.json").write_text(text)
+        with pytest.raises(InputError, match=r"dataset\.json"):
+            READERS[command](out)
+
+    def test_a_deep_line_is_no_record(self, scene, out):
+        for depth in (150, 900, 100_000):
+            line = b'{"index":12,"deep":' + b"[" * depth + b"]" * depth + b"}"
+            record = encode_line({"index": 12, "deep": 0})
+            assert record.startswith(line[:19])
+            with (out / "manifest.jsonl").open("rb") as file:
+                kept = file.read()
+            (out / "manifest.jsonl").write_bytes(_checked(line) + kept)
+            with pytest.raises(InputError, match=r"line 1: must be the record of a frame"):
+                write_folds(out, 2)
+            assert any("line 1 is not the record" in text for _, text in audit_dataset(out).violations)
+            (out / "manifest.jsonl").write_bytes(kept)
+
+    def test_brackets_in_strings_have_no_depth(self):
+        text = json.dumps(["[" * 1000, '\\"[[' * 100, '"' + "{" * 500])
+        assert parse_json(text.encode()) == json.loads(text)
+        levels = "[" * DEEPEST_JSON + "]" * DEEPEST_JSON
+        assert parse_json(levels.encode()) == json.loads(levels)
+        with pytest.raises(ValueError, match="nested deeper"):
+            parse_json(f"[{levels}]".encode())
+
+    @pytest.mark.parametrize("command", READERS)
+    @pytest.mark.parametrize("name", ["dataset.json", "manifest.jsonl", "runs.jsonl", "layouts/0000.json"])
+    def test_a_pipe_is_not_waited_for(self, out, name, command):
+        (out / name).unlink(missing_ok=True)
+        os.mkfifo(out / name)
+        signal.alarm(60)  # ends the process where a pipe is waited for
+        try:
+            with suppress(InputError, OSError):
+                READERS[command](out)
+        finally:
+            assert signal.alarm(0) > 0
+
+
+def _checked(text):
+    """A line of a manifest with the checksum that fits, of JSON that Python does not write."""
+    return text[:-1] + f',"check":"{hashlib.sha256(text).hexdigest()[:16]}"}}\n'.encode()
+
+
+def _places(value, at=()):
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        yield (*at, key)
+        yield from _places(value[key], (*at, key))
+
+
+def _changed(value, at, new):
+    value = copy.deepcopy(value)
+    inner = value
+    for key in at[:-1]:
+        inner = inner[key]
+    if new is KeyError:
+        del inner[at[-1]]
+    else:
+        inner[at[-1]] = new
+    return value
+
+
+class TestTypes:
+    """Keys that are missing or of another type; the checksum fits."""
+
+    @pytest.mark.parametrize("key", ["index", "files", "split", "labels", "camera", "layout"])
+    @pytest.mark.parametrize("new", [KeyError, -1], ids=repr)
+    def test_no_key_of_a_line_is_trusted(self, scene, out, key, new):
+        lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+        for line in lines:
+            del line["check"]
+        lines[1] = _changed(lines[1], (key,), new)
+        (out / "manifest.jsonl").write_bytes(b"".join(map(encode_line, lines)))
+        for command in (lambda: write_folds(out, 2), lambda: READERS["merge"](out), lambda: write(scene, out)):
+            with pytest.raises(InputError, match=r"line 2: must be the record of a frame") as caught:
+                command()
+            assert "\n" not in str(caught.value)
+        assert any("line 2 is not the record" in text for _, text in audit_dataset(out).violations)
+        assert DatasetIndex(out).unreadable == 1
+
+    @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of values that overflow
+    def test_no_value_anywhere_ends_in_a_fault(self, scene, out):
+        """Drawn changes of drawn values, of which each is refused in a sentence, named by the audit, or borne."""
+        rng = random.Random(1)
+        values = [KeyError, None, "x", -1, {}, [], 1e308, 10**30, True, "\u2028", [[[]]], float("nan")]
+        tried = 0
+        for name in [*["manifest.jsonl"] * 8, *["dataset.json"] * 8, *["runs.jsonl", "timings.jsonl"] * 2]:
+            before = (out / name).read_bytes()
+            lines = [before] if name == "dataset.json" else before.splitlines()
+            found = [json.loads(line) for line in lines]
+            number = rng.randrange(len(found))
+            found[number].pop("check", None)
+            found[number] = _changed(found[number], rng.choice(list(_places(found[number]))), rng.choice(values))
+            if name == "manifest.jsonl":
+                changed = [encode_line({key: value for key, value in one.items() if key != "check"}) for one in found]
+            else:
+                changed = [json.dumps(one).encode() + b"\n" for one in found]
+            (out / name).write_bytes(b"".join(changed))
+            for command in rng.sample(sorted(READERS), 3):
+                tried += 1
+                shutil.rmtree(out.parent / "merged", ignore_errors=True)
+                try:
+                    READERS[command](out)
+                except (InputError, PartialResultError) as error:
+                    assert "\n" not in str(error)
+            (out / name).write_bytes(before)
+        assert tried == 60
+
+
+@pytest.mark.parametrize("character", ["\n", "\r\n", "\0", "\x1b", "\u2028", "\uffff"], ids=ascii)
+def test_class_names_are_of_one_line(scene_data, write_scene, character):
+    scene_data["objects"][0]["class_name"] = f"nut{character}"
+    with pytest.raises(InputError, match=r"class.*must have no control characters or line breaks"):
+        load_scene(write_scene(scene_data))
+
+
+@pytest.mark.parametrize("key", ["name", "class"])
+def test_names_of_assets_are_of_one_line(scene_data, write_scene, key):
+    path = write_scene(scene_data).parent / "assets/nut/asset.yaml"
+    kept = "".join(line for line in path.read_text().splitlines(keepends=True) if not line.startswith(f"{key}:"))
+    path.write_text(f'{kept}{key}: "nut\\r\\nbolt"\n')
+    with pytest.raises(InputError, match=rf"{key}.*must have no control characters or line breaks"):
+        load_scene(path.parents[2] / "scene.yaml")
+
+
+def test_classes_of_a_dataset_are_of_one_line(out):
+    content = read_json(out / "dataset.json")
+    content["classes"][0] = "nut\u2028bolt"
+    (out / "dataset.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"classes\.0.*must have no control characters"):
+        audit_dataset(out)

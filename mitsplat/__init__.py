@@ -120,7 +120,7 @@ def _load_no_plugins_from_here() -> None:
 
     Other files are still found there: names that no folder has count from the current one.
     """
-    import mitsuba as mi
+    import mitsuba as mi  # called once it is there: `import mitsplat` does not load it
 
     folders, here = mi.file_resolver(), str(mi.filesystem.current_path())
     for number in reversed(range(len(folders))):

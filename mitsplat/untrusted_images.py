@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mitsplat.child_process import limit_memory, run_bounded
+from mitsplat.exr_header import check_exr_header
 
 IMAGES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """Suffixes of what patterns of images match."""
@@ -64,6 +65,7 @@ def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
     mi.set_variant("scalar_rgb")
     for path, limit in zip(arguments[::2], arguments[1::2], strict=True):
         limit_memory(int(limit))
+        check_exr_header(Path(path))
         mi.Bitmap(path)
         output.write(b"\n")
         output.flush()

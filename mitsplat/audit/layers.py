@@ -16,6 +16,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.audit.conveyor import BeltTruth
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
+from mitsplat.exr_header import check_exr_header
 from mitsplat.picture_files import read_picture
 
 _FLOW_ROUNDED = 0.02
@@ -234,6 +235,7 @@ def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] 
 def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
     """Channels by name, and what prevents reading them."""
     try:
+        check_exr_header(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}, ""
     except Exception as error:  # noqa: BLE001 - OpenEXR raises what it likes

@@ -336,6 +336,9 @@ class Capture:
             raise InputError(f"{folder / _POINTS}: no such file") from None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{folder / _POINTS}: not a capture's points ({error})") from error
+        whole = seen.dtype.kind in "iu" and counts.dtype.kind in "iu"
+        if not whole or np.any((counts < 0) | (counts > len(seen))):
+            raise InputError(f"{folder / _POINTS}: must count points in whole numbers of 0 to {len(seen)}")
         if len(counts) != len(spec.photos) or counts.sum() != len(seen):
             raise InputError(
                 f"{folder / _POINTS}: must count the points of {len(spec.photos)} photos (got {len(counts)})"

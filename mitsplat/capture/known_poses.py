@@ -21,6 +21,10 @@ _Row = tuple[float, float, float, float]
 _Positive = Annotated[float, Field(gt=0)]
 
 
+_FARTHEST = 1e9
+"""Largest coordinate of a camera or a point, in the model's unit; that of geocentric metres is 6e6."""
+
+
 class _Lens(BaseModel):
     """Intrinsics, of all frames or of one; pixel centres at +0.5 as in COLMAP, from where such files come."""
 
@@ -75,11 +79,21 @@ def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress:
     names = _match(model.cameras, photos)
     if len(names) < 2:
         raise InputError(f"{source}: must name the photos (got {next(iter(model.cameras))} and no match for it)")
+    _check_places(source, model)
     sizes = {photo.file.name: photo.size for photo in photos}
     cameras = {file: _fitted(source, name, model.cameras[name], sizes[file]) for name, file in names.items()}
     if not len(model.points):
         return find_points([photo for photo in photos if photo.file.name in cameras], cameras, folder, progress)
     return replace(model, cameras=cameras, seen={file: model.seen[name] for name, file in names.items()})
+
+
+def _check_places(source: Path, model: SparseModel) -> None:
+    """Refuse a model of which a camera or a point is so far away that numbers overflow, or nowhere."""
+    places = [(f"camera {name}", camera.world_from_camera[:3, 3]) for name, camera in model.cameras.items()]
+    places += [("a point", model.points)] if len(model.points) else []
+    for name, place in places:
+        if not (farthest := float(np.abs(place).max())) <= _FARTHEST:
+            raise InputError(f"{source}: {name} must lie within {_FARTHEST:g} of the origin (got {farthest:g})")
 
 
 def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -10,7 +10,6 @@ from typing import Literal
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 from skimage.transform import SimilarityTransform
 
 from mitsplat.arrays import Float64Array
@@ -19,12 +18,10 @@ from mitsplat.camera import Camera
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.picture_files import read_picture
+from mitsplat.triangulation import meeting_point, triangulate
 
 DEFAULT_BOARD = Board()
 """What `mitsplat board` prints by default."""
-
-MAX_ERROR = 3.0
-"""Reprojection error from which an observation of a target's corner is an outlier [px]."""
 
 MAX_CONTRADICTION = 0.0025
 """Error up to which a camera sees the board where it is, as a share of its image's longer edge."""
@@ -97,7 +94,7 @@ def find_metric_frame(
         centred: Whether the origin is below the point that the cameras look at, else in the middle of a board.
 
     Raises:
-        InputError: If ``scale_from`` names places that do not exist.
+        InputError: If ``scale_from`` names places that do not exist, or all cameras are where they look.
     """
     views, tag_views = _find_targets(model, images, board, tags=tag is not None)
     corners = _triangulate_corners(views, set(model.cameras))
@@ -159,7 +156,10 @@ def find_metric_frame(
         origin = target - (target - point) @ normal * normal
     else:
         origin = point
-    factor = scale[0] if scale else 1 / float(np.median(np.linalg.norm(centres - target, axis=1)))
+    distance = float(np.median(np.linalg.norm(centres - target, axis=1)))
+    if not distance > 0:
+        raise InputError(f"the {len(centres)} cameras must stand apart from the place that they look at (got 0)")
+    factor = scale[0] if scale else 1 / distance
     rotation = _upright(normal, forward[0] if board_pose is None else board_pose[:3, 0])
     matrix = np.eye(4)
     matrix[:3, :3] = factor * rotation
@@ -209,35 +209,6 @@ def spot(model: SparseModel, name: str) -> Float64Array:
     depth = float(depths[near] @ weights / weights.sum())
     ray = np.append(camera.ray_slopes([(x, y)])[0], 1.0) * depth
     return np.asarray(camera.world_from_camera[:3, :3] @ ray + camera.centre)
-
-
-def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64Array | None:
-    """The point (3,) that cameras see at pixels (2,), or None where fewer than three agree on one.
-
-    The point nearest to all rays starts a search for the least robust reprojection error; observations off by more
-    than :data:`MAX_ERROR` are then left out.
-    """
-    observations = list(observations)
-    while len(observations) >= 3:
-        cameras = [camera for camera, _ in observations]
-        slopes = np.array([np.append(c.ray_slopes([p])[0], 1.0) for c, p in observations])
-        rays = np.array([c.world_from_camera[:3, :3] @ slope for c, slope in zip(cameras, slopes, strict=True)])
-        centres = np.array([camera.centre for camera in cameras])
-        start = meeting_point(centres, rays / np.linalg.norm(rays, axis=1, keepdims=True))
-        poses = np.array([camera.camera_from_world for camera in cameras])
-        focal = np.array([(camera.fx, camera.fy) for camera in cameras])
-
-        def residuals(point: Float64Array, poses: Float64Array = poses, focal: Float64Array = focal) -> Float64Array:
-            local = poses[:, :3, :3] @ point + poses[:, :3, 3]
-            depth = np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:])
-            return np.asarray(((local[:, :2] / depth - slopes[:, :2]) * focal).ravel())  # noqa: B023 - used at once
-
-        point = least_squares(residuals, start, loss="soft_l1").x
-        errors = np.linalg.norm(residuals(point).reshape(-1, 2), axis=1)
-        if errors.max() <= MAX_ERROR:
-            return np.asarray(point)
-        del observations[int(errors.argmax())]
-    return None
 
 
 def fit_similarity(source: Float64Array, target: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -312,15 +283,6 @@ def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
     if tilt[best] > 0.03 or others.min() < 3 * tilt[best] + 0.01:  # held anyhow, or all from one side
         return None
     return np.asarray(upward * np.sign(np.mean(-poses[:, :, 2] @ upward)))
-
-
-def meeting_point(origins: Float64Array, directions: Float64Array) -> Float64Array:
-    """The point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    # A grain of the identity: lines that are all parallel have no such point.
-    whole = across.sum(axis=0) + 1e-9 * np.eye(3)
-    right = np.einsum("nij,nj->i", across, origins) + 1e-9 * origins.mean(axis=0)
-    return np.asarray(np.linalg.solve(whole, right))
 
 
 def _rays(model: SparseModel) -> tuple[Float64Array, Float64Array]:

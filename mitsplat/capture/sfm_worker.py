@@ -24,6 +24,7 @@ zlib.compress(b"before pycolmap")
 import numpy as np  # noqa: E402
 import pycolmap  # noqa: E402
 
+from mitsplat.child_process import limit_memory  # noqa: E402
 from mitsplat.cores import usable_cores  # noqa: E402
 
 SEED = 1
@@ -40,7 +41,7 @@ def main(job_file: Path) -> None:
     folder = job_file.parent
     try:
         run(json.loads(job_file.read_text()), folder)
-    except (ValueError, RuntimeError, OSError, KeyError, IndexError) as error:
+    except (ValueError, RuntimeError, OSError, KeyError, IndexError, MemoryError) as error:
         (folder / "error").write_text(" ".join(str(error).split()) or type(error).__name__)
         sys.exit(1)
 
@@ -63,13 +64,15 @@ def run(job: dict[str, Any], folder: Path) -> None:
     """Find or read a model and store it.
 
     Args:
-        job: ``task``: "read" a COLMAP model from ``model``; or "reconstruct" from ``groups`` (names of the photos in
-            ``images``, a path from ``folder``, by shared intrinsics), with ``features``, ``first_octave``, ``matching``
-            ("exhaustive" or "sequential") and ``enough``, the number of photos below which the global mapper is tried
-            as well; or "triangulate", the same with known ``cameras`` (see :func:`known_model`).
+        job: ``task``: "read" a COLMAP model from ``model`` within ``memory`` [bytes]; or "reconstruct" from ``groups``
+            (names of the photos in ``images``, a path from ``folder``, by shared intrinsics), with ``features``,
+            ``first_octave``, ``matching`` ("exhaustive" or "sequential") and ``enough``, the number of photos below
+            which the global mapper is tried as well; or "triangulate", the same with known ``cameras`` (see
+            :func:`known_model`).
         folder: Where the database and the results are.
     """
     if job["task"] == "read":
+        limit_memory(job["memory"])  # counts in damaged files are not compared with their sizes
         store(folder, [pycolmap.Reconstruction(job["model"])])
         return
     images, database = folder / job["images"], folder / "database.db"

@@ -7,9 +7,11 @@ The work is done by COLMAP (Schönberger and Frahm 2016; global mapper: Pan et a
 from __future__ import annotations
 
 import json
+import math
 import os
 import sqlite3
 import subprocess
+import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -38,6 +40,12 @@ SURE_AGREEMENT = 0.65
 
 ENOUGH = 0.8
 """Share of registered photos below which the global mapper is tried as well."""
+
+_MODEL_PARTS = ("cameras", "images", "points3D")
+_READ_MEMORY = 2 << 30
+"""Address space for reading a model, beside 100 times the size of its files [bytes]."""
+_READ_SECONDS = 30
+"""Time for reading a model, beside a second for each megabyte [s]."""
 
 _MODELS: Mapping[str, tuple[int, ...]] = {
     # Places of COLMAP's parameters fx, fy, cx, cy, then k1, k2, p1, p2, k3, k4, k5, k6; -1: 0.
@@ -152,8 +160,13 @@ def read_model(source: Path, folder: Path) -> SparseModel:
         InputError: If it is damaged or its lens model is not one of OpenCV's.
         MissingResourceError: If COLMAP ends its process.
     """
+    parts = [source / f"{name}{suffix}" for name in _MODEL_PARTS for suffix in (".bin", ".txt")]
+    if odd := [path for path in parts if path.exists() and not path.is_file()]:
+        raise InputError(f"{odd[0]}: must be a file")
+    size = sum(path.stat().st_size for path in parts if path.exists())
+    job = {"task": "read", "model": str(source), "memory": _READ_MEMORY + 100 * size}
     try:
-        arrays = _run({"task": "read", "model": str(source)}, folder, None)
+        arrays = _run(job, folder, None, seconds=_READ_SECONDS + size / 1e6)
     except InputError as error:
         raise InputError(f"{source}: not a readable COLMAP model ({error})") from error
     return _read_arrays(arrays, ())
@@ -209,8 +222,10 @@ def _job(photos: Sequence[Prepared], folder: Path) -> dict[str, Any]:
     }
 
 
-def _run(job: Mapping[str, Any], folder: Path, progress: Progress | None) -> dict[str, npt.NDArray[Any]]:
-    """Have the child do the job; what an earlier one of the same input stored in the database is kept."""
+def _run(
+    job: Mapping[str, Any], folder: Path, progress: Progress | None, *, seconds: float = math.inf
+) -> dict[str, npt.NDArray[Any]]:
+    """Have the child do the job within a time; what an earlier one of the same input stored in the database is kept."""
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(job, indent=1)
     file, database = folder / "job.json", folder / "database.db"
@@ -219,6 +234,7 @@ def _run(job: Mapping[str, Any], folder: Path, progress: Progress | None) -> dic
         write_text(file, text)
     for name in ("model.npz", "error", "status"):
         (folder / name).unlink(missing_ok=True)
+    until = time.monotonic() + seconds
     with (folder / "log.txt").open("wb") as log:
         child = subprocess.Popen(
             python_command("-m", "mitsplat.capture.sfm_worker", file.resolve()),
@@ -233,6 +249,8 @@ def _run(job: Mapping[str, Any], folder: Path, progress: Progress | None) -> dic
                     status = child.wait(timeout=0.3)
                     break
                 except subprocess.TimeoutExpired:
+                    if time.monotonic() > until:
+                        raise InputError(f"COLMAP did not end within {seconds:.0f} s") from None
                     if progress is not None:
                         progress(*_reached(job, folder))
         finally:

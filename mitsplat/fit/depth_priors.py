@@ -24,6 +24,7 @@ from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo, Window
 from mitsplat.capture.masks import shapes_differ
 from mitsplat.errors import InputError
+from mitsplat.exr_header import check_exr_header
 from mitsplat.files import IMAGE_ERRORS
 
 DepthMap = Float32Array
@@ -107,6 +108,7 @@ def _read_exr(path: Path) -> Float32Array:
     """The only channel of an OpenEXR file, or the one that is named Z."""
     if not path.is_file():
         raise FileNotFoundError(path)
+    check_exr_header(path)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     if len(channels) > 1 and "Z" not in channels:

@@ -16,7 +16,6 @@ from scipy.ndimage import binary_erosion
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.metric_frame import meeting_point
 from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.colour import decode_srgb
 from mitsplat.files import write_text
@@ -37,6 +36,7 @@ from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
 from mitsplat.surroundings.shading import ShadingLight, light_of_shading
 from mitsplat.surroundings.supports import Support, find_supports, flattened
+from mitsplat.triangulation import meeting_point
 
 _NEAR = 3.0
 """Distance from what the cameras look at, in their own, beyond which is background: shown, but no part of the mesh."""

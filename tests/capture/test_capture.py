@@ -179,3 +179,18 @@ def test_missing_and_damaged_files_are_named(capture: Capture, tmp_path: Path) -
     loaded.photos[0].file.write_bytes(b"rubbish")
     with pytest.raises(InputError, match="not a readable image"):
         loaded.photos[0].picture()
+
+
+@pytest.mark.parametrize(
+    "counts", [[-1, *[0] * 8, 1], [2**62, *[0] * 8, 2**62], [0.5] * 10], ids=["negative", "too many", "fractions"]
+)
+def test_counts_of_points_are_whole_numbers_of_what_is_there(
+    capture: Capture, tmp_path: Path, counts: list[float]
+) -> None:
+    capture.save(tmp_path / "a")
+    points = tmp_path / "a/points.npz"
+    with np.load(points) as stored:
+        arrays = dict(stored)
+    np.savez(points, **(arrays | {"seen": arrays["seen"][:0], "seen_counts": np.array(counts)}))
+    with pytest.raises(InputError, match=r"points\.npz: must count points in whole numbers of 0 to 0"):
+        Capture.load(tmp_path / "a")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from mitsplat.capture import known_poses as poses
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.photos import prepare_photos
+from mitsplat.capture.photos import Prepared, prepare_photos
 from mitsplat.capture.pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.errors import InputError
 from tests import rendered
@@ -160,3 +162,60 @@ def test_fisheyes_are_read(tmp_path: Path) -> None:
     for camera in (colmap, nerf):
         assert camera.lens == "fisheye"
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
+
+
+def small_model(folder: Path) -> tuple[Path, list[Prepared]]:
+    """A COLMAP model of two photos and a point, and the photos."""
+    model = folder / "model"
+    model.mkdir()
+    (model / "cameras.txt").write_text("1 PINHOLE 32 24 40 40 16 12\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 1 1 a.png\n5 6 1\n2 1 0 0 0 0.1 0 1 1 b.png\n5 6 1\n")
+    (model / "points3D.txt").write_text("1 0 0 1 9 9 9 0.1 1 0 2 0\n")
+    return model, [Prepared(f"{name}.png", folder / f"{name}.png", (32, 24), 1, ()) for name in "ab"]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "sentence"),
+    [
+        ("images", "0.1 0 1 1", "1e300 0 1 1", "camera b.png must lie within 1e+09 of the origin (got 1e+300)"),
+        ("points3D", "1 0 0 1", "1 0 -1e308 1", "a point must lie within 1e+09 of the origin (got 1e+308)"),
+        ("points3D", "1 0 0 1", "1 nan 0 1", "not a readable COLMAP model"),
+    ],
+)
+def test_models_with_places_nowhere_are_refused(tmp_path: Path, file: str, old: str, new: str, sentence: str) -> None:
+    model, photos = small_model(tmp_path)
+    path = model / f"{file}.txt"
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError) as raised:
+        read_poses(model, photos, tmp_path / "work")
+    assert sentence in str(raised.value) and str(model) in str(raised.value)
+
+
+@pytest.mark.parametrize("data", [struct.pack("<Q", 1 << 62), struct.pack("<Q3d3BdQ", 1, 0, 0, 1, 9, 9, 9, 0, 1 << 62)])
+def test_counts_in_a_model_take_no_more_memory_than_its_size_warrants(
+    tmp_path: Path, data: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, photos = small_model(tmp_path)
+    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    for path in model.glob("*.txt"):
+        path.unlink()
+    (model / "points3D.bin").write_bytes(data)
+    monkeypatch.setattr(sfm, "_READ_MEMORY", 200 << 20)
+    with pytest.raises(InputError, match="model: not a readable COLMAP model"):
+        read_poses(model, photos, tmp_path / "work")
+
+
+def test_reading_a_model_takes_no_longer_than_its_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, photos = small_model(tmp_path)
+    monkeypatch.setattr(sfm, "_READ_SECONDS", 0.0)
+    with pytest.raises(InputError, match="COLMAP did not end within 0 s"):
+        read_poses(model, photos, tmp_path / "work")
+
+
+def test_a_pipe_in_a_model_is_refused(tmp_path: Path) -> None:
+    model, photos = small_model(tmp_path)
+    (model / "points3D.txt").unlink()
+    os.mkfifo(model / "points3D.txt")
+    with pytest.raises(InputError, match=r"points3D\.txt: must be a file"):
+        read_poses(model, photos, tmp_path / "work")

@@ -19,12 +19,11 @@ from mitsplat.capture.metric_frame import (
     find_metric_frame,
     find_table,
     fit_similarity,
-    meeting_point,
-    triangulate,
     vertical_from_cameras,
 )
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
+from mitsplat.triangulation import meeting_point, triangulate
 
 BOARD = Board(6, 4, 0.03)
 LOST = np.eye(4)
@@ -365,3 +364,11 @@ def test_impossible_boards_are_one_sentence(tmp_path: Path, make: object, senten
     with pytest.raises(InputError) as raised:
         make(tmp_path)  # type: ignore[operator]
     assert sentence in str(raised.value)
+
+
+def test_cameras_of_one_place_are_refused(tmp_path: Path) -> None:
+    Image.new("L", (64, 48)).save(tmp_path / "black.png")
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+    model = replace(model_of([camera] * 4, np.zeros((0, 3))), cameras=dict.fromkeys("abcd", camera))
+    with pytest.raises(InputError, match="the 4 cameras must stand apart from the place that they look at"):
+        find_metric_frame(model, dict.fromkeys("abcd", tmp_path / "black.png"))

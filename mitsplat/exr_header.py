@@ -1,0 +1,75 @@
+"""Bounds on the headers of OpenEXR files, to be asked for before a library reads one.
+
+OpenEXR looks through all channels, and all attributes, for each new one: 200,000 of them in 5 MB take it many minutes.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from mitsplat.errors import InputError
+
+_MAGIC = b"\x76\x2f\x31\x01"
+_MULTIPLE_PARTS = 0x1000
+_MOST_CHANNELS = 64 << 10
+"""Size of the longest list of channels [bytes]; 2,000 channels with short names fit."""
+_MOST_ATTRIBUTES = 2000
+"""Most attributes of all parts."""
+_LONGEST_NAME = 256
+
+
+def check_exr_header(path: Path) -> None:
+    """Refuse an OpenEXR file whose header holds too much; what is no OpenEXR file at all is left to its reader.
+
+    Raises:
+        InputError: If a list of channels, or the number of attributes, is too large, or the header ends too early.
+        OSError: If the file cannot be read.
+    """
+    with path.open("rb") as file:
+        if file.read(4) != _MAGIC:
+            return
+        multiple = bool(_number(path, file) & _MULTIPLE_PARTS)
+        for _ in range(_MOST_ATTRIBUTES):
+            if not _attribute(path, file) and not (multiple and _more_parts(file)):
+                return
+    raise InputError(f"{path}: the header of an OpenEXR file must not hold more than {_MOST_ATTRIBUTES} attributes")
+
+
+def _attribute(path: Path, file: BinaryIO) -> bool:
+    """Read one attribute; false at the end of a part's header."""
+    name = _text(path, file)
+    if not name:
+        return False
+    kind, size = _text(path, file), _number(path, file)
+    if kind == b"chlist" and size > _MOST_CHANNELS:
+        raise InputError(f"{path}: channels must be listed in at most {_MOST_CHANNELS} bytes (got {size})")
+    file.seek(size, 1)
+    return True
+
+
+def _more_parts(file: BinaryIO) -> bool:
+    """Whether another part's header follows."""
+    following = file.read(1)
+    file.seek(-len(following), 1)
+    return following not in (b"", b"\0")
+
+
+def _text(path: Path, file: BinaryIO) -> bytes:
+    """Read a text up to its zero byte."""
+    found = file.read(_LONGEST_NAME)
+    text, zero, rest = found.partition(b"\0")
+    if not zero:
+        raise InputError(f"{path}: the header of an OpenEXR file must have names of at most {_LONGEST_NAME - 1} bytes")
+    file.seek(-len(rest), 1)
+    return text
+
+
+def _number(path: Path, file: BinaryIO) -> int:
+    """Read a 32-bit number that is not negative."""
+    data = file.read(4)
+    value: int = struct.unpack("<i", data)[0] if len(data) == 4 else -1
+    if value < 0:
+        raise InputError(f"{path}: the header of an OpenEXR file is cut short or damaged")
+    return value

@@ -133,6 +133,15 @@ EXRS: Mapping[str, Callable[[], bytes]] = {
 
 _EVERYWHERE = ("window of 2^50 pixels", "damaged pixels", "deep", "empty")
 """Variants that lights of scenes are tried with, too; their reader is that of panoramas."""
+_DEPTHS = (
+    *_EVERYWHERE,
+    "cut in half",
+    "offsets that lead outside",
+    "2^40 tiles",
+    "200,000 channels",
+    "attribute of 2 GB",
+)
+"""Variants that depth maps are tried with, which another reader reads."""
 
 
 def _exr_attacks() -> Iterator[Attack]:
@@ -152,7 +161,7 @@ def _exr_attacks() -> Iterator[Attack]:
         yield Attack(f"exr: panorama, {name}", tries, sky, [LIGHTS], refused)
         if name in _EVERYWHERE:
             yield Attack(f"exr: light, {name}", tries, sky, [CHECK], REFUSED)
-        if name not in _EVERYWHERE[1:]:
+        if name in _DEPTHS:
             yield Attack(f"exr: depth map, {name}", tries, depth, [FIT], REFUSED)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,6 +19,14 @@ Box = tuple[int, int, int, int]
 
 BOUNDARY_TOLERANCE = 2
 """Distance within which two boundaries count as the same [px]."""
+
+
+def decode_rle(rle: Any) -> Any:
+    """Decode a COCO run-length code to a mask of 0 and 1, shape (H, W)."""
+    with warnings.catch_warnings():
+        # Of pycocotools with NumPy 2; with Python's option -W error it would end the run.
+        warnings.filterwarnings("ignore", "__array__ implementation", DeprecationWarning)
+        return coco_mask.decode(rle)
 
 
 @dataclass(frozen=True, eq=False)

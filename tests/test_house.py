@@ -164,6 +164,12 @@ def test_opencv_opens_no_picture_by_itself() -> None:
     assert [module for module, path in MODULES.items() if "cv2.imread(" in path.read_text()] == []
 
 
+def test_masks_are_decoded_without_the_warning_of_pycocotools() -> None:
+    """It would end a run under Python's option -W error."""
+    found = [module for module, path in MODULES.items() if "coco_mask.decode(" in path.read_text()]
+    assert found == ["mitsplat.masks"]
+
+
 def test_imports_inside_of_functions_say_why() -> None:
     silent = [
         f"{path.relative_to(ROOT)}:{line}"

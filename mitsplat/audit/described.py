@@ -20,6 +20,7 @@ from pycocotools.coco import COCO
 from mitsplat.audit.read_back import Violations, segment_picture
 from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
 from mitsplat.json_stream import read_lists
+from mitsplat.masks import decode_rle
 
 WHOLE = 32 << 20
 """Size up to which a file is also opened by pycocotools, which holds all of it, ten times as large [bytes]."""
@@ -371,7 +372,7 @@ def _check_segmentation(frame: TrueFrame, label: TrueInstance, code: Any, *, amo
         return
     truth = frame.whole(label, amodal=amodal)
     try:
-        mask = coco_mask.decode(code).astype(bool)
+        mask = decode_rle(code).astype(bool)
         box = coco_mask.toBbox(code).tolist()
     except Exception as error:  # noqa: BLE001 - pycocotools raises what it likes
         yield f"{name} cannot be decoded by pycocotools ({error})"

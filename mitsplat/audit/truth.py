@@ -14,10 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pycocotools import mask as coco_mask
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.files import Record
+from mitsplat.masks import decode_rle
 
 Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
@@ -225,6 +225,6 @@ def bounds_of(mask: BoolArray) -> Box:
 
 
 def _decode(code: str, width: int, height: int) -> tuple[Box, BoolArray]:
-    whole = coco_mask.decode({"size": [height, width], "counts": code})
+    whole = decode_rle({"size": [height, width], "counts": code})
     x0, y0, x1, y1 = box = bounds_of(whole)
     return box, np.ascontiguousarray(whole[y0:y1, x0:x1], dtype=bool)

@@ -22,6 +22,7 @@ from mitsplat.dataset.manifest import LONGEST_LINE, parse_line, read_lines
 from mitsplat.errors import InputError
 from mitsplat.files import Record, open_regular, read_json, splits_of
 from mitsplat.format_version import FORMAT_VERSIONS, check_format_version
+from mitsplat.masks import decode_rle
 from mitsplat.spec.camera import CameraSpec
 from mitsplat.spec.spec import LabelRules, Output
 from mitsplat.spec_types import Name
@@ -383,7 +384,7 @@ def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
     x0, y0, x1, y1 = box
     if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
         raise ValueError(f"its box must lie in the image (got {box})")
-    mask = coco_mask.decode({"size": [height, width], "counts": code})
+    mask = decode_rle({"size": [height, width], "counts": code})
     # Decoding leaves what no run covers as the memory was; only a whole code is what its mask encodes to.
     if not mask[y0:y1, x0:x1].any() or coco_mask.encode(mask)["counts"].decode() != code:
         raise ValueError(f"must be the code of a mask in its box (got {code[:20]!r} for {box})")

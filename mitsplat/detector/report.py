@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pycocotools import mask as coco_mask
 
 from mitsplat.detector.losses import KINDS
 from mitsplat.detector.pictures import read_picture
@@ -16,7 +15,7 @@ from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePr
 from mitsplat.detector.sets import LabelledSet, Sample
 from mitsplat.html import inline_image, make_page, mask_path
 from mitsplat.labels.overlay import class_colour
-from mitsplat.masks import Silhouette
+from mitsplat.masks import Silhouette, decode_rle
 from mitsplat.svg_charts import bars, curves
 
 WORST = 8
@@ -177,7 +176,7 @@ def _picture(sample: Sample, shown: Sequence[Mapping[str, Any]], class_names: Se
         colour = "rgb({},{},{})".format(*class_colour(index))
         x, y, width, height = entry["bbox"]
         name = class_names[index] + (f" {entry['score']:.2f}" if "score" in entry else "")
-        if "segmentation" in entry and (mask := coco_mask.decode(entry["segmentation"])).any():
+        if "segmentation" in entry and (mask := decode_rle(entry["segmentation"])).any():
             path = mask_path(Silhouette.cropped(mask.astype(bool), 0, 0))
             marks.append(f'<path class="mask" d="{path}" fill="{colour}" stroke="{colour}"/>')
         marks.append(f'<rect class="box" x="{x}" y="{y}" width="{width}" height="{height}" stroke="{colour}"/>')

@@ -32,7 +32,7 @@ from mitsplat.detector.pictures import images_below, look_at_image
 from mitsplat.errors import InputError
 from mitsplat.files import SPLITS, is_inside, read_json
 from mitsplat.labels.polygons import fill_polygon, outline
-from mitsplat.masks import encode_mask
+from mitsplat.masks import decode_rle, encode_mask
 from mitsplat.progress import Progress
 
 Split = Literal["train", "val", "test", "all"]
@@ -84,7 +84,7 @@ class Instance:
         """Its outline [px], shape (M, 2)."""
         if self.polygon is not None:
             return self.polygon
-        return outline(np.asarray(coco_mask.decode(self.rle), dtype=bool))
+        return outline(np.asarray(decode_rle(self.rle), dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,7 +471,7 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                         f"{place}: run lengths must be of {height} x {width} px, {height * width} (got {sum(lengths)})"
                     )
                 rle = coco_mask.frPyObjects({"size": [height, width], "counts": lengths}, height, width)
-            if not coco_mask.decode(rle).any():
+            if not decode_rle(rle).any():
                 raise InputError(f"{place}: segmentation must cover a pixel")
         except InputError:
             raise

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycocotools.mask as coco_mask
 
 from mitsplat.arrays import BoolArray
 from mitsplat.detector.pictures import SMALLEST, read_picture
 from mitsplat.detector.sets import Instance, LabelledSet
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import outline
-from mitsplat.masks import Silhouette
+from mitsplat.masks import Silhouette, decode_rle
 
 LEAST_SEEN = 0.15
 """Share of what a photograph shows of an object from which it is labelled in a tile."""
@@ -50,7 +49,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
                 f"a --real-size nearer to --size, {size}"
             )
         masks = [
-            np.asarray(coco_mask.decode(one.encoded(sample.width, sample.height)), dtype=bool) if one.has_mask else None
+            np.asarray(decode_rle(one.encoded(sample.width, sample.height)), dtype=bool) if one.has_mask else None
             for one in sample.instances
         ]
         for top in _starts(sample.height, height):

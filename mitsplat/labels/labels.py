@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from pycocotools import mask as coco_mask
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.labels.polygons import fill_polygon, outline
@@ -34,6 +33,7 @@ from mitsplat.masks import (
     Silhouette,
     boundary_f1,
     bounds_of_ids,
+    decode_rle,
     encode_mask,
     without_fragments,
 )
@@ -196,7 +196,7 @@ class Labels:
 
         def decode(code: str, box: list[int]) -> BoolArray:
             x0, y0, x1, y1 = box
-            mask = coco_mask.decode({"size": [height, width], "counts": code})
+            mask = decode_rle({"size": [height, width], "counts": code})
             return np.ascontiguousarray(mask[y0:y1, x0:x1], dtype=bool)
 
         instances = []

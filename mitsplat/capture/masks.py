@@ -22,8 +22,9 @@ from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo, mask_name
 from mitsplat.capture.photos import Prepared
 from mitsplat.cores import usable_cores
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import InputError
 from mitsplat.files import IMAGE_ERRORS, write_file
+from mitsplat.onnx_networks import load_library
 from mitsplat.progress import Progress
 
 ByteImage = npt.NDArray[np.uint8]
@@ -190,14 +191,11 @@ def model_masks(model: Path) -> MaskMaker:
 
     Raises:
         InputError: If the file does not exist or is no such network.
-        MissingResourceError: If rembg is not installed.
+        MissingResourceError: If rembg is not installed, or ONNX Runtime is too old.
     """
     if not model.is_file():
         raise InputError(f"{model}: no such file")
-    try:
-        import rembg  # optional: the extra [masks]
-    except ImportError as error:
-        raise MissingResourceError(f"masks by a model need rembg: pip install 'mitsplat[masks]' ({error})") from error
+    rembg = load_library("masks", "rembg")
     try:
         session: Any = rembg.new_session("dis_custom", model_path=str(model.resolve()))
     except Exception as error:  # onnxruntime's have no other base

@@ -13,9 +13,10 @@ import numpy as np
 from mitsplat.arrays import Float32Array
 from mitsplat.capture.capture import Photo, stored_name
 from mitsplat.content_hash import ContentHash, file_hash
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import InputError
 from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthKind, DepthMaps
+from mitsplat.onnx_networks import load_library
 from mitsplat.progress import Progress
 from mitsplat.version import __version__
 
@@ -49,7 +50,7 @@ def model_maps(
 
     Raises:
         InputError: If the file does not exist or is no such network.
-        MissingResourceError: If onnxruntime is not installed.
+        MissingResourceError: If onnxruntime is not installed, or too old.
     """
     if not model.is_file():
         raise InputError(f"{model}: no such file")
@@ -74,14 +75,9 @@ def open_session(model: Path) -> Any:
 
     Raises:
         InputError: If the file is no network.
-        MissingResourceError: If onnxruntime is not installed.
+        MissingResourceError: If onnxruntime is not installed, or too old.
     """
-    try:
-        import onnxruntime  # optional: the extra [depth]
-    except ImportError as error:
-        raise MissingResourceError(
-            f"depths by a model need onnxruntime: pip install 'mitsplat[depth]' ({error})"
-        ) from error
+    onnxruntime = load_library("depth", "onnxruntime")
     try:
         return onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
     except Exception as error:  # its errors have no other base

@@ -73,14 +73,17 @@ def network(nodes: list[bytes], initializers: list[bytes] | None = None, edge: i
 
 
 def _added(initializer: bytes) -> bytes:
-    return network([node("Add", ("image", "w"), "depth")], [initializer])
+    """A network of the mean of the colours and of weights."""
+    channels = field(5, field(1, "axes") + field(8, 1) + field(20, 7))
+    return network([node("Add", ("image", "w"), "sum"), node("ReduceMean", ("sum",), "depth", channels)], [initializer])
 
 
-def _external(location: str, length: int = 64) -> Callable[[Place], bytes]:
+def external_weights(location: str, length: int = 4) -> Callable[[Place], bytes]:
+    """Maker of a network whose weights are in a file."""
     return lambda place: _added(
         tensor(
             "w",
-            (1, 1, 1, 16),
+            (1, 1, 1, 1),
             None,
             {"location": location.replace("{outside}", str(place.outside)), "offset": "0", "length": str(length)},
         )
@@ -89,7 +92,7 @@ def _external(location: str, length: int = 64) -> Callable[[Place], bytes]:
 
 def _linked(place: Place) -> bytes:
     (place.inside / "w.bin").symlink_to(place.outside / "numbers.bin")
-    return _external("w.bin")(place)
+    return external_weights("w.bin")(place)
 
 
 def _subgraphs(depth: int) -> bytes:
@@ -101,11 +104,11 @@ def _subgraphs(depth: int) -> bytes:
 
 
 NETWORKS: Mapping[str, Callable[[Place], bytes]] = {
-    "numbers from a path with ..": _external("../outside/numbers.bin"),
-    "numbers from an absolute path": _external("{outside}/numbers.bin"),
+    "numbers from a path with ..": external_weights("../outside/numbers.bin"),
+    "numbers from an absolute path": external_weights("{outside}/numbers.bin"),
     "numbers from a link": _linked,
-    "numbers from a file that ends early": _external("../outside/numbers.bin", 1 << 40),
-    "numbers from endless zeros": _external("/dev/zero", 1 << 40),
+    "numbers from a file that ends early": external_weights("../outside/numbers.bin", 1 << 40),
+    "numbers from endless zeros": external_weights("/dev/zero", 1 << 40),
     "weights that are a million times as many as given": lambda p: _added(tensor("w", (1 << 20, 1 << 20), bytes(64))),
     "weights of 2^62": lambda p: _added(tensor("w", (1 << 31, 1 << 31), None)),
     "weights of -1": lambda p: _added(tensor("w", (-1, -1), bytes(64))),

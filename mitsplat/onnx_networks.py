@@ -1,0 +1,39 @@
+"""Libraries that run networks in ONNX which users name."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import Any, Literal
+
+from mitsplat.errors import MissingResourceError
+
+OLDEST = (1, 24)
+"""First release of ONNX Runtime that reads no weights from outside of the folder of the network."""
+
+
+def load_library(extra: Literal["depth", "masks"], name: str) -> Any:
+    """Import a library that runs networks by ONNX Runtime.
+
+    Args:
+        extra: Extra of mitsplat that installs it.
+        name: Its module.
+
+    Raises:
+        MissingResourceError: If it or ONNX Runtime is not installed, or ONNX Runtime is too old.
+    """
+    try:
+        runtime = importlib.import_module("onnxruntime")
+        library = importlib.import_module(name)
+    except ImportError as error:
+        raise MissingResourceError(
+            f"{extra.removesuffix('s')}s by a model need {name}: pip install 'mitsplat[{extra}]' ({error})"
+        ) from error
+    numbers = re.match(r"(\d+)\.(\d+)", runtime.__version__)
+    if numbers is None or tuple(map(int, numbers.groups())) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise MissingResourceError(
+            f"networks need onnxruntime {oldest} or newer, which reads no files outside of the network's folder (got "
+            f"{runtime.__version__}): pip install 'onnxruntime>={oldest}'"
+        )
+    return library

@@ -21,6 +21,7 @@ from mitsplat.dataset.own_files import MANIFEST
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding
+from mitsplat.frames.budget import worker_memory
 from mitsplat.mesh import check_size
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.scene import FramePlan, Scene, plan_frame
@@ -39,9 +40,11 @@ VIEWS = 48
 """Views that are looked at, spread over the run."""
 NARROWEST = 0.01
 """Share of the smallest object that an image must show at least."""
-PIXEL_BYTES, PROCESS_GIB = 400, 0.5
+PIXEL_BYTES, PROCESS_GIB = 500, 0.5
 """Least memory of a pixel at the peak of a frame, and of a process besides; the workcell takes 1.0 GiB at 640x360,
 2.6 at 2000x2000 and 8.4 at 4000x4000."""
+SLOW_OBJECTS = 40
+"""Objects of a layout from which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
 FRAME_BYTES = 8192
 """Least room on the disk of a frame: an image and a label, a block each."""
 _CELLS = 24  # of a region along each axis, in which is looked for room
@@ -260,6 +263,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
         f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
         "move camera, its keys or its ranges: such images have no labels",
     )
+    yield from _cost_doubts(scene)
     yield from _backdrop_doubts(scene, plans)
     for number, light in enumerate(spec.lights):
         if isinstance(light, LocalLight) and not light.moved and (name := _light_inside(scene, light)):
@@ -279,6 +283,20 @@ def doubts(scene: Scene) -> Iterator[Finding]:
             if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
                 text = f"{asset.name!r} does not fit into {shape.name!r}"
                 yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
+
+
+def _cost_doubts(scene: Scene) -> Iterator[Finding]:
+    """Warn of frames that may exceed the memory, and of layouts that settle for minutes."""
+    output, free = scene.spec.output, unused_memory()
+    need = worker_memory(scene).own / 2**30
+    if need > free:
+        size = f"{output.width}x{output.height} px"
+        text = f"an image of {size} may take {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
+        yield Finding("memory", False, text, "lower output.width and height: it may be refused after the first layout")
+    most = sum(entry.most for entry in scene.spec.objects if not entry.poses)
+    if most > SLOW_OBJECTS:
+        text = f"a layout of up to {most} objects takes minutes to settle"
+        yield Finding("settling", False, text, "lower objects[].count, or add views to each layout by output.views")
 
 
 def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:

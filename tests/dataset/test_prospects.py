@@ -13,13 +13,13 @@ from mitsplat.camera import Camera
 from mitsplat.checks.preflight import check_scene
 from mitsplat.dataset import prospects
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.prospects import disk_faults, doubts, refuse, run_faults, sees
+from mitsplat.dataset.prospects import disk_faults, doubts, image_faults, refuse, run_faults, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames import speed_accuracy as chart
 from mitsplat.mesh_points import points_inside
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.scene import load_scene, plan_frame
 from tests.bodies import pose_at
 from tests.cli.typed import run
 from tests.dataset.test_write import render, settle
@@ -41,7 +41,7 @@ HOPELESS = {
     "narrow": ({"camera": path_of(ABOVE, fx=1e9)}, r"camera.intrinsics: an image shows at most .*e-08 m"),
     "far": ({"camera": path_of((200, 0, 200), fov_x=60)}, r"no object covers more than .* \(labels.min_pixels is 16\)"),
     "tiny": ({"output": {"width": 1, "height": 1}}, "an image of 1 px cannot show labels.min_pixels = 16"),
-    "huge": ({"output": {"width": 16000, "height": 16000}}, r"16000x16000 px takes at least 95.9 GiB of memory \(8.0"),
+    "huge": ({"output": {"width": 16000, "height": 16000}}, r"16000x16000 px takes at least 119.7 GiB of memory \(8.0"),
     "ids": ({"objects": [{"asset": "assets/nut", "count": 10**8}]}, r"objects: .* at most 65535 .*\(got 100000000\)"),
     "room": ({"objects": [{"asset": "assets/nut", "count": 9000}]}, r"9000 objects of 54 l .* \(it has 28.8 l\)"),
     "frames": ({"output": {"layouts": 10**9, "views": 10**9}}, "layouts x views must be at most 2147483647"),
@@ -140,6 +140,32 @@ def test_what_is_hardly_meant_is_told(change, found, scene_data, write_scene, ma
     scene = scene_with(scene_data, write_scene, change)
     (finding,) = (finding for finding in check_scene(scene) if finding.name in TOLD and not finding.ok)
     assert re.match(found, finding.text)
+
+
+def test_check_warns_of_slow_settling_and_of_large_images(scene_data, write_scene, monkeypatch):
+    scene_data["objects"][0]["count"] = [100, 200]
+    scene_data["output"] |= {"width": 3000, "height": 3000}
+    monkeypatch.setattr(prospects, "unused_memory", lambda: 5.0)
+    found = {finding.name: finding.text for finding in doubts(load_scene(write_scene(scene_data))) if not finding.ok}
+    assert found["settling"] == "a layout of up to 201 objects takes minutes to settle"
+    assert re.match(r"an image of 3000x3000 px may take \d+\.\d GiB of memory \(5\.0 GiB are unused\)", found["memory"])
+
+
+def test_an_image_larger_than_the_memory_is_refused_before_work(scene_data, write_scene, monkeypatch):
+    monkeypatch.setattr(prospects, "unused_memory", lambda: 22.5)
+    scene = load_scene(write_scene(scene_data), overrides={"output.width": 8000, "output.height": 6000})
+    (fault,) = image_faults(scene)
+    assert fault.text == "output: an image of 8000x6000 px takes at least 22.9 GiB of memory (22.5 GiB are unused)"
+
+
+def test_the_cost_of_checks_does_not_grow_with_layouts(scene_data, write_scene, monkeypatch):
+    planned = []
+    monkeypatch.setattr(prospects, "plan_frame", lambda scene, index: planned.append(index) or plan_frame(scene, index))
+    scene_data["output"]["layouts"] = 100_000
+    scene = load_scene(write_scene(scene_data))
+    assert list(run_faults(scene)) == []
+    assert all(finding.ok for finding in doubts(scene))
+    assert len(planned) <= 2 * prospects.VIEWS
 
 
 def test_points_inside():

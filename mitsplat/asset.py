@@ -34,6 +34,7 @@ from mitsplat.format_version import FORMAT_VERSIONS
 from mitsplat.mesh import check_faces
 from mitsplat.spec_types import Name
 from mitsplat.splats import Splats
+from mitsplat.untrusted_meshes import check_mesh
 from mitsplat.yaml_input import FieldError, key_place, load_yaml
 
 Positive = Annotated[float, Field(gt=0)]
@@ -335,8 +336,7 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
     Raises:
         InputError: If the file is missing or damaged, or has no triangles or a vertex that is not finite.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    check_mesh(path)
     try:
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(path, process=merge)

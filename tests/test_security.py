@@ -1,6 +1,7 @@
 """Hostile scenes and archives: nothing outside is read, nothing swells, no code is run."""
 
 import gzip
+import json
 import os
 import resource
 import struct
@@ -9,11 +10,14 @@ import time
 import zipfile
 
 import pytest
+import trimesh
 
 from benchmarks.scale.attack.__main__ import all_attacks
 from benchmarks.scale.attack.attack import SECRET_COLOUR, SECRET_WORD, Attack, judge
 from benchmarks.scale.attack.samples import Place, Samples
-from mitsplat.asset import Asset
+from mitsplat import untrusted_meshes
+from mitsplat.asset import Asset, read_mesh
+from mitsplat.bake.parts import read_parts
 from mitsplat.errors import InputError
 from mitsplat.frames import mitsuba_xml as xml_scene
 from mitsplat.frames.untrusted_xml import check_xml
@@ -406,3 +410,74 @@ class TestAttacks:
         attack = Attack("a", "b", build, [command], seconds=5, mebibytes=60, keep=("kept",))
         faults = judge(attack, place).faults
         assert (fault is None and faults == ()) or any(fault in found for found in faults), faults
+
+
+class TestMeshes:
+    """Meshes that swell when they are read; the peak of this process says that they were not read here."""
+
+    @pytest.fixture(autouse=True)
+    def peak(self):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        yield
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300e3
+
+    @pytest.mark.parametrize("name", ["m.zip", "m.ZIP", "m.tar.gz", "m.bz2"])
+    def test_an_archive_is_no_mesh(self, scene_data, write_scene, tmp_path, name):
+        (tmp_path / name).write_bytes(b"PK")
+        scene_data["shapes"] = [{"name": "a", "mesh": name}]
+        with pytest.raises(
+            InputError, match=r"scene\.yaml:\d+: shapes\[0\]\.mesh: .* must be a mesh file, not an archive"
+        ):
+            load_scene(write_scene(scene_data))
+        with pytest.raises(InputError, match="must be a mesh file, not an archive"):
+            read_parts(tmp_path / name)
+
+    @pytest.mark.parametrize("read", [read_mesh, read_parts])
+    def test_a_count_without_data(self, tmp_path, read):
+        """Positions of 10^10 vertices in no buffer, which are zeros by the rules of glTF."""
+        accessor = {"componentType": 5126, "count": 10**10, "type": "VEC3"}
+        mesh = {"primitives": [{"attributes": {"POSITION": 0}}]}
+        said = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        empty, path = {"buffers": [], "bufferViews": []}, tmp_path / "a.gltf"
+        path.write_text(json.dumps({**said, "meshes": [mesh], "accessors": [accessor], **empty}))
+        with pytest.raises(InputError, match=r"a\.gltf: not a mesh file that can be read \(it takes more memory"):
+            read(path)
+
+    def test_a_swollen_3mf(self, tmp_path):
+        pytest.importorskip("lxml")
+        path = tmp_path / "a.3mf"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/a.model", "w") as file:
+            file.write(b"<model><resources><object id='1'><mesh><vertices>")
+            for _ in range(100):
+                file.write(b"<vertex x='0' y='0' z='0'/>" * 40000)
+            file.write(b"</vertices></mesh></object></resources></model>")
+        with pytest.raises(InputError, match=r"a\.3mf: not a mesh file that can be read \("):
+            read_mesh(path)
+
+    def test_a_buffer_outside_is_not_read(self, tmp_path):
+        (tmp_path / "in").mkdir()
+        files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box()))
+        for name, data in files.items():
+            (tmp_path / "in" / name.replace("model.gltf", "a.gltf")).write_bytes(data)
+        buffers = [name for name in files if name != "model.gltf"]
+        read_mesh(tmp_path / "in/a.gltf")
+        for name in buffers:
+            (tmp_path / "in" / name).rename(tmp_path / f"outside_{name}")
+        text = (tmp_path / "in/a.gltf").read_text()
+        for uri in ("../outside_", f"{tmp_path}/outside_"):
+            changed = text
+            for name in buffers:
+                changed = changed.replace(name, uri + name)
+            (tmp_path / "in/a.gltf").write_text(changed)
+            with pytest.raises(InputError, match="escapes resolver root"):
+                read_mesh(tmp_path / "in/a.gltf")
+
+    def test_plain_triangles_take_no_process(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(untrusted_meshes, "run_bounded", None)
+        box = trimesh.creation.box()
+        for name in ("a.ply", "a.stl"):
+            box.export(tmp_path / name)
+            assert len(read_mesh(tmp_path / name).faces) == 12
+        (tmp_path / "a.stl").write_bytes((tmp_path / "a.stl").read_bytes() + b"x")
+        with pytest.raises(TypeError):
+            read_mesh(tmp_path / "a.stl")

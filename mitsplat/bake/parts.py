@@ -36,6 +36,7 @@ from mitsplat.mesh_normals import corner_normals
 from mitsplat.plugins.device import ray_scene
 from mitsplat.render.emitters import emitter_dict, y_up_to_z_up
 from mitsplat.spec.lights import LightSpec
+from mitsplat.untrusted_meshes import check_mesh
 from mitsplat.variant import ensure_variant
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
@@ -128,6 +129,7 @@ def read_parts(
         refuse_others(path, "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
         if not path.is_file():
             raise InputError(f"{source}: no such mesh file")
+        check_mesh(path)
         if finish.colour is None:
             check_textures(path)
         linear = path.suffix.lower() in (".glb", ".gltf")

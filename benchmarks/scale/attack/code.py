@@ -81,14 +81,17 @@ def _colmap(place: Place) -> None:
 def _splats(name: str) -> Attack:
     def build(place: Place) -> None:
         hostile_modules(place)
-        place.take(name)
+        place.take("nut")
+        place.take(name, into="nut")
+        description = place.inside / "nut/asset.yaml"
+        description.write_text(description.read_text().replace("splats.ply", name))
 
     return Attack(
-        f"code: beside {name}, imported",
+        f"code: check of an asset of {name}",
         "run Python files of the current folder in the decoder's process",
         build,
-        [["mitsplat", "import", name, "-o", "made", "--size", "0.1"]],
-        ANY,
+        [["mitsplat", "check", "nut"]],
+        frozenset({0, 1}),
     )
 
 

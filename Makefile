@@ -16,7 +16,7 @@ test: $(STAMPS)/tools
 	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # What renders, on the GPU; tests/gpu also compares it with the CPU. The tests share the GPU.
-GPU_TESTS := tests/gpu tests/plugins tests/render tests/frames tests/fit tests/bake
+GPU_TESTS := tests/gpu tests/renderer tests/frames tests/fit tests/bake
 test-gpu: $(STAMPS)/tools
 	$(VENV)/bin/python -m pytest --device cuda --numprocesses 6 --dist loadfile $(GPU_TESTS)
 
@@ -24,7 +24,7 @@ lint: $(STAMPS)/tools
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
 	$(VENV)/bin/mypy
-	$(VENV)/bin/python -m pytest -q tests/test_house.py
+	$(VENV)/bin/python -m pytest -q tests/test_package_structure.py
 
 # What the tests of the live view look at it with; they are skipped where it is missing. On Debian, as root.
 browser:

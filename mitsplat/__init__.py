@@ -1,8 +1,9 @@
 """mitsplat: labelled training images of robot workcells from Gaussian splats, settled parts and traced light.
 
-Conventions (frames, units, colour) are stated in :mod:`mitsplat.splats`. Importing this package points Dr.Jit at a
-usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the current and any
-later variant, once Mitsuba is imported; heavy modules, Mitsuba among them, load when a name is first used.
+Conventions (frames, units, colour) are stated in :mod:`mitsplat.gaussians.splat_cloud`. Importing this package points
+Dr.Jit at a usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the
+current and any later variant, once Mitsuba is imported; heavy modules, Mitsuba among them, load when a name is first
+used.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsplat.gpu_memory import hide_full_gpus
-from mitsplat.late_mitsuba import after_mitsuba
-from mitsplat.llvm import use_bundled_llvm
+from mitsplat.runtime.gpu_memory import hide_full_gpus
+from mitsplat.runtime.import_hook import after_mitsuba
+from mitsplat.runtime.llvm import use_bundled_llvm
+from mitsplat.runtime.plugin_registration import register_plugins, set_registration
 from mitsplat.version import __version__ as __version__
 
 # Dr.Jit must be told, before it is imported, which LLVM to load, and which GPUs not.
@@ -24,31 +26,31 @@ hide_full_gpus()
 _importing = threading.RLock()
 _HOME = {
     "Asset": "asset",
-    "Camera": "camera",
+    "Camera": "geometry.camera",
     "DetectionMatches": "detector.scores",
     "Frame": "frames.frame",
     "InputError": "errors",
     "Labels": "labels.labels",
-    "Layers": "render.layers",
+    "Layers": "renderer.layers",
     "Layout": "scene.layout",
     "Quality": "quality",
     "Renderer": "frames.frame",
     "Scene": "scene.scene",
-    "SceneSpec": "spec.spec",
-    "Splats": "splats",
+    "SceneSpec": "scene.spec.scene_spec",
+    "Splats": "gaussians.splat_cloud",
     "TrainSettings": "detector.training",
     "average_precision": "detector.scores",
     "bake_asset": "bake.bake",
-    "evaluate_detector": "detector.evaluation",
-    "load_scene": "scene.scene",
-    "make_scene": "scene.scene",
+    "evaluate_detector": "detector.detector_evaluation",
+    "load_scene": "scene.loading.scene_loading",
+    "make_scene": "scene.loading.scene_loading",
     "remake_frame": "dataset.remake",
     "render_frame": "frames.frame",
     "render_frames": "frames.sequence",
-    "render_splats": "render.layers",
+    "render_splats": "renderer.layers",
     "settle_layout": "physics.settle",
     "train_detector": "detector.training",
-    "use_device": "device",
+    "use_device": "runtime.device",
     "write_dataset": "dataset.write",
     "write_frames": "dataset.given_frames",
 }
@@ -58,32 +60,32 @@ __all__ = sorted(_HOME)
 if TYPE_CHECKING:
     from mitsplat.asset import Asset as Asset
     from mitsplat.bake.bake import bake_asset as bake_asset
-    from mitsplat.camera import Camera as Camera
     from mitsplat.dataset.given_frames import write_frames as write_frames
     from mitsplat.dataset.remake import remake_frame as remake_frame
     from mitsplat.dataset.write import write_dataset as write_dataset
-    from mitsplat.detector.evaluation import evaluate_detector as evaluate_detector
+    from mitsplat.detector.detector_evaluation import evaluate_detector as evaluate_detector
     from mitsplat.detector.scores import DetectionMatches as DetectionMatches
     from mitsplat.detector.scores import average_precision as average_precision
     from mitsplat.detector.training import TrainSettings as TrainSettings
     from mitsplat.detector.training import train_detector as train_detector
-    from mitsplat.device import use_device as use_device
     from mitsplat.errors import InputError as InputError
     from mitsplat.frames.frame import Frame as Frame
     from mitsplat.frames.frame import Renderer as Renderer
     from mitsplat.frames.frame import render_frame as render_frame
     from mitsplat.frames.sequence import render_frames as render_frames
+    from mitsplat.gaussians.splat_cloud import Splats as Splats
+    from mitsplat.geometry.camera import Camera as Camera
     from mitsplat.labels.labels import Labels as Labels
     from mitsplat.physics.settle import settle_layout as settle_layout
     from mitsplat.quality import Quality as Quality
-    from mitsplat.render.layers import Layers as Layers
-    from mitsplat.render.layers import render_splats as render_splats
+    from mitsplat.renderer.layers import Layers as Layers
+    from mitsplat.renderer.layers import render_splats as render_splats
+    from mitsplat.runtime.device import use_device as use_device
     from mitsplat.scene.layout import Layout as Layout
+    from mitsplat.scene.loading.scene_loading import load_scene as load_scene
+    from mitsplat.scene.loading.scene_loading import make_scene as make_scene
     from mitsplat.scene.scene import Scene as Scene
-    from mitsplat.scene.scene import load_scene as load_scene
-    from mitsplat.scene.scene import make_scene as make_scene
-    from mitsplat.spec.spec import SceneSpec as SceneSpec
-    from mitsplat.splats import Splats as Splats
+    from mitsplat.scene.spec.scene_spec import SceneSpec as SceneSpec
 
 
 def __getattr__(name: str) -> Any:
@@ -101,26 +103,27 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-def _register_plugins() -> None:
-    import mitsuba as mi  # which is imported: this is what follows
+def _register(variant: str | None) -> None:
+    from mitsplat.plugins import register_under  # imports Mitsuba
 
-    def register(variant: str) -> None:
-        from mitsplat.variant import register_plugins  # imports Mitsuba
+    register_under(variant)
 
-        register_plugins(variant)
 
-    # Another thread may be importing what imports Mitsuba, and wait: nothing is imported before a variant is chosen.
-    mi.detail.add_variant_callback(lambda _old, new: register(new))
+def _follow_variants() -> None:
+    import mitsuba as mi  # already imported when this is called
+
+    # Import nothing before a variant is chosen: another thread may be importing a module that imports Mitsuba.
+    mi.detail.add_variant_callback(lambda _old, new: register_plugins(new))
     if mi.variant():
-        register(mi.variant())
+        register_plugins(mi.variant())
 
 
-def _load_no_plugins_from_here() -> None:
-    """Remove the current folder from those in which Mitsuba looks for native plugins; it would look there first.
+def _remove_current_folder_from_plugin_paths() -> None:
+    """Remove the current folder from the folders in which Mitsuba looks for native plugins.
 
-    Other files are still found there: names that no folder has count from the current one.
+    Mitsuba still finds other files there: relative paths start at the current folder.
     """
-    import mitsuba as mi  # called once it is there: `import mitsplat` does not load it
+    import mitsuba as mi  # already imported when this is called
 
     folders, here = mi.file_resolver(), str(mi.filesystem.current_path())
     for number in reversed(range(len(folders))):
@@ -128,5 +131,6 @@ def _load_no_plugins_from_here() -> None:
             del folders[number]
 
 
-after_mitsuba(_load_no_plugins_from_here)
-after_mitsuba(_register_plugins)
+set_registration(_register)
+after_mitsuba(_remove_current_folder_from_plugin_paths)
+after_mitsuba(_follow_variants)

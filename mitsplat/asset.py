@@ -4,7 +4,7 @@ A folder holds ``asset.yaml`` (:class:`AssetSpec` lists its keys) and the files 
 
     name: hammer
     class: hammer
-    splats: hammer.splat    # any format of mitsplat.splat_files
+    splats: hammer.splat    # any format of mitsplat.gaussians.splat_files
     mesh: hull              # or a mesh file in the same units and axes
     up: -y                  # axis of the files that points up
     size: 0.2               # longest extent [m]; or units: metres per file unit
@@ -29,13 +29,13 @@ from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.files import MESH_ERRORS, file_inside, storage_errors
-from mitsplat.format_version import FORMAT_VERSIONS
-from mitsplat.mesh import check_faces
-from mitsplat.spec_types import Name
-from mitsplat.splats import Splats
-from mitsplat.untrusted_meshes import check_mesh
-from mitsplat.yaml_input import FieldError, key_place, load_yaml
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.mesh import check_faces
+from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.storage.field_types import Name
+from mitsplat.storage.files import MESH_ERRORS, file_inside, storage_errors
+from mitsplat.storage.format_version import FORMAT_VERSIONS
+from mitsplat.storage.yaml_input import FieldError, key_place, load_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 Length = Annotated[float, Field(ge=1e-9, le=1e9)]
@@ -354,7 +354,7 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
 
 
 def _named_file(folder: Path, key: str, name: str) -> Path:
-    """A file that ``asset.yaml`` names, see :func:`mitsplat.files.file_inside`."""
+    """A file that ``asset.yaml`` names, see :func:`mitsplat.storage.files.file_inside`."""
     try:
         return file_inside(folder, name)
     except InputError as error:

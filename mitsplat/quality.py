@@ -61,7 +61,7 @@ class Quality:
             depths and instances stay those of the tile's order.
         sh_degree: Highest spherical-harmonic band that is evaluated.
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered); ``edges`` for one, and 2 x 2
-            where instances border on each other, see :mod:`mitsplat.plugins.edges`.
+            where instances border on each other, see :mod:`mitsplat.renderer.splatting.antialiasing`.
         lens_rings: Rings of points around the centre of a thin lens that are looked through: 1, 2, 3 take 7, 19, 37
             images. Where blur is wide, its points stand apart, and more rings make it smooth.
     """

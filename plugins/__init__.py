@@ -8,7 +8,23 @@ from typing import Any
 
 import mitsuba as mi
 
+from mitsplat.runtime.variant import VARIANTS
+
 PLUGINS = ("splats", "opencv_camera", "splat_proxy")
+
+_registered: str | None = None
+
+
+def register_under(variant: str | None) -> None:
+    """Register the plugins under a variant once; under an unsupported one, plugins that raise a clear error."""
+    global _registered
+    if variant is None or variant == _registered:
+        return
+    if variant in VARIANTS:
+        register()
+        _registered = variant
+    else:
+        refuse(variant)
 
 
 def register() -> None:

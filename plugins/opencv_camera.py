@@ -8,10 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.plugins.rays import View
+from mitsplat.renderer.rays.camera_rays import View
 
 
 class OpenCVCamera(mi.Sensor):

@@ -12,29 +12,29 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.lost_rays import refuse_lost_rays
-from mitsplat.masks import Silhouette
-from mitsplat.plugins.bounce import RadianceGrid
-from mitsplat.plugins.edges import Edges
-from mitsplat.plugins.emitters import reference_irradiance
-from mitsplat.plugins.gaussian import Cloud, upload_cloud
-from mitsplat.plugins.light import Accuracy, light_factor
-from mitsplat.plugins.lit_surface import Seen, VisibleSurfaces
-from mitsplat.plugins.march import Image, largest_and_mean, trace
-from mitsplat.plugins.mirrored import SplatMirror
-from mitsplat.plugins.occlusion import Caster
-from mitsplat.plugins.pairs import CrowdedError
+from mitsplat.images.masks import Silhouette
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.plugins.project import CloudSet, Placement, merge_clouds
-from mitsplat.plugins.proxies import Occluder, Proxies
-from mitsplat.plugins.rays import View
-from mitsplat.plugins.sensors import view_of
-from mitsplat.plugins.shown import Shown
-from mitsplat.plugins.silhouettes import proxy_silhouettes, splat_silhouettes
-from mitsplat.plugins.still import StillLayer
-from mitsplat.plugins.traits import Traits
-from mitsplat.plugins.visible import Behind, PathTracer, SeenLights, VisibleMeshes, is_clear
 from mitsplat.quality import Quality, resolve_quality
+from mitsplat.renderer.instances.primary_visibility import Shown
+from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
+from mitsplat.renderer.light.bounce import RadianceGrid
+from mitsplat.renderer.light.emitter_sampling import reference_irradiance
+from mitsplat.renderer.light.light import Accuracy, light_factor
+from mitsplat.renderer.light.light_traits import Traits
+from mitsplat.renderer.light.lit_surface import Seen, VisibleSurfaces
+from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
+from mitsplat.renderer.meshes.visible_meshes import Behind, PathTracer, SeenLights, VisibleMeshes, is_clear
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies
+from mitsplat.renderer.occluders.splat_occlusion import Caster
+from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.renderer.splatting.antialiasing import Edges
+from mitsplat.renderer.splatting.gaussian import Cloud, upload_cloud
+from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
+from mitsplat.renderer.splatting.pairs import CrowdedError
+from mitsplat.renderer.splatting.projection import CloudSet, Placement, merge_clouds
+from mitsplat.renderer.splatting.static_tile_cache import StillLayer
+from mitsplat.runtime.dropped_rays import refuse_lost_rays
 
 AOVS = (
     "captured.R",
@@ -449,8 +449,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _still_layer(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> StillLayer | None:
         """What is static as seen from here, from the second time that the camera is in the same place."""
         static = [p for p in contents.placements if p.instance == 0]
-        bare = contents.clouds is None or not any(contents.clouds.counts[p.cloud] for p in static)
-        if bare or len(static) == len(contents.placements):
+        if contents.clouds is None or len(static) == len(contents.placements):
+            return None
+        if not any(contents.clouds.counts[p.cloud] for p in static):
             return None
         fixed = [s for s in contents.shapes if getattr(s, "instance", 0) == 0]
         if not self.hide_emitters:

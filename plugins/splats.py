@@ -11,9 +11,9 @@ import trimesh
 
 from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
-from mitsplat.plugins.appearance import Appearance
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.splats import Splats
+from mitsplat.renderer.splatting.splat_appearance import Appearance
 
 
 class SplatsShape(mi.Mesh):

@@ -17,20 +17,21 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.cache import cache_folder
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.dataset.write import write_dataset
-from mitsplat.device import Lack, use_device, visible_gpus
 from mitsplat.errors import MissingResourceError
-from mitsplat.lost_rays import refuse_lost_rays
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import warp_settings
-from mitsplat.scene.scene import Scene, load_scene
-from mitsplat.spec.spec import FORMATS
-from mitsplat.splats import Splats
+from mitsplat.runtime.device import Lack, use_device, visible_gpus
+from mitsplat.runtime.dropped_rays import refuse_lost_rays
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import FORMATS
+from mitsplat.storage.cache import cache_folder
 
 if TYPE_CHECKING:
-    from mitsplat.capture.pipeline import CaptureResult
+    from mitsplat.capture.capture_photos import CaptureResult
 
 WriteScene = Callable[..., Path]
 
@@ -227,7 +228,7 @@ def captured(
     photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, CaptureResult]:
     """Their capture, with one torn photo among them: photos, folder, result."""
-    from mitsplat.capture.pipeline import CaptureSettings, capture_photos
+    from mitsplat.capture.capture_photos import CaptureSettings, capture_photos
     from tests import rendered
 
     def make(folder: Path) -> None:
@@ -266,9 +267,9 @@ def known_object(tmp_path_factory: pytest.TempPathFactory) -> KnownObject:
     import mitsuba as mi
     from PIL import Image
 
-    from mitsplat.colour import encode_srgb
-    from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
-    from mitsplat.surfels import place_surfels
+    from mitsplat.gaussians.surfels import place_surfels
+    from mitsplat.images.colour import encode_srgb
+    from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
 
     ball = trimesh.creation.icosphere(3, 0.05)
     box = trimesh.creation.box((0.06, 0.04, 0.05))

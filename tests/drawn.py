@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.asset import Asset
+from mitsplat.images.masks import Silhouette
 from mitsplat.labels.labels import LabelRules, Truth, label_instances
-from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.scene import plan_frame
+from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.streams import random_stream
 from tests.conftest import box_asset
 from tests.synthetic import CERTIFICATE, frame_around

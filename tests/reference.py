@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from mitsplat.camera import Camera
+from mitsplat.gaussians.spherical_harmonics import evaluate_sh
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import KERNELS, PRESETS, Quality
-from mitsplat.spherical_harmonics import evaluate_sh
-from mitsplat.splats import Splats
 
 Array = npt.NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks.assets.known import table_scene
 from benchmarks.assets.photographing import paint, photograph, speckle
-from mitsplat.boards.targets import Board
-from mitsplat.camera import Camera
+from mitsplat.capture.boards.targets import Board
+from mitsplat.geometry.camera import Camera
 
 BOARD = Board(7, 5, 0.035)
 BOX = np.array([0.07, 0.05, 0.07])

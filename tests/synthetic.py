@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsplat.frames.frame import Frame
 from mitsplat.labels.labels import Labels
-from mitsplat.render.layers import Layers
+from mitsplat.renderer.layers import Layers
 from mitsplat.scene.layout import NOTHING_TO_REST
 
 CERTIFICATE = replace(NOTHING_TO_REST, time_to_rest=1.5, collider_penetration=1e-5, attempts=2, refused=("too deep",))

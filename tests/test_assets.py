@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mitsplat.asset import Asset, read_mesh
 from mitsplat.errors import InputError
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
 
 DATA = Path(__file__).parents[2] / "shared/data/splats"
 SIZE = (0.06, 0.04, 0.02)

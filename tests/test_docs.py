@@ -13,7 +13,7 @@ import pytest
 from mitsplat.checks import check_path
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.scene import scene_json_schema
-from mitsplat.spec import SceneSpec
+from mitsplat.scene.spec import SceneSpec
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -30,7 +30,7 @@ def worker():
 
 
 def image():
-    from mitsplat.untrusted_images import check_images
+    from mitsplat.images.untrusted_images import check_images
     Path("picture.png").write_bytes(b"no picture")
     print(check_images([Path("picture.png")]))
 
@@ -59,7 +59,7 @@ def cameras():
 
 
 def video():
-    from mitsplat.video.extraction import choose_frames
+    from mitsplat.capture.video.extraction import choose_frames
     Path("video.mp4").write_bytes(b"no video")
     choose_frames(Path("video.mp4"), Path("frames"), most=10, least=3)
 

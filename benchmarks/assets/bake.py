@@ -27,8 +27,8 @@ import trimesh
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.device import use_device
-from mitsplat.mesh_distance import Surface, standoff
+from mitsplat.geometry.mesh_distance import Surface, standoff
+from mitsplat.runtime.device import use_device
 from scenes.build.parts import PARTS, build_part
 
 

@@ -30,14 +30,14 @@ from benchmarks.assets.known import chamfer, solid, speckled
 from benchmarks.assets.photographing import by_name, paint, photograph, show_where, speckle
 from benchmarks.record import recording
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo, known_where
-from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.capture.capture_photos import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
-from mitsplat.reconstruct.evaluation import iou, show_asset
-from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import iou, show_asset
+from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
-from mitsplat.render.layers import ensure_variant
+from mitsplat.renderer.layers import ensure_variant
 
 WANTED = {
     "photos kept, %": 95.0,
@@ -137,7 +137,7 @@ GROUNDS: Mapping[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], np
 
 def coloured(mesh: trimesh.Trimesh, colours: np.ndarray) -> Any:
     """A matt mesh with a colour on each vertex (N, 3)."""
-    from mitsplat.plugins.device import plain_mesh
+    from mitsplat.renderer.rays.device_arrays import plain_mesh
 
     properties = mi.Properties()
     colour = {"type": "mesh_attribute", "name": "vertex_color"}

@@ -21,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 # isort: off
-from mitsplat.device import use_device  # which must come before Dr.Jit
+from mitsplat.runtime.device import use_device  # which must come before Dr.Jit
 
 import drjit as dr
 import numpy as np
@@ -29,12 +29,12 @@ import numpy as np
 # isort: on
 from benchmarks.assets.photographed import photograph_asset
 from benchmarks.record import ROOT, figure, recording
-from mitsplat import recorded
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.fit.training_view import TrainingView
+from mitsplat.runtime import recorded_kernels as recorded
 
 
 def main() -> None:

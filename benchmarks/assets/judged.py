@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.record import figure
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.metric_frame import fit_similarity
-from mitsplat.reconstruct.evaluation import VERDICT_FILE
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
 
 
 def on_truth(asset: Path, truth: Mapping[str, Camera]) -> tuple[Capture, Float64Array, Float64Array]:

@@ -27,18 +27,18 @@ from benchmarks.assets import photographing
 from benchmarks.assets.judged import tell_wanted
 from benchmarks.assets.photographing import Sensors, by_name, paint, photograph, speckle
 from benchmarks.record import figure, recording
-from mitsplat.boards.targets import Board
-from mitsplat.camera import Camera
+from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.capture_photos import CaptureSettings
 from mitsplat.capture.metric_frame import fit_similarity
-from mitsplat.capture.pipeline import CaptureSettings
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings
-from mitsplat.mesh_distance import Surface
-from mitsplat.reconstruct.evaluation import iou
-from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
-from mitsplat.render.layers import ensure_variant
-from mitsplat.scene.scene import load_scene
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.scene.loading.scene_loading import load_scene
 
 BOARD = Board(7, 5, 0.035)
 
@@ -116,7 +116,7 @@ def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
 
 def speckled(mesh: trimesh.Trimesh, *, contrast: float = 1.6, finish: Mapping[str, Any] | None = None) -> Any:
     """The solid with speckles of 3 and 10 mm on its vertices, matt or with the ``finish`` of a principled BSDF."""
-    from mitsplat.plugins.device import plain_mesh
+    from mitsplat.renderer.rays.device_arrays import plain_mesh
 
     fine = mesh.subdivide_to_size(0.0012)
     fine.update_faces(fine.nondegenerate_faces())
@@ -175,7 +175,7 @@ def chamfer(one: trimesh.Trimesh, truth: trimesh.Trimesh, samples: int = 20_000)
 
 def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> list[float]:
     """IoU of each photo's mask with the true silhouette."""
-    from mitsplat.plugins.device import plain_mesh, ray_scene
+    from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene
 
     solid = ray_scene({"solid": plain_mesh(mesh, mi.Properties())})
     depths = mi.load_dict({"type": "aov", "aovs": "depth:depth"})

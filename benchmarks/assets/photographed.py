@@ -11,11 +11,11 @@ import numpy as np
 from PIL import Image
 
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.colour import encode_srgb
-from mitsplat.render.layers import render_splats
-from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
+from mitsplat.renderer.layers import render_splats
 
 VIEWS, POINTS = 72, 6000
 _NOISE = 0.002

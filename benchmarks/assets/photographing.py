@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from mitsplat.camera import Camera
-from mitsplat.cores import usable_cores
-from mitsplat.render.layers import ensure_variant
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.cores import usable_cores
 
 
 class Sensors:
@@ -65,7 +65,7 @@ def photograph(
         gains: Of each photo and channel, shape (N, 3), that its light is multiplied by.
         suffix: Of the files.
     """
-    from mitsplat.plugins.device import ray_scene
+    from mitsplat.renderer.rays.device_arrays import ray_scene
 
     ensure_variant()
     folder.mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ def develop(file: Path, radiance: np.ndarray, gain: np.ndarray, noise: np.ndarra
 
 def show_where(scene: Mapping[str, Any], thing: str, views: Sequence[Camera], folder: Path, finer: int = 3) -> None:
     """Write masks of where a thing of a scene is seen: in most of ``finer`` squared points of a pixel."""
-    from mitsplat.plugins.device import ray_scene
+    from mitsplat.renderer.rays.device_arrays import ray_scene
 
     ensure_variant()
     folder.mkdir(parents=True, exist_ok=True)

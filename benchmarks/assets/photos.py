@@ -36,8 +36,8 @@ from benchmarks.assets.judged import tell_wanted
 from benchmarks.assets.known import solid, speckled
 from benchmarks.assets.photographing import photograph
 from benchmarks.record import cpu_seconds, figure, recording
-from mitsplat.device import use_device
-from mitsplat.reconstruct.evaluation import VERDICT_FILE
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
+from mitsplat.runtime.device import use_device
 
 WANTED = {"cpu": {"CPU minutes": 30.0}, "cuda": {"minutes": 4.0}}
 JUDGED = "photos", "psnr", "psnr_object", "splat_iou", "mesh_iou", "gaussians", "faces"

@@ -17,11 +17,11 @@ import numpy as np
 
 from benchmarks.assets.bake import cpu_seconds
 from benchmarks.record import figure, recording
-from mitsplat.bake.parts import read_parts
+from mitsplat.bake.mesh_parts import read_parts
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.decomposition import convex_pieces, thin_solid, widest_gap
-from mitsplat.mesh_distance import Surface, standoff
-from mitsplat.render.layers import ensure_variant
+from mitsplat.geometry.decomposition import convex_pieces, thin_solid, widest_gap
+from mitsplat.geometry.mesh_distance import Surface, standoff
+from mitsplat.renderer.layers import ensure_variant
 
 
 def main() -> None:

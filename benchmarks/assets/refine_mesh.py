@@ -19,15 +19,15 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.assets.known import chamfer, solid
 from benchmarks.record import figure, recording
-from mitsplat.camera import Camera
-from mitsplat.plugins.device import plain_mesh, ray_scene
-from mitsplat.reconstruct.evaluation import iou
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.surfels import place_surfels
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
-from mitsplat.render.layers import ensure_variant
-from mitsplat.splats import Splats
-from mitsplat.surfels import place_surfels
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene
 
 WAVE = 8.0
 """Length over which an outline wavers [px]."""

@@ -27,13 +27,13 @@ from benchmarks.assets.photographing import by_name, photograph
 from benchmarks.assets.room import room, things, walk
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
-from mitsplat.files import write_text
 from mitsplat.fit.image_metrics import psnr_of
-from mitsplat.reconstruct.evaluation import VERDICT_FILE, show_held_out
-from mitsplat.reconstruct.pipeline import AssetJob
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, show_held_out
+from mitsplat.reconstruct.asset_from_photos import AssetJob
+from mitsplat.storage.files import write_text
 from mitsplat.surroundings import make_surroundings
 
 WANTED = {"things removed": len(things())}

@@ -33,15 +33,15 @@ from benchmarks.assets.known import BOARD, chamfer, solid, speckled, table_scene
 from benchmarks.assets.photographing import by_name, photograph, show_where
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera, spiral
-from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.capture.capture_photos import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
-from mitsplat.reconstruct.evaluation import VERDICT_FILE, iou, show_asset
-from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
+from mitsplat.geometry.camera import Camera, spiral
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
+from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
-from mitsplat.render.layers import ensure_variant
+from mitsplat.renderer.layers import ensure_variant
 
 WIDTH, SAMPLES = 320, 12
 AROUND, CLOSE, FINE = 8, 26.0, 24

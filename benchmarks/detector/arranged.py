@@ -27,8 +27,8 @@ from shapely.geometry.base import BaseGeometry
 
 # isort: on
 from benchmarks.detector.experiment import PLAN, VIEWS, write_scene
-from mitsplat.scene.contents import draw_objects, draw_regions
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.planning.contents import draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
 
 TRIES = 500

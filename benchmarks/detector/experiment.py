@@ -32,7 +32,7 @@ from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
 from mitsplat.detector.losses import gains
 from mitsplat.detector.training import Run
-from mitsplat.files import write_text
+from mitsplat.storage.files import write_text
 
 HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")

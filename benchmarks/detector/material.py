@@ -29,9 +29,9 @@ from scipy.cluster.vq import kmeans2
 from benchmarks.detector.packages import make_bag, make_package, relabel, shape_of
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.parts import read_parts
-from mitsplat.cores import usable_cores
-from mitsplat.device import use_device
+from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.runtime.cores import usable_cores
+from mitsplat.runtime.device import use_device
 
 PACKAGE = BakeSettings(
     gaussians=30000, sh_degree=1, directions=8, samples=8, fit_views=12, fit_steps=50, verify_views=2

@@ -28,18 +28,19 @@ from scipy.spatial import KDTree
 from benchmarks.detector.experiment import write_scene
 from benchmarks.detector.material import wanted_assets
 from mitsplat.asset import Asset
-from mitsplat.bake.parts import Part, part_shape, read_parts
-from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.bake.mesh_parts import Part, part_shape, read_parts
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import Frame
-from mitsplat.plugins.device import ray_scene
-from mitsplat.render.emitters import emitter_dict
-from mitsplat.render.path_tracing import render_mesh
-from mitsplat.scene.appearance import Appearance, draw_appearances
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.renderer.path_tracing import render_mesh
+from mitsplat.renderer.rays.device_arrays import ray_scene
+from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.scene import Scene, layout_of
-from mitsplat.spec.spec import BACKDROP
-from mitsplat.spherical_harmonics import SH_C0
+from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.object_appearance import Appearance, draw_appearances
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import BACKDROP
 
 LEAST = 500
 """Pixels where no object is by which a picture's brightness is told."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from mitsplat.device import use_device  # imports mitsplat, which must come before Dr.Jit
+from mitsplat.runtime.device import use_device  # imports mitsplat, which must come before Dr.Jit
 
 import cv2
 import mitsuba as mi
@@ -32,12 +32,12 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.assets.photographing import Sensors
 from benchmarks.light.shadows import block, nearest_object, placed, shipped, worn
 from benchmarks.record import ROOT, figure, recording
-from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
-from mitsplat.camera import Camera
-from mitsplat.lighting.panorama import unit_vector
+from mitsplat.bake.mesh_parts import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.capture.lighting.panorama import unit_vector
+from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import settle_layout
-from mitsplat.scene.scene import load_scene
-from mitsplat.spec.lights import AreaLight, EnvironmentLight
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight
 from scenes.build import materials as m
 
 LEAST_SEEN = 0.15

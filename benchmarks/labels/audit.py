@@ -21,8 +21,8 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.scene.streams import random_stream
-from mitsplat.spec.spec import FORMATS
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = 8

@@ -25,7 +25,7 @@ from benchmarks.record import figure, recording
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.labels.labels import LabelRules, Truth, label_instances
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.spec.spec import FORMATS
+from mitsplat.scene.spec.scene_spec import FORMATS
 
 ROOT = Path(__file__).resolve().parents[2]
 INSTANCES = 15

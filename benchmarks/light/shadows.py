@@ -44,12 +44,11 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.parts import Part, bake_lights, mitsuba_scene, read_parts
-from mitsplat.camera import Camera
-from mitsplat.colour import LUMINANCE, encode_srgb
+from mitsplat.bake.mesh_parts import Part, bake_lights, mitsuba_scene, read_parts
 from mitsplat.frames.camera_response import light_image
-from mitsplat.plugins.proxies import Occluder, Proxies
-from mitsplat.render.layers import (
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import LUMINANCE, encode_srgb
+from mitsplat.renderer.layers import (
     Layers,
     ensure_variant,
     make_integrator,
@@ -57,9 +56,10 @@ from mitsplat.render.layers import (
     make_splats_shape,
     render_layers,
 )
-from mitsplat.render.path_tracing import trace_radiance
-from mitsplat.spec.image import Composite
-from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec, SpotLight
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies
+from mitsplat.renderer.path_tracing import trace_radiance
+from mitsplat.scene.spec.image_spec import Composite
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, SpotLight
 from scenes.build import materials as m
 from scenes.build.parts import build_part
 

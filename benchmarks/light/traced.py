@@ -30,15 +30,15 @@ from mitsplat.arrays import Float32Array
 from mitsplat.frames.camera_response import develop, light_image
 from mitsplat.frames.frame import Renderer, light_properties
 from mitsplat.quality import resolve_quality
-from mitsplat.render.layers import Layers, ensure_variant, make_integrator, render_layers
-from mitsplat.scene.scene import FramePlan, layout_of, plan_frame
+from mitsplat.renderer.layers import Layers, ensure_variant, make_integrator, render_layers
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 
 ensure_variant()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from mitsplat.plugins import light  # noqa: E402
-from mitsplat.plugins.light_filter import Estimate, LightFilter  # noqa: E402
+from mitsplat.renderer.light import light  # noqa: E402
+from mitsplat.renderer.light.light_filter import Estimate, LightFilter  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SMOOTH = LightFilter.smooth

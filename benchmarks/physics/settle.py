@@ -31,13 +31,14 @@ from trimesh.creation import annulus, box, cylinder, torus
 
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
-from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.physics.settle import settle_layout, settle_layouts, warp_settings
-from mitsplat.scene.contents import draw_objects
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, load_scene
-from mitsplat.splats import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.contents import draw_objects
+from mitsplat.scene.scene import Scene
 
 STEPPERS = ("warp", "mujoco")
 WORKCELL = Path(__file__).resolve().parents[2] / "scenes/workcell.yaml"

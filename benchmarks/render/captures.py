@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsplat.camera import Camera
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 
 CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "data" / "splats"
 

@@ -24,11 +24,11 @@ import numpy as np
 # isort: on
 from benchmarks.record import ROOT, figure, recording
 from benchmarks.render.frame import time_frames
-from mitsplat.colour import encode_srgb
 from mitsplat.frames.volprim import render_volprim, volprim_scene
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.images.colour import encode_srgb
 from mitsplat.quality import resolve_quality
-from mitsplat.render.layers import make_sensor, render_splats
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import make_sensor, render_splats
 
 
 def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int = 30) -> float:
@@ -46,11 +46,11 @@ def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int 
 
 def time_ours(splats: Splats) -> None:
     """Print the time of binning and march, per preset."""
-    from mitsplat.plugins.gaussian import upload_cloud
-    from mitsplat.plugins.march import march
-    from mitsplat.plugins.project import Placement, merge_clouds
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.plugins.tiles import TileLists, bin_gaussians
+    from mitsplat.renderer.splatting.gaussian import upload_cloud
+    from mitsplat.renderer.splatting.march import march
+    from mitsplat.renderer.splatting.projection import Placement, merge_clouds
+    from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
     camera = view_of(make_sensor(CAMERA))

@@ -20,8 +20,8 @@ import numpy as np
 import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
-from mitsplat.colour import encode_srgb
-from mitsplat.scene.scene import layout_of
+from mitsplat.images.colour import encode_srgb
+from mitsplat.scene.planning.frame_plan import layout_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TRUTH = 4

@@ -25,10 +25,10 @@ import numpy as np
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.frames.frame import Renderer
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import PRESETS
-from mitsplat.render.layers import ensure_variant, make_integrator, make_sensor, make_splats_shape
-from mitsplat.scene.scene import layout_of, plan_frame
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import ensure_variant, make_integrator, make_sensor, make_splats_shape
+from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,7 +38,7 @@ def print_differences(scenes: int) -> None:
     sys.path.insert(0, str(ROOT / "tests"))
     from reference import reference_shares
 
-    from tests.plugins.test_instances import CAMERA, EXACT, differences, layered, porous, shown
+    from tests.renderer.test_instances import CAMERA, EXACT, differences, layered, porous, shown
 
     totals = np.zeros(3, dtype=int)
     for seed in range(scenes):
@@ -69,9 +69,9 @@ def crowd(count: int = 8, each: int = 4000) -> dict[str, Any]:
 
 def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repeats: int = 7) -> None:
     """Time of the march with all instances told apart, with the first walk alone, and with all taken for one."""
-    from mitsplat.plugins import march
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.plugins.tiles import bin_gaussians
+    from mitsplat.renderer.splatting import march
+    from mitsplat.renderer.splatting.tiles import bin_gaussians
 
     contents, view, settle = integrator._read(scene), view_of(make_sensor(camera)), march.settle_instances
     unsure: list[float] = []

@@ -25,7 +25,13 @@ import numpy as np
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.render.layers import ensure_variant, make_integrator, make_splats_shape, render_layers, render_silhouettes
+from mitsplat.renderer.layers import (
+    ensure_variant,
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_silhouettes,
+)
 
 
 def peak() -> float:
@@ -53,9 +59,9 @@ def forward(count: int) -> None:
 
 def backward(count: int) -> None:
     """Gradients of an image of many Gaussians."""
-    from mitsplat.plugins.backward import pack_cloud, render_differentiable
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.render.layers import make_sensor
+    from mitsplat.renderer.differentiation.backward import pack_cloud, render_differentiable
+    from mitsplat.renderer.layers import make_sensor
 
     splats = synthetic(count)
     names = ("means", "quats", "scales", "opacities", "sh")

@@ -32,13 +32,13 @@ from scipy.stats import spearmanr
 # isort: on
 from benchmarks.record import figure, recording
 from benchmarks.render.captures import CAPTURES
-from mitsplat.camera import Camera
 from mitsplat.frames.frame import Renderer
 from mitsplat.frames.speed_accuracy import look_around
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.render.layers import ensure_variant, make_sensor
-from mitsplat.scene.scene import layout_of, plan_frame
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 TOLERANCES = (2e-3, 5e-3, 1e-2)
@@ -68,9 +68,9 @@ class Picture:
     """Splats on the device, as one camera sees them."""
 
     def __init__(self, splats: Splats, camera: Camera) -> None:
-        from mitsplat.plugins.gaussian import upload_cloud
-        from mitsplat.plugins.project import Placement, merge_clouds
         from mitsplat.plugins.splat_proxy import view_of
+        from mitsplat.renderer.splatting.gaussian import upload_cloud
+        from mitsplat.renderer.splatting.projection import Placement, merge_clouds
 
         cloud = upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
         self.clouds, self.placements = merge_clouds([cloud]), [Placement(0, np.eye(4), 1)]
@@ -78,7 +78,7 @@ class Picture:
 
     def show(self, quality: Quality) -> npt.NDArray[np.float32]:
         """Display-encoded colours, (pixels, 3)."""
-        from mitsplat.plugins.march import trace
+        from mitsplat.renderer.splatting.march import trace
 
         image = trace(self.clouds, self.placements, self.view, quality)
         dr.eval(image)
@@ -86,9 +86,9 @@ class Picture:
 
     def estimate(self, quality: Quality) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Colours before any tile is walked again, and the estimate of their errors, (pixels,)."""
-        from mitsplat.plugins.march import ERROR, _blend, _fresh
-        from mitsplat.plugins.tiles import bin_gaussians
-        from mitsplat.plugins.walk import Lanes, Rays, walk
+        from mitsplat.renderer.splatting.march import ERROR, _blend, _fresh
+        from mitsplat.renderer.splatting.tiles import bin_gaussians
+        from mitsplat.renderer.splatting.walk import Lanes, Rays, walk
 
         lists = bin_gaussians(self.clouds, self.placements, self.view, quality)
         lanes = Lanes(lists, self.view, rows=1)
@@ -102,7 +102,7 @@ class Picture:
 
 def print_estimate(name: str, picture: Picture) -> None:
     """How far the estimate agrees with the truth, for the cut-offs of ``balanced``."""
-    from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
+    from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
     quality = replace(PRESETS["balanced"], extends=False)  # as the walk that estimates leaves a ray's end
     exact = picture.show(replace(quality, tolerance=0.0))
@@ -139,7 +139,7 @@ def print_estimate(name: str, picture: Picture) -> None:
 
 def tiles_of(pixels: npt.NDArray[np.bool_], width: int) -> npt.NDArray[np.bool_]:
     """Which tiles hold one of some pixels of an image whose edges tiles divide."""
-    from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
+    from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
     return pixels.reshape(-1, TILE_HEIGHT, width // TILE_WIDTH, TILE_WIDTH).any(axis=(1, 3))
 

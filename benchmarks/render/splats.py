@@ -28,12 +28,12 @@ import numpy as np
 
 # isort: on
 from benchmarks.record import figure, recording
-from mitsplat.camera import Camera
 from mitsplat.frames.speed_accuracy import look_around, picture_of
 from mitsplat.frames.volprim import render_volprim, volprim_scene
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
 
 FMA_PER_EVALUATION = 20
 """Fused multiply-adds, or operations that cost as much, of one Gaussian on one ray: response, blending, ids."""
@@ -58,11 +58,11 @@ def timed(run: Callable[[], object]) -> float:
 
 def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, float, int]:
     """Seconds of projecting, binning and sorting, seconds of the march, and pairs of a Gaussian and a tile."""
-    from mitsplat.plugins.gaussian import upload_cloud
-    from mitsplat.plugins.march import march
-    from mitsplat.plugins.project import Placement, merge_clouds
     from mitsplat.plugins.splat_proxy import view_of
-    from mitsplat.plugins.tiles import bin_gaussians
+    from mitsplat.renderer.splatting.gaussian import upload_cloud
+    from mitsplat.renderer.splatting.march import march
+    from mitsplat.renderer.splatting.projection import Placement, merge_clouds
+    from mitsplat.renderer.splatting.tiles import bin_gaussians
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])
     view = view_of(make_sensor(camera)).sampled(quality.samples)
@@ -119,7 +119,7 @@ def print_growth() -> None:
 
 def print_peak() -> None:
     """Evaluations per second of a march that no ray leaves early, against the peak of fused multiply-adds."""
-    from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
+    from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
     splats = synthetic(200_000)
     endless = replace(PRESETS["fast"], transmittance_min=0.0)

@@ -141,7 +141,7 @@ def compare(path: Path, frames: int, machines: Machines) -> bool:
 
     from mitsplat.dataset.write import write_dataset
     from mitsplat.engine.ray import Cluster
-    from mitsplat.scene.scene import load_scene
+    from mitsplat.scene.loading.scene_loading import load_scene
 
     folder = path.parent
     write_dataset(load_scene(path), folder / "alone", frames=frames)

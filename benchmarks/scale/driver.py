@@ -27,7 +27,7 @@ from benchmarks.record import figure, recording
 from benchmarks.scale.faults import SCENE
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.manifest import encode_line
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
 
 LINKS = 60_000
 """Names of one file: ext4 allows 65,000."""

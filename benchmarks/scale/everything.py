@@ -26,14 +26,14 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
-from mitsplat.device import current_device
 from mitsplat.formats.registry import Catalogue, write_frame
-from mitsplat.scene.contents import draw_objects
+from mitsplat.runtime.device import current_device
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.planning.contents import draw_objects
+from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.scene.streams import random_stream
-from mitsplat.spec.spec import FORMATS
 
 ROOT = Path(__file__).resolve().parents[2]
 SKIPPED = ("yolo-pose", "exr")

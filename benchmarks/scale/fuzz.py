@@ -35,16 +35,16 @@ from PIL import Image
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset, read_mesh
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.masks import given_masks
+from mitsplat.capture.photo_masks import given_masks
 from mitsplat.capture.photos import Prepared
-from mitsplat.detector.evaluation import truth_of
+from mitsplat.capture.video import choose_frames
+from mitsplat.detector.detector_evaluation import truth_of
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError
 from mitsplat.frames.untrusted_xml import check_xml
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
-from mitsplat.video import choose_frames
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
 
 MEMORY = 12 << 30
 """Address space of a child [bytes]; libraries that it loads reserve some of it without using it."""
@@ -223,8 +223,8 @@ def _colmap(folder: Path) -> None:
 def _masks(folder: Path) -> None:
     photo = Prepared("a.png", folder / "photos/a.png", (32, 24), 1, ())
     make = given_masks(folder / "masks", {"a.png": photo})
-    from mitsplat.camera import Camera
     from mitsplat.capture.capture import Photo
+    from mitsplat.geometry.camera import Camera
 
     camera = Camera.look_at((0, 0, -1), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
     make(Photo("a.png", photo.file, camera))

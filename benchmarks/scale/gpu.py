@@ -35,7 +35,7 @@ from benchmarks.record import ROOT, figure, recording
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.physics.settle import settle_layouts
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
 
 WORKCELL = ROOT / "scenes/workcell.yaml"
 PARTS = 8

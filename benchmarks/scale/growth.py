@@ -26,11 +26,11 @@ from benchmarks.figures import read_results
 from benchmarks.record import figure, recording
 from benchmarks.scale import projection
 from benchmarks.scale.faults import SCENE
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine.ray import Cluster
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKCELL = ROOT / "scenes/workcell.yaml"

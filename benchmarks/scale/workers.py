@@ -25,8 +25,8 @@ from benchmarks.scale.faults import ROOT, workers_of
 from mitsplat.asset import Asset
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.budget import worker_memory
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
 
 MIB = 2**20
 WORKCELL = ROOT / "scenes/workcell.yaml"

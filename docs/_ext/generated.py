@@ -23,12 +23,12 @@ from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
 
 ROOT = Path(__file__).parents[2]
-WINGS = (
+PACKAGES = (
     *(
-        "spec",
         "scene",
+        "scene.spec",
         "physics",
-        "render",
+        "renderer",
         "labels",
         "frames",
         "formats",
@@ -38,7 +38,7 @@ WINGS = (
         "report",
         "detector",
     ),
-    *("video", "boards", "lighting", "capture", "fit", "reconstruct", "bake", "checks"),
+    *("capture", "capture.video", "capture.boards", "capture.lighting", "fit", "reconstruct", "bake", "checks"),
 )
 
 
@@ -91,20 +91,20 @@ def _api() -> str:
     return "\n\n".join(_documented("mitsplat", name) for name in mitsplat.__all__)
 
 
-def _wings() -> str:
-    """What the doors of the wings hand out beyond that."""
+def _packages() -> str:
+    """Public names of the packages that ``mitsplat`` itself does not export."""
     import mitsplat
 
     sections = []
-    for wing in WINGS:
-        module = importlib.import_module(f"mitsplat.{wing}")
+    for package in PACKAGES:
+        module = importlib.import_module(f"mitsplat.{package}")
         sections.append(
-            f"## `mitsplat.{wing}`\n\n```{{eval-rst}}\n.. automodule:: mitsplat.{wing}\n   :no-members:\n```"
+            f"## `mitsplat.{package}`\n\n```{{eval-rst}}\n.. automodule:: mitsplat.{package}\n   :no-members:\n```"
         )
         public = [name for name in module.__all__ if name in mitsplat.__all__]
         if public:
-            sections.append("Also hands out " + ", ".join(f"{{py:obj}}`mitsplat.{name}`" for name in public) + ".")
-        sections += [_documented(f"mitsplat.{wing}", name) for name in module.__all__ if name not in public]
+            sections.append("Also exports " + ", ".join(f"{{py:obj}}`mitsplat.{name}`" for name in public) + ".")
+        sections += [_documented(f"mitsplat.{package}", name) for name in module.__all__ if name not in public]
     return "\n\n".join(sections)
 
 
@@ -133,7 +133,7 @@ GENERATED: dict[str, Callable[[], str]] = {
     "gallery": _gallery,
     "scripts": _scripts,
     "api": _api,
-    "wings": _wings,
+    "packages": _packages,
     "plugins": _plugins,
 }
 

@@ -22,20 +22,20 @@ from typing import Any
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.audit.bop import BopReader
+from mitsplat.audit.bop_check import BopReader
 from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
-from mitsplat.audit.label_studio import ConfigReader, check_task
-from mitsplat.audit.layers import LayersReader, SightReader
+from mitsplat.audit.label_studio_check import ConfigReader, check_task
+from mitsplat.audit.layers_check import LayersReader, SightReader
 from mitsplat.audit.listed import ColmapReader, LayoutReader, VocReader, YoloReader
 from mitsplat.audit.owned import Owned, check_listed
 from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
-from mitsplat.audit.scene import SceneReader
+from mitsplat.audit.scene_check import SceneReader
 from mitsplat.audit.truth import TrueFrame
-from mitsplat.content_hash import file_hash
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.errors import InputError
-from mitsplat.files import SPLITS, Record, splits_of
-from mitsplat.picture_files import read_picture
+from mitsplat.images.picture_files import read_picture
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.files import SPLITS, Record, splits_of
 
 _SHARE = 1e-5
 """Difference of shares that are stored with six decimals."""

@@ -19,8 +19,8 @@ from pycocotools.coco import COCO
 
 from mitsplat.audit.read_back import Violations, segment_picture
 from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
-from mitsplat.json_stream import read_lists
-from mitsplat.masks import decode_rle
+from mitsplat.images.masks import decode_rle
+from mitsplat.storage.json_stream import read_lists
 
 WHOLE = 32 << 20
 """Size up to which a file is also opened by pycocotools, which holds all of it, ten times as large [bytes]."""

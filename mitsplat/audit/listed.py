@@ -14,13 +14,13 @@ import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from mitsplat.audit.conveyor import BeltTruth
+from mitsplat.audit.conveyor_check import BeltTruth
 from mitsplat.audit.described import Cursor, is_close
 from mitsplat.audit.owned import YOLO_FOLDERS
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
-from mitsplat.child_process import python_command, python_environment
-from mitsplat.files import SPLITS, read_json, splits_of
+from mitsplat.runtime.child_process import python_command, python_environment
+from mitsplat.storage.files import SPLITS, read_json, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""

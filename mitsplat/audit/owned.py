@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mitsplat.audit.read_back import Violations
-from mitsplat.files import Record, splits_of
+from mitsplat.storage.files import Record, splits_of
 
 YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
 """Where Ultralytics' tasks have their folders: labels lie beside the images that they are of."""

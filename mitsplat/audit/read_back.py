@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.audit.truth import TrueFrame, TrueInstance, bounds_of
-from mitsplat.picture_files import read_picture
+from mitsplat.images.picture_files import read_picture
 
 POLYGON_IOU = 0.99
 """Least IoU of a mask in one part and its polygon, for masks of more than :data:`POLYGON_AREA` pixels."""

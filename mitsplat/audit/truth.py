@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
-from mitsplat.files import Record
-from mitsplat.masks import decode_rle
+from mitsplat.images.masks import decode_rle
+from mitsplat.storage.files import Record
 
 Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""

@@ -1,9 +1,9 @@
 """CAD meshes to assets: surface-aligned Gaussians whose outgoing radiance Mitsuba's path tracer bakes.
 
-Surfels (:mod:`mitsplat.surfels`) are seen from directions all over their hemispheres. The radiance that leaves
-them towards each, display-encoded, is fitted with spherical harmonics. A diffuse white surface under the ``uniform``
-light has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or face
-colours.
+Surfels (:mod:`mitsplat.gaussians.surfels`) are seen from directions all over their hemispheres. The radiance that
+leaves them towards each, display-encoded, is fitted with spherical harmonics. A diffuse white surface under the
+``uniform`` light has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or
+face colours.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from scipy.spatial import KDTree
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.bake.materials import Finish
-from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts, world_from_file
+from mitsplat.bake.mesh_parts import bake_lights, mitsuba_scene, read_parts, world_from_file
 from mitsplat.bake.proxy_mesh import make_proxy
+from mitsplat.bake.surface_materials import Finish
 from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
-from mitsplat.camera import Camera, spiral
-from mitsplat.colour import encode_srgb
-from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
+from mitsplat.gaussians.spherical_harmonics import sh_basis
+from mitsplat.gaussians.surfels import Surfels, place_surfels
+from mitsplat.geometry.camera import Camera, spiral
+from mitsplat.geometry.decomposition import convex_pieces
+from mitsplat.images.colour import encode_srgb
 from mitsplat.progress import Progress
-from mitsplat.render.layers import ensure_variant
-from mitsplat.render.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
-from mitsplat.spec.lights import LightSpec
-from mitsplat.spherical_harmonics import sh_basis
-from mitsplat.surfels import Surfels, place_surfels
-from mitsplat.variant import one_at_a_time
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
+from mitsplat.runtime.variant import one_at_a_time
+from mitsplat.scene.spec.light_spec import LightSpec
 
 _HIDDEN = 0.01
 """Radiance of a white surface under the uniform light below which nobody sees it."""

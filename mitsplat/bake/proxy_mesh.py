@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 import trimesh
 
-from mitsplat.bake.parts import Part
-from mitsplat.mesh import simplify_solid
-from mitsplat.plugins.proxies import Occluder, Proxies
+from mitsplat.bake.mesh_parts import Part
+from mitsplat.geometry.mesh import simplify_solid
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
 """Distance from a solid, relative to its own size, within which a sheet is a label on it."""

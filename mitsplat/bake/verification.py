@@ -15,14 +15,14 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.color import uv_to_color
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
-from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.fit.image_metrics import psnr_of
+from mitsplat.gaussians.spherical_harmonics import evaluate_sh
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.progress import Progress
-from mitsplat.render.layers import render_splats
-from mitsplat.render.path_tracing import render_mesh
-from mitsplat.spherical_harmonics import evaluate_sh
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import render_splats
+from mitsplat.renderer.path_tracing import render_mesh
 
 _POINTS = 4000
 _NEAR = 3.0

@@ -2,7 +2,7 @@
 
 A folder holds ``capture.json`` (:class:`CaptureSpec` lists its keys), ``points.npz``, ``images/`` and ``masks/``.
 Cameras and points share the frame of the asset that is to be made of them; conventions are those of
-:mod:`mitsplat.splats`.
+:mod:`mitsplat.gaussians.splat_cloud`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
-from mitsplat.camera import Camera, Lens
-from mitsplat.colour import decode_srgb, encode_srgb
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS, copied, file_inside, write_file, write_text
-from mitsplat.format_version import FORMAT_VERSIONS
-from mitsplat.yaml_input import load_yaml
+from mitsplat.geometry.camera import Camera, Lens
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.storage.files import IMAGE_ERRORS, copied, file_inside, write_file, write_text
+from mitsplat.storage.format_version import FORMAT_VERSIONS
+from mitsplat.storage.yaml_input import load_yaml
 
 HELD_OUT_EVERY = 8
 """One photo in so many, by name, is kept for evaluation (Kerbl et al. 2023, after Mip-NeRF 360)."""
@@ -44,7 +44,7 @@ class _Strict(BaseModel):
 
 
 class PhotoCamera(_Strict):
-    """A camera's keys: those of :class:`~mitsplat.camera.Camera`."""
+    """A camera's keys: those of :class:`~mitsplat.geometry.camera.Camera`."""
 
     width: int
     height: int
@@ -372,7 +372,7 @@ def mask_name(name: str) -> str:
 
 
 def _named_file(folder: Path, name: str) -> Path:
-    """A file that ``capture.json`` names, see :func:`mitsplat.files.file_inside`."""
+    """A file that ``capture.json`` names, see :func:`mitsplat.storage.files.file_inside`."""
     try:
         return file_inside(folder, name)
     except InputError as error:

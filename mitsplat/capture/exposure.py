@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.colour import decode_srgb
+from mitsplat.images.colour import decode_srgb
 
 STEADY = 0.02
 """Standard deviation of the photos' logarithmic gains up to which exposure counts as fixed, and is left alone."""

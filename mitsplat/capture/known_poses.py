@@ -11,10 +11,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mitsplat.camera import Camera
 from mitsplat.capture.photos import Prepared
 from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_model
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 
 _Row = tuple[float, float, float, float]

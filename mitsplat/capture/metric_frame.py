@@ -13,12 +13,12 @@ import numpy.typing as npt
 from skimage.transform import SimilarityTransform
 
 from mitsplat.arrays import Float64Array
-from mitsplat.boards.targets import Board, find_tags
-from mitsplat.camera import Camera
+from mitsplat.capture.boards.targets import Board, find_tags
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
-from mitsplat.picture_files import read_picture
-from mitsplat.triangulation import meeting_point, triangulate
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.triangulation import meeting_point, triangulate
+from mitsplat.images.picture_files import read_picture
 
 DEFAULT_BOARD = Board()
 """What `mitsplat board` prints by default."""

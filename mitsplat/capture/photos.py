@@ -14,12 +14,12 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture.capture import Photo, stored_name
-from mitsplat.colour import eight_bit
-from mitsplat.cores import usable_cores
+from mitsplat.capture.video.sharpness import sharpness
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS, files_below, write_file
+from mitsplat.images.colour import eight_bit
 from mitsplat.progress import Progress
-from mitsplat.video.sharpness import sharpness
+from mitsplat.runtime.cores import usable_cores
+from mitsplat.storage.files import IMAGE_ERRORS, files_below, write_file
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _UNREAD = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")

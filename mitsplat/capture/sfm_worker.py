@@ -24,8 +24,8 @@ zlib.compress(b"before pycolmap")
 import numpy as np  # noqa: E402
 import pycolmap  # noqa: E402
 
-from mitsplat.child_process import limit_memory  # noqa: E402
-from mitsplat.cores import usable_cores  # noqa: E402
+from mitsplat.runtime.child_process import limit_memory  # noqa: E402
+from mitsplat.runtime.cores import usable_cores  # noqa: E402
 
 SEED = 1
 SEQUENTIAL_OVERLAP = 10

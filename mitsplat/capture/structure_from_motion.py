@@ -22,12 +22,12 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array, Int32Array
-from mitsplat.camera import Camera
 from mitsplat.capture.photos import Prepared
-from mitsplat.child_process import python_command, python_environment
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.files import write_text
+from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
+from mitsplat.runtime.child_process import python_command, python_environment
+from mitsplat.storage.files import write_text
 
 MIN_POINTS = 30
 """Points that a photo must observe: with fewer, cameras 20 % off were measured at reprojection errors of 0.2 px."""

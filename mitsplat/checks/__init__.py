@@ -6,6 +6,6 @@ In: a path, or nothing. Out: :class:`~mitsplat.findings.Finding` after finding.
 from __future__ import annotations
 
 from mitsplat.checks.doctor import examine
-from mitsplat.checks.preflight import check_path
+from mitsplat.checks.path_checks import check_path
 
 __all__ = ["check_path", "examine"]

@@ -14,13 +14,13 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from mitsplat.cache import cache_folder, drjit_folder, warp_folder, why_unusable
-from mitsplat.child_process import python_command, python_environment
-from mitsplat.device import Lack, gpu_environment, visible_gpus
 from mitsplat.engine.resources import unused_memory
 from mitsplat.findings import Finding
-from mitsplat.llvm import OLDEST_USABLE, VARIABLE
-from mitsplat.warp_start import quiet_warp
+from mitsplat.runtime.child_process import python_command, python_environment
+from mitsplat.runtime.device import Lack, gpu_environment, visible_gpus
+from mitsplat.runtime.llvm import OLDEST_USABLE, VARIABLE
+from mitsplat.runtime.warp_start import quiet_warp
+from mitsplat.storage.cache import cache_folder, drjit_folder, warp_folder, why_unusable
 
 NEEDED_MEMORY = 2.5
 """What :func:`mitsplat.frames.budget.worker_memory` allows a worker of the default scene, rounded up [GiB];

@@ -16,10 +16,10 @@ import numpy as np
 import trimesh
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
-from mitsplat.device import use_device
-from mitsplat.render.layers import Layers, make_integrator, make_splats_shape, render_layers
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
+from mitsplat.runtime.device import use_device
 
 BLOCK = 8
 """Edge of the squares whose means are compared [px]."""

@@ -14,9 +14,9 @@ from typing import Annotated
 
 import typer
 
-from mitsplat.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
 from mitsplat.errors import InputError, LateDeviceError, exit_status, sentence_of
+from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.version import __version__
 
 app = typer.Typer(

@@ -65,8 +65,8 @@ def bake(
     It has Gaussians with baked radiance, a proxy mesh and convex pieces; report.html shows the mesh beside the splats.
     """
     from mitsplat.bake.bake import BakeSettings, bake_asset
-    from mitsplat.bake.materials import Finish
-    from mitsplat.bake.report import write_bake_report
+    from mitsplat.bake.bake_report import write_bake_report
+    from mitsplat.bake.surface_materials import Finish
 
     _check_folder(out, mesh, name, overwrite=overwrite)
     if not 0 < units < math.inf:

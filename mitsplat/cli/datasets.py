@@ -28,8 +28,8 @@ from mitsplat.quality import PresetName
 
 if TYPE_CHECKING:
     from mitsplat.dataset.write import DatasetSummary
-    from mitsplat.device import Device
     from mitsplat.findings import Finding
+    from mitsplat.runtime.device import Device
     from mitsplat.scene.scene import Scene
 
 # Commands import what they need themselves, so that help appears at once.
@@ -111,7 +111,7 @@ def render(
 
     Options replace what the file says. A Mitsuba scene (.xml) gives one picture.
     """
-    from mitsplat.device import find_device
+    from mitsplat.runtime.device import find_device
 
     if only is not None and any((frames is not None, shard, engine == "ray", workers is not None, overwrite)):
         raise InputError("--only makes one image, here: give it without -n, --shard, --engine, --workers, --overwrite")
@@ -130,10 +130,10 @@ def render(
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")
             return
-        from mitsplat.dataset.folder import Shard
+        from mitsplat.dataset.dataset_folder import Shard
         from mitsplat.dataset.write import write_dataset
         from mitsplat.engine.ray import Cluster
-        from mitsplat.scene.scene import load_scene
+        from mitsplat.scene.loading.scene_loading import load_scene
 
         part = None if shard is None else Shard.parse(shard)
         if engine != "ray" and (address is not None or resources is not None):
@@ -146,7 +146,7 @@ def render(
         if tolerance is not None:
             if quality is not None:
                 raise InputError("--quality and --tolerance both choose the preset: give one of them")
-            from mitsplat.dataset.prospects import refuse, run_faults
+            from mitsplat.dataset.preflight import refuse, run_faults
             from mitsplat.frames.speed_accuracy import choose_preset
 
             refuse(loaded, run_faults(loaded))
@@ -273,8 +273,8 @@ def chart(
     from rich.console import Console
     from rich.table import Table
 
-    from mitsplat.device import find_device
     from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
+    from mitsplat.runtime.device import find_device
 
     check_place(out, ".png")
     check_tolerance(tolerance)
@@ -333,7 +333,7 @@ def report(
     It is one HTML file that needs no network: samples with their labels, statistics, draws, audit, origin. What a
     detector cannot learn from the images is printed, too.
     """
-    from mitsplat.report.report import write_report
+    from mitsplat.report.dataset_report import write_report
 
     check_ending(out, ".html")
     page, found, warnings = write_report(dataset, out)
@@ -359,11 +359,11 @@ def preview(
     check_place(out, ".png", ".jpg", ".jpeg")
     from PIL import Image
 
-    from mitsplat.dataset.prospects import count_faults, image_faults, layout_faults, refuse
-    from mitsplat.files import write_file
+    from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
     from mitsplat.frames.frame import render_frame
     from mitsplat.frames.layer_sheet import layer_sheet
-    from mitsplat.scene.scene import load_scene
+    from mitsplat.scene.loading.scene_loading import load_scene
+    from mitsplat.storage.files import write_file
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
     refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
@@ -431,10 +431,10 @@ def settle(
     check_place(out, ".gif")
     from rich.console import Console
 
-    from mitsplat.dataset.prospects import count_faults, layout_faults, refuse
+    from mitsplat.dataset.preflight import count_faults, layout_faults, refuse
     from mitsplat.frames.settle_preview import certificate_table, write_preview
     from mitsplat.physics.settle import settle_layouts
-    from mitsplat.scene.scene import load_scene
+    from mitsplat.scene.loading.scene_loading import load_scene
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed), allow_outside=allow_outside)
     wanted = loaded.spec.output.layouts if layouts is None else layouts
@@ -474,7 +474,7 @@ def export(
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
         raise InputError(f"--out needs a new folder beside it, {files} (it is there); --overwrite replaces its files")
     from mitsplat.frames.mitsuba_xml import export_xml
-    from mitsplat.scene.scene import load_scene
+    from mitsplat.scene.loading.scene_loading import load_scene
 
     export_xml(load_scene(scene, allow_outside=allow_outside), frame, out)
     typer.echo(f"scene: {out}")
@@ -484,7 +484,7 @@ def schema() -> None:
     """Print the JSON Schema of scene files, for editors."""
     import json
 
-    from mitsplat.scene.scene import scene_json_schema
+    from mitsplat.scene.loading.scene_loading import scene_json_schema
 
     typer.echo(json.dumps(scene_json_schema(), indent=2))
 
@@ -508,7 +508,7 @@ def check(
     Units, up axis, needles, floaters, mesh against splats, mass, colliders, room, sight and light, and what to do about
     each. If there is anything, the exit status is 1.
     """
-    from mitsplat.checks.preflight import check_path
+    from mitsplat.checks.path_checks import check_path
 
     _tell_findings(check_path(path, allow_outside=allow_outside), "look")
 
@@ -532,7 +532,7 @@ def _overrides(
     *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
 ) -> dict[str, Any]:
     """The options that were given, by the scene file's keys."""
-    from mitsplat.spec.spec import FORMATS
+    from mitsplat.scene.spec.scene_spec import FORMATS
 
     if seed is not None and seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")

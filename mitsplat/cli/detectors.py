@@ -117,7 +117,7 @@ def evaluate(
 
     The page shows precision over recall, what is taken for what, and the images that went worst.
     """
-    from mitsplat.detector.evaluation import evaluate_detector
+    from mitsplat.detector.detector_evaluation import evaluate_detector
 
     with command_log(json_log, "evaluate") as progress_bars, progress_bars() as progress:
         found = evaluate_detector(run, data, out, split=split, size=size, device=device, progress=progress)
@@ -151,7 +151,7 @@ def compare(
     Objects' brightness, colours, size and number, images' brightness and noise, of all and of each class.
     """
     from mitsplat.detector.likeness import compare_with_photographs
-    from mitsplat.files import write_text
+    from mitsplat.storage.files import write_text
 
     check_ending(out, ".json")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from mitsplat.cache import cache_folder
+from mitsplat.storage.cache import cache_folder
 from mitsplat.version import __version__
 
 STATUS = 70

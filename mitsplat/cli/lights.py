@@ -15,7 +15,7 @@ from mitsplat.cli.options import check_ending
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from mitsplat.lighting import LightEstimate
+    from mitsplat.capture.lighting import LightEstimate
 
 _MIRROR = (1.0, 1.0, 1.0)
 _WHITE = math.pi
@@ -71,7 +71,7 @@ def lights(
     Lamps are cut out as area lights, which layouts may vary; what is left is an environment light. A level table gets
     the same light from both together as from the panorama. A picture beside the lines shows what was taken for a lamp.
     """
-    from mitsplat.lighting import (
+    from mitsplat.capture.lighting import (
         BallView,
         LightSettings,
         estimate_light,
@@ -80,7 +80,7 @@ def lights(
         refuse_to_replace,
         write_light,
     )
-    from mitsplat.lighting.panorama import HDR_SUFFIXES
+    from mitsplat.capture.lighting.panorama import HDR_SUFFIXES
 
     check_ending(out, ".yaml", ".yml")
     refuse_to_replace(out, images)

@@ -17,7 +17,7 @@ from mitsplat.errors import InputError, exit_status, sentence_of
 from mitsplat.progress import Progress
 
 if TYPE_CHECKING:
-    from mitsplat.device import Device
+    from mitsplat.runtime.device import Device
 
 DeviceName = Annotated[
     str,
@@ -63,7 +63,7 @@ def check_new(out: Path, *endings: str, overwrite: bool) -> None:
 
 def take_device(name: str) -> None:
     """Compute on a device from now on; why ``auto`` chose it is said."""
-    from mitsplat.device import use_device  # most commands do without
+    from mitsplat.runtime.device import use_device  # most commands do without
 
     tell_device(use_device(name))
 

@@ -29,9 +29,9 @@ from mitsplat.cli.options import (
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
-    from mitsplat.boards.targets import Board
-    from mitsplat.capture.pipeline import CaptureSettings
-    from mitsplat.reconstruct.pipeline import AssetResult
+    from mitsplat.capture.boards.targets import Board
+    from mitsplat.capture.capture_photos import CaptureSettings
+    from mitsplat.reconstruct.asset_from_photos import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with masks for an object.")]
 Photos = Annotated[
@@ -221,7 +221,7 @@ def capture(
 
     Runs again where it stopped. If too many photos are of no use, the exit status is 4.
     """
-    from mitsplat.capture.pipeline import capture_photos
+    from mitsplat.capture.capture_photos import capture_photos
 
     settings = replace(
         _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
@@ -300,7 +300,7 @@ def mesh(
     environment is kept whole, and level surfaces in it are found. If a threshold is missed, the exit status is 4.
     """
     from mitsplat.asset import read_mesh
-    from mitsplat.reconstruct.pipeline import AssetJob, make_asset
+    from mitsplat.reconstruct.asset_from_photos import AssetJob, make_asset
     from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings
     from mitsplat.reconstruct.registration import invert_transform
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
@@ -366,7 +366,7 @@ def asset(
     drops things on the one that photos look at. If a threshold is missed, the exit status is 4.
     """
     from mitsplat.fit.trainer import FitSettings
-    from mitsplat.reconstruct.pipeline import AssetJob, make_photo_asset
+    from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
     from mitsplat.reconstruct.reconstruct import ReconstructSettings
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
@@ -418,7 +418,7 @@ def _capture_settings(
     box: Box,
 ) -> CaptureSettings:
     """What `capture` and `asset` both are told of photographs."""
-    from mitsplat.capture.pipeline import CaptureSettings
+    from mitsplat.capture.capture_photos import CaptureSettings
 
     return CaptureSettings(
         kind=kind,
@@ -434,7 +434,7 @@ def _capture_settings(
 
 
 def _board(squares: str, square: float) -> Board:
-    from mitsplat.boards.targets import Board
+    from mitsplat.capture.boards.targets import Board
 
     columns, _, rows = squares.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal()):

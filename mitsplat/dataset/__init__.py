@@ -6,7 +6,7 @@ same bytes. Scenes that can come to nothing are refused before work starts (:mod
 
 from __future__ import annotations
 
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.folds import Fold, write_folds
 from mitsplat.dataset.given_frames import write_frames
 from mitsplat.dataset.remake import RemadeFrame, remake_frame

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import ByteImage
-from mitsplat.files import Record, write_file
 from mitsplat.formats.coco import image_file
+from mitsplat.images.picture_files import read_picture
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import draw_labels
-from mitsplat.picture_files import read_picture
+from mitsplat.storage.files import Record, write_file
 
 _COLUMNS = 4
 _TILE_WIDTH = 480

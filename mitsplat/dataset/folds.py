@@ -18,14 +18,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsplat.dataset.folder import open_finished
+from mitsplat.dataset.dataset_folder import open_finished
 from mitsplat.dataset.own_files import remove_folds
 from mitsplat.dataset.schema import read_content
 from mitsplat.errors import InputError
-from mitsplat.files import GrowingFile, storage_errors, write_text
 from mitsplat.formats.coco import InstancesWriter, image_file
 from mitsplat.formats.yolo import TASKS, names_yaml
-from mitsplat.json_stream import ListsFile
+from mitsplat.storage.files import GrowingFile, storage_errors, write_text
+from mitsplat.storage.json_stream import ListsFile
 
 
 @dataclass(frozen=True)

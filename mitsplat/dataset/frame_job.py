@@ -17,7 +17,12 @@ from typing import TYPE_CHECKING
 
 from mitsplat.dataset.own_files import LOCK
 from mitsplat.errors import InputError, PartialResultError
-from mitsplat.files import (
+from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.progress import Note
+from mitsplat.scene.layout import Layout, NothingRests
+from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.scene import Scene
+from mitsplat.storage.files import (
     Record,
     link_file,
     open_in_place,
@@ -27,10 +32,6 @@ from mitsplat.files import (
     write_file,
     write_text,
 )
-from mitsplat.formats.registry import Catalogue, write_frame
-from mitsplat.progress import Note
-from mitsplat.scene.layout import Layout, NothingRests
-from mitsplat.scene.scene import Scene, layout_of
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame

@@ -8,16 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mitsplat.dataset.folder import append_run, content_of, finish_folder, open_folder
+from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.own_files import TIMINGS
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
-from mitsplat.device import current_device
 from mitsplat.errors import InputError
-from mitsplat.files import storage_errors, write_text
 from mitsplat.formats.registry import Catalogue, write_frame
-from mitsplat.scene.contents import split_of
+from mitsplat.runtime.device import current_device
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.splits import split_of
+from mitsplat.storage.files import storage_errors, write_text
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import trimesh
 
-from mitsplat.content_hash import ContentHash, file_hash
-from mitsplat.scene.references import image_lists
-from mitsplat.spec.lights import EnvironmentLight
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.scene.spec.light_spec import EnvironmentLight
+from mitsplat.scene.spec.named_files import image_lists
+from mitsplat.storage.content_hash import ContentHash, file_hash
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset

@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import Record, open_in_place, open_regular, write_file
+from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.files import Record, open_in_place, open_regular, write_file
 
 LONGEST_LINE = 1 << 26
 """Most bytes of a line that are read at once; no frame needs as many."""

@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from mitsplat.errors import InputError
-from mitsplat.files import SPLITS, read_json
 from mitsplat.formats.registry import TABLE
 from mitsplat.formats.yolo import TASKS
+from mitsplat.storage.files import SPLITS, read_json
 
 CONTENT = "dataset.json"
 MANIFEST = "manifest.jsonl"
@@ -26,7 +26,7 @@ _ENTRIES = ("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMING
 _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
 """Names of what may be in a folder before ``dataset.json`` is."""
 _PARTIAL = re.compile(r"\..+\.\d+\.part")
-"""Of what :func:`mitsplat.files.write_file` has not finished."""
+"""Of what :func:`mitsplat.storage.files.write_file` has not finished."""
 
 _SPLIT = f"(?:{'|'.join(SPLITS)})"
 _TASK = f"(?:{'|'.join(task.folder for task in TASKS.values() if task.folder)})?"

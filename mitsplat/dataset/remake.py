@@ -15,19 +15,20 @@ from itertools import chain
 from pathlib import Path
 from typing import SupportsIndex
 
-from mitsplat.dataset.folder import IMPLIED, content_of, first_difference
+from mitsplat.dataset.dataset_folder import IMPLIED, content_of, first_difference
 from mitsplat.dataset.frame_job import FrameMaker, Render, Settle
 from mitsplat.dataset.manifest import parse_line, read_lines
 from mitsplat.dataset.own_files import CONTENT, MANIFEST, is_written, refuse_links
-from mitsplat.dataset.prospects import count_faults, image_faults, layout_faults, refuse
+from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
 from mitsplat.dataset.schema import check_record, read_content
-from mitsplat.device import Device, current_device, use_device
 from mitsplat.errors import InputError
-from mitsplat.files import Record, open_regular, read_json, storage_errors, write_text
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
-from mitsplat.scene.scene import Scene, layout_of, whole
+from mitsplat.runtime.device import Device, current_device, use_device
+from mitsplat.scene.planning.frame_plan import layout_of, whole
+from mitsplat.scene.scene import Scene
+from mitsplat.storage.files import Record, open_regular, read_json, storage_errors, write_text
 
 FRAME = "frame.json"
 

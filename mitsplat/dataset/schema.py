@@ -17,15 +17,15 @@ import numpy.typing as npt
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mitsplat.camera import Camera, Lens
 from mitsplat.dataset.manifest import LONGEST_LINE, parse_line, read_lines
 from mitsplat.errors import InputError
-from mitsplat.files import Record, open_regular, read_json, splits_of
-from mitsplat.format_version import FORMAT_VERSIONS, check_format_version
-from mitsplat.masks import decode_rle
-from mitsplat.spec.camera import CameraSpec
-from mitsplat.spec.spec import LabelRules, Output
-from mitsplat.spec_types import Name
+from mitsplat.geometry.camera import Camera, Lens
+from mitsplat.images.masks import decode_rle
+from mitsplat.scene.spec.camera_spec import CameraSpec
+from mitsplat.scene.spec.scene_spec import LabelRules, Output
+from mitsplat.storage.field_types import Name
+from mitsplat.storage.files import Record, open_regular, read_json, splits_of
+from mitsplat.storage.format_version import FORMAT_VERSIONS, check_format_version
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]
@@ -157,7 +157,7 @@ class _Motion(_Stored):
 
 
 class _Viewpoint(_Stored):
-    """How a camera was drawn: see :class:`mitsplat.scene.viewpoints.View`, whose units these are."""
+    """How a camera was drawn: see :class:`mitsplat.scene.planning.viewpoints.View`, whose units these are."""
 
     camera: Count = 0
     side: Literal["left", "right"] | None = None

@@ -10,8 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mitsplat.content_hash import file_hash
-from mitsplat.dataset.folder import (
+from mitsplat.dataset.dataset_folder import (
     IMPLIED,
     finish_folder,
     first_difference,
@@ -24,9 +23,10 @@ from mitsplat.dataset.own_files import CONTENT, RUNS, TIMINGS
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
-from mitsplat.files import Record, file_inside, link_file, open_regular, read_json, splits_of, write_file
 from mitsplat.formats.registry import Catalogue
 from mitsplat.progress import Progress
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.files import Record, file_inside, link_file, open_regular, read_json, splits_of, write_file
 
 
 def merge_shards(

@@ -26,24 +26,25 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mitsplat.dataset.folder import Shard, append_run, content_of, finish_folder, open_folder
+from mitsplat.dataset.dataset_folder import Shard, append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle, layout_errors
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.own_files import SHEET, TIMINGS, remove_folds
-from mitsplat.dataset.prospects import refuse, run_faults
-from mitsplat.device import Device, current_device, find_device
+from mitsplat.dataset.preflight import refuse, run_faults
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL
 from mitsplat.errors import InputError
-from mitsplat.files import SPLITS, Record, read_json, storage_errors
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note, Progress
+from mitsplat.runtime.device import Device, current_device, find_device
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, layout_of
+from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.scene import Scene
+from mitsplat.storage.files import SPLITS, Record, read_json, storage_errors
 
 _logger = logging.getLogger(__name__)
 
@@ -114,13 +115,14 @@ def write_dataset(
         progress: Hears of every finished frame and of slow steps.
         render: What to use instead of :func:`mitsplat.frames.frame.render_frame`.
         settle: What to use instead of :func:`mitsplat.physics.settle.settle_layout`.
-        device: What frames are rendered on, as :mod:`mitsplat.device` names them; layouts are settled on CPUs. That of
+        device: What frames are rendered on, as :mod:`mitsplat.runtime.device` names them; layouts are settled on CPUs.
+        That of
             this process if None, see :func:`mitsplat.use_device`, and on a cluster what its resources say.
         any_device: Continue a dataset that was begun on the other kind of device.
 
     Raises:
         InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
-            :mod:`mitsplat.dataset.prospects`), the folder cannot be written, is in use, holds something else, or holds
+            :mod:`mitsplat.dataset.preflight`), the folder cannot be written, is in use, holds something else, or holds
             a dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else, or
             more layouts lack objects than ``settle.incomplete`` says.
         MissingResourceError: If the disk is full, the device is not here, or memory does not suffice for one frame.

@@ -7,7 +7,7 @@ Training and predicting need the extra ``train``; judging detections that are ke
 
 from __future__ import annotations
 
-from mitsplat.detector.evaluation import Evaluation, evaluate_detector
+from mitsplat.detector.detector_evaluation import Evaluation, evaluate_detector
 from mitsplat.detector.likeness import Likeness, compare_with_photographs
 from mitsplat.detector.scores import AveragePrecision, DetectionMatches, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set

@@ -10,9 +10,9 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from mitsplat.arrays import ByteImage
-from mitsplat.content_hash import ContentHash
 from mitsplat.errors import InputError
-from mitsplat.files import IMAGE_ERRORS, files_below
+from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.files import IMAGE_ERRORS, files_below
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Images that Ultralytics reads as well."""

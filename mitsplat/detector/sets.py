@@ -27,13 +27,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from mitsplat.arrays import Float64Array
-from mitsplat.content_hash import ContentHash
 from mitsplat.detector.pictures import images_below, look_at_image
 from mitsplat.errors import InputError
-from mitsplat.files import SPLITS, is_inside, read_json
+from mitsplat.images.masks import decode_rle, encode_mask
 from mitsplat.labels.polygons import fill_polygon, outline
-from mitsplat.masks import decode_rle, encode_mask
 from mitsplat.progress import Progress
+from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.files import SPLITS, is_inside, read_json
 
 Split = Literal["train", "val", "test", "all"]
 

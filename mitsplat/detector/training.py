@@ -24,8 +24,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mitsplat.content_hash import file_hash
-from mitsplat.cores import usable_cores
 from mitsplat.detector.libraries import (
     check_device,
     check_weights,
@@ -35,11 +33,13 @@ from mitsplat.detector.libraries import (
     versions,
 )
 from mitsplat.detector.mix import plan_images
+from mitsplat.detector.photo_tiles import cut_photographs
 from mitsplat.detector.sets import STRIDE, LabelledSet, check_masks, in_classes, read_set
-from mitsplat.detector.tiles import cut_photographs
 from mitsplat.errors import InputError
-from mitsplat.files import open_in_place, read_json, remove_folder, storage_errors, write_text
 from mitsplat.progress import Progress
+from mitsplat.runtime.cores import usable_cores
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.files import open_in_place, read_json, remove_folder, storage_errors, write_text
 
 RUN = "run.json"
 WEIGHTS = "weights.pt"

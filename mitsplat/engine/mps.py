@@ -13,8 +13,8 @@ import subprocess
 import tempfile
 from contextlib import suppress
 
-from mitsplat.child_process import python_command, python_environment
-from mitsplat.gpu_memory import VISIBLE
+from mitsplat.runtime.child_process import python_command, python_environment
+from mitsplat.runtime.gpu_memory import VISIBLE
 
 CONTROL = "nvidia-cuda-mps-control"
 """The program that starts the service and ends it."""

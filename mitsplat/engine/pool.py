@@ -23,10 +23,6 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
-from mitsplat.cache import prepare_caches
-from mitsplat.child_process import starting_safely
-from mitsplat.cores import usable_cores
-from mitsplat.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
 from mitsplat.engine.mps import MOST_CLIENTS, SharedGpu
 from mitsplat.engine.resources import TYPICAL, WorkerMemory, unused_memory
 from mitsplat.engine.shared_arrays import SharedArrays
@@ -39,6 +35,10 @@ from mitsplat.errors import (
     sentence_of,
 )
 from mitsplat.progress import Note
+from mitsplat.runtime.child_process import starting_safely
+from mitsplat.runtime.cores import usable_cores
+from mitsplat.runtime.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
+from mitsplat.storage.cache import prepare_caches
 
 Made = TypeVar("Made", covariant=True)
 Result = TypeVar("Result")

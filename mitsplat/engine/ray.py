@@ -17,10 +17,10 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-from mitsplat.device import Device, Kind, use_share
 from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, check_workers, run_pool
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.progress import Note
+from mitsplat.runtime.device import Device, Kind, use_share
 
 Result = TypeVar("Result")
 Made = TypeVar("Made", covariant=True)

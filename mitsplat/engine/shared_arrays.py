@@ -18,7 +18,7 @@ from itertools import accumulate, chain
 from multiprocessing.reduction import DupFd
 from typing import IO, Any, Generic, TypeVar
 
-from mitsplat.cache import cache_folder
+from mitsplat.storage.cache import cache_folder
 
 Value = TypeVar("Value")
 

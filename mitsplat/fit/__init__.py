@@ -6,7 +6,7 @@ trainer starts from the capture's points, and a strategy (MCMC or classic) adds 
 
 from __future__ import annotations
 
-from mitsplat.fit.folder import FitResult
+from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 
 __all__ = ["FitProgress", "FitResult", "FitSettings", "fit_capture"]

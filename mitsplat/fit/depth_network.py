@@ -12,12 +12,12 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.capture.capture import Photo, stored_name
-from mitsplat.content_hash import ContentHash, file_hash
 from mitsplat.errors import InputError
-from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthKind, DepthMaps
-from mitsplat.onnx_networks import load_library
 from mitsplat.progress import Progress
+from mitsplat.runtime.onnx_networks import load_library
+from mitsplat.storage.content_hash import ContentHash, file_hash
+from mitsplat.storage.files import write_file
 from mitsplat.version import __version__
 
 FloatImage = Float32Array

@@ -20,12 +20,12 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo, Window
-from mitsplat.capture.masks import shapes_differ
+from mitsplat.capture.photo_masks import shapes_differ
 from mitsplat.errors import InputError
-from mitsplat.exr_header import check_exr_header
-from mitsplat.files import IMAGE_ERRORS
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.exr_header import check_exr_header
+from mitsplat.storage.files import IMAGE_ERRORS
 
 DepthMap = Float32Array
 """Inverse depths along z [1/m] of a photo's pixels, shape (H, W) of its aspect, NaN where unknown."""

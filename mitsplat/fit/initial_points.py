@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array, Float64Array, Int32Array
-from mitsplat.camera import Camera
+from mitsplat.geometry.camera import Camera
 
 Mask = Float32Array
 

@@ -12,12 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray
-from mitsplat.plugins.backward import Eye, Rendering, gather_gradients, pack_cloud, project_cloud, render_records
-from mitsplat.plugins.device import number, on_device, wrapped
-from mitsplat.plugins.gaussian import Cloud
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
-from mitsplat.recorded import recorded
-from mitsplat.splats import Splats
+from mitsplat.renderer.differentiation.backward import (
+    Eye,
+    Rendering,
+    gather_gradients,
+    pack_cloud,
+    project_cloud,
+    render_records,
+)
+from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
+from mitsplat.renderer.splatting.gaussian import Cloud
+from mitsplat.runtime.recorded_kernels import recorded
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15
 """Adam as in 3DGS; mi.ad.Adam forgets all moments when the number of Gaussians changes."""

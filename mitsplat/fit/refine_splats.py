@@ -11,16 +11,16 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.arrays import Float32Array
-from mitsplat.camera import Camera
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.plugins.backward import Eye
-from mitsplat.plugins.device import number, on_device, wrapped
-from mitsplat.plugins.sensors import view_of
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
-from mitsplat.recorded import recorded
-from mitsplat.render.layers import ensure_variant, make_sensor
-from mitsplat.splats import Splats
+from mitsplat.renderer.differentiation.backward import Eye
+from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.runtime.recorded_kernels import recorded
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,10 +18,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.strategy_mcmc import DEAD
-from mitsplat.plugins.device import wrapped
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.rays.device_arrays import wrapped
 
 _REFINED = (1 / 60, 0.5)
 """Shares of the fit between which Gaussians are added and removed."""

@@ -19,13 +19,13 @@ from scipy.spatial import KDTree
 from scipy.special import comb
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.plugins.device import number, on_device, wrapped
-from mitsplat.plugins.gaussian import rotation_axes
-from mitsplat.recorded import recorded
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
+from mitsplat.renderer.splatting.gaussian import rotation_axes
+from mitsplat.runtime.recorded_kernels import recorded
 
 DEAD = 0.005
 """Opacity below which a Gaussian is moved to where it is of use."""

@@ -1,7 +1,7 @@
 """Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
 
 Gaussians start at the capture's points and are densified (:mod:`mitsplat.fit.strategy_mcmc`). A fit lives in a folder,
-see :mod:`mitsplat.fit.folder`.
+see :mod:`mitsplat.fit.fit_folder`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,10 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
-from mitsplat.content_hash import ContentHash
-from mitsplat.cores import usable_cores
 from mitsplat.errors import InputError
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
-from mitsplat.fit.folder import FitFolder, FitResult
+from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.optimizer import Adam, GaussianModel
@@ -33,12 +30,15 @@ from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, TrainingView, unpacked
 from mitsplat.fit.windows import object_windows
-from mitsplat.plugins.backward import DepthRendering
-from mitsplat.plugins.device import number, on_device, wrapped
-from mitsplat.plugins.photometric import photometric_loss
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
-from mitsplat.recorded import recorded
-from mitsplat.render.layers import ensure_variant
+from mitsplat.renderer.differentiation.backward import DepthRendering
+from mitsplat.renderer.differentiation.photometric_loss import photometric_loss
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
+from mitsplat.runtime.cores import usable_cores
+from mitsplat.runtime.recorded_kernels import recorded
+from mitsplat.storage.content_hash import ContentHash
 from mitsplat.version import __version__
 
 

@@ -13,17 +13,17 @@ import numpy.typing as npt
 from PIL import Image
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo, Window
-from mitsplat.files import write_file
 from mitsplat.fit.depth_priors import DepthMap, resize_map
 from mitsplat.fit.image_metrics import psnr, ssim
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.plugins.backward import Eye
-from mitsplat.plugins.device import wrapped
-from mitsplat.plugins.sensors import view_of
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
-from mitsplat.render.layers import make_sensor
+from mitsplat.renderer.differentiation.backward import Eye
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.storage.files import write_file
 
 _DIFFERENCE_GAIN = 4
 

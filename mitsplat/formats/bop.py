@@ -24,12 +24,12 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from mitsplat.camera import Camera
-from mitsplat.files import GrowingFile, Record, write_file, write_text
 from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.formats.maps import encode_mask_png
-from mitsplat.json_stream import EntriesFile
+from mitsplat.geometry.camera import Camera
 from mitsplat.labels.labels import Labels
+from mitsplat.storage.files import GrowingFile, Record, write_file, write_text
+from mitsplat.storage.json_stream import EntriesFile
 
 MILLIMETRES = 1000.0
 _TOGETHER, _WAITING = 768, 32

@@ -21,11 +21,11 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.camera import Camera
-from mitsplat.files import Record
 from mitsplat.formats.format import Catalogue, Describer, FrameFiles
-from mitsplat.json_stream import ListsFile
+from mitsplat.geometry.camera import Camera
 from mitsplat.labels.labels import UNLABELLED, Labels
+from mitsplat.storage.files import Record
+from mitsplat.storage.json_stream import ListsFile
 
 ENVIRONMENT = "environment"
 """Name of the panoptic category of what is no instance."""

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
-from mitsplat.camera import Camera
-from mitsplat.files import GrowingFile, Record
 from mitsplat.formats.coco import image_file
 from mitsplat.formats.format import Catalogue
+from mitsplat.geometry.camera import Camera
+from mitsplat.storage.files import GrowingFile, Record
 
 
 class ModelWriter:

@@ -12,16 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.errors import InputError
-from mitsplat.files import SPLITS, Record, link_file, splits_of, write_file
 from mitsplat.formats import maps
-from mitsplat.spec_types import plain
+from mitsplat.storage.field_types import plain
+from mitsplat.storage.files import SPLITS, Record, link_file, splits_of, write_file
 
 if TYPE_CHECKING:
     import trimesh
 
     from mitsplat.frames.frame import Frame
     from mitsplat.scene.scene import Scene
-    from mitsplat.spec.image import DepthSensor
+    from mitsplat.scene.spec.image_spec import DepthSensor
 
 
 _ONE_POSE = frozenset(("bop", "colmap", "flow"))

@@ -25,9 +25,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mitsplat.arrays import BoolArray
-from mitsplat.files import Record, write_text
 from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.labels.labels import InstanceLabel
+from mitsplat.storage.files import Record, write_text
 
 _COUNT_BITS = (3, 4, 8, 16)
 """Bits of counts, as Label Studio's own encoder chooses them."""

@@ -1,4 +1,4 @@
-"""Pictures of per-pixel values: layers as OpenEXR, depth, normals, ids and classes as PNG, optical flow as ``.flo``."""
+"""Encodings of per-pixel maps: depth, normals, ids and classes as 16-bit PNG, optical flow as ``.flo``."""
 
 from __future__ import annotations
 
@@ -6,84 +6,22 @@ import struct
 import zlib
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float32Array
-from mitsplat.files import library_errors
-from mitsplat.frames.depth_sensor import sensed_depth
+from mitsplat.images.masks import Box
 from mitsplat.labels.labels import Labels
-from mitsplat.masks import Box
 
 if TYPE_CHECKING:
-    from mitsplat.formats.format import FrameFiles
-    from mitsplat.frames.frame import Frame
+    pass
+
 
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
 """Millimetres per unit of a depth picture: the first by which the frame's farthest depth fits 16 bits."""
-
-
-def write_instances(files: FrameFiles) -> None:
-    """Write the ids of a frame's labelled instances."""
-    files.add_png(f"instances/{files.name}.png", files.labelled)
-
-
-def write_semantic(files: FrameFiles) -> None:
-    """Write a frame's classes."""
-    picture = semantic_picture(files.frame.labels, files.ids, files.catalogue.class_names)
-    files.add_png(f"semantic/{files.name}.png", picture)
-
-
-def write_depth(files: FrameFiles) -> None:
-    """Write a frame's depth."""
-    files.add_depth(f"depth/{files.name}.png")
-
-
-def write_depth_sensor(files: FrameFiles) -> None:
-    """Write a frame's depth as the scene's sensor measures it, and its unit as ``depth_sensor_scale`` [mm]."""
-    assert files.catalogue.depth_sensor is not None  # noqa: S101 - the scene's rule
-    measured = sensed_depth(files.frame, files.catalogue.depth_sensor)
-    files.record["depth_sensor_scale"] = depth_scale(measured)
-    files.add_png(f"depth-sensor/{files.name}.png", depth_picture(measured))
-
-
-def write_normals(files: FrameFiles) -> None:
-    """Write a frame's normals."""
-    files.add_png(f"normals/{files.name}.png", normal_picture(files.frame.normal))
-
-
-def write_flow(files: FrameFiles) -> None:
-    """Write the flow to the next view of the frame's layout, if there is one."""
-    if (flow := files.frame.flow) is not None:
-        files.add_bytes(f"flow/{files.name}.flo", encode_flow(flow))
-
-
-def write_exr(files: FrameFiles) -> None:
-    """Write the layers of a frame."""
-    files.add(f"layers/{files.name}.exr", lambda path: save_exr(path, files.frame))
-
-
-def save_exr(path: Path, frame: Frame) -> None:
-    """Write the layers of a frame as channels of one scan-line OpenEXR file, 32 bits each."""
-    names = {"depth": "Z", "alpha": "A"}
-    axes = {"normal": "XYZ"}
-    channels = {letter: frame.rgb[..., i] for i, letter in enumerate("RGB")}
-    for layer in ("depth", "instance", "proxy_instance", "normal", "light", "alpha", "captured", "highlight"):
-        values = getattr(frame.layers, layer)
-        if values.ndim == 2:
-            channels[names.get(layer, layer)] = values
-        else:
-            channels |= {f"{layer}.{axis}": values[..., i] for i, axis in enumerate(axes.get(layer, "RGB"))}
-    kinds = {"f": np.float32, "u": np.uint32, "i": np.uint32, "b": np.uint32}
-    contiguous = {name: np.ascontiguousarray(c, dtype=kinds[c.dtype.kind]) for name, c in channels.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, contiguous) as file, library_errors(path):
-        file.write(str(path))
 
 
 def encode_png(picture: npt.NDArray[Any]) -> bytes:

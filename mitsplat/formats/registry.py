@@ -34,13 +34,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.files import Record
-from mitsplat.formats import bop, coco, label_studio, maps, voc, yolo
+from mitsplat.formats import bop, coco, label_studio, map_files, maps, voc, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
-from mitsplat.render.places import draw_place
-from mitsplat.scene.contents import draw_regions, is_empty
-from mitsplat.spec.spec import FORMATS, Output, SceneSpec
+from mitsplat.scene.planning.contents import draw_regions
+from mitsplat.scene.planning.layout_surroundings import draw_place
+from mitsplat.scene.spec.scene_spec import FORMATS, Output, SceneSpec
+from mitsplat.scene.splits import is_empty
+from mitsplat.storage.files import Record
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame
@@ -51,19 +52,19 @@ TABLE = {
     **{task: yolo.format_of(task) for task in yolo.TASKS},
     "voc": Format(("voc",), voc.write, voc.SetsWriter),
     "label-studio": Format(("label-studio",), label_studio.write, label_studio.ConfigWriter),
-    "instances": Format(("instances",), maps.write_instances),
+    "instances": Format(("instances",), map_files.write_instances),
     "coco": Format(("annotations",), describe=coco.describe_instances),
     "amodal": Format(("annotations",), describe=partial(coco.describe_instances, amodal=True)),
     "panoptic": Format(("panoptic", "annotations"), coco.write_panoptic, coco.describe_panoptic),
     "poses": Format(("annotations",), describe=coco.describe_poses),
-    "semantic": Format(("semantic",), maps.write_semantic),
-    "depth": Format(("depth",), maps.write_depth),
-    "depth-sensor": Format(("depth-sensor",), maps.write_depth_sensor),
+    "semantic": Format(("semantic",), map_files.write_semantic),
+    "depth": Format(("depth",), map_files.write_depth),
+    "depth-sensor": Format(("depth-sensor",), map_files.write_depth_sensor),
     "bop": Format(("bop",), bop.write, bop.ScenesWriter),
     "colmap": Format(("colmap",), describe=ModelWriter),
-    "normals": Format(("normals",), maps.write_normals),
-    "flow": Format(("flow",), maps.write_flow),
-    "exr": Format(("layers",), maps.write_exr),
+    "normals": Format(("normals",), map_files.write_normals),
+    "flow": Format(("flow",), map_files.write_flow),
+    "exr": Format(("layers",), map_files.write_exr),
 }
 """Formats in the order in which they are written."""
 

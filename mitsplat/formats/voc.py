@@ -15,9 +15,9 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
-from mitsplat.files import GrowingFile, Record
 from mitsplat.formats.format import Catalogue, FrameFiles
 from mitsplat.labels.labels import InstanceLabel, Labels
+from mitsplat.storage.files import GrowingFile, Record
 
 TRUNCATED, OCCLUDED = 0.15, 0.05
 """Shares of an object above which its flags are set."""

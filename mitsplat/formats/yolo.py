@@ -25,9 +25,9 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.files import SPLITS, Record, write_text
 from mitsplat.formats.format import Catalogue, Format, FrameFiles
 from mitsplat.labels.labels import UNLABELLED, InstanceLabel, Labels
+from mitsplat.storage.files import SPLITS, Record, write_text
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage, Float32Array
-from mitsplat.colour import decode_srgb
-from mitsplat.render.places import Backing
-from mitsplat.render.textures import read_image
+from mitsplat.images.colour import decode_srgb
+from mitsplat.renderer.textures import read_image
+from mitsplat.scene.planning.layout_surroundings import Backing
 
 
 def background_picture(backing: Backing, path: Path, width: int, height: int) -> Float32Array:

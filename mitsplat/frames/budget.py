@@ -12,13 +12,14 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from mitsplat.camera import Camera
 from mitsplat.engine.resources import WorkerMemory
-from mitsplat.plugins.pairs import PAIRS_MAX
-from mitsplat.plugins.rays import TILE_HEIGHT, TILE_WIDTH
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import KERNELS, Quality, resolve_quality
-from mitsplat.scene.scene import Scene, plan_frame
-from mitsplat.splats import Splats
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
+from mitsplat.renderer.splatting.pairs import PAIRS_MAX
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.scene import Scene
 
 BASE = 2**30
 """Python, libraries, compiled kernels and the simulation of a layout [bytes]."""

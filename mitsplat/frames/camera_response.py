@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
-from mitsplat.colour import (
+from mitsplat.images.colour import (
     LUMINANCE,
     chroma_matrix,
     encode_srgb,
@@ -22,10 +22,10 @@ from mitsplat.colour import (
     saturation_matrix,
     white_balance_matrix,
 )
-from mitsplat.plugins.device import wrapped
-from mitsplat.render.layers import Layers, device_array, host_array
-from mitsplat.spec.image import Composite, ImageShadow, Sensor
-from mitsplat.variant import one_at_a_time
+from mitsplat.renderer.layers import Layers, device_array, host_array
+from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.runtime.variant import one_at_a_time
+from mitsplat.scene.spec.image_spec import Composite, ImageShadow, Sensor
 
 Tone: TypeAlias = Literal["neutral", "filmic"]
 
@@ -354,8 +354,8 @@ def colour_matrix(
     """One 3x3 matrix on linear sRGB for white balance, chroma, hue and saturation, in this order.
 
     White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; chroma is a factor and
-    an angle of :func:`mitsplat.colour.chroma_matrix`; hue turns colours about the grey axis; saturation scales their
-    distance from the grey of the same luminance.
+    an angle of :func:`mitsplat.images.colour.chroma_matrix`; hue turns colours about the grey axis; saturation scales
+    their distance from the grey of the same luminance.
     """
     matrix = np.eye(3)
     if white_balance != 6504.0:

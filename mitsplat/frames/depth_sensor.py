@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
-from mitsplat.camera import Camera
-from mitsplat.colour import LUMINANCE
 from mitsplat.frames.frame import Frame
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import LUMINANCE
+from mitsplat.scene.spec.image_spec import DepthSensor, StereoSensor, TimeOfFlightSensor
 from mitsplat.scene.streams import random_stream
-from mitsplat.spec.image import DepthSensor, StereoSensor, TimeOfFlightSensor
 
 LIGHT_SPEED = 299_792_458.0
 WINDOW = 9

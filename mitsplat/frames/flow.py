@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.camera import Camera
-from mitsplat.scene.conveyor import Belt
+from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
+from mitsplat.scene.planning.conveyor import Belt
 
 UNKNOWN_FLOW = 1e10
 """Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
@@ -74,7 +74,7 @@ def swept_by(
     Args:
         depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
         camera: Where it is in the middle of the exposure.
-        motion: As :class:`mitsplat.scene.viewpoints.View` has it.
+        motion: As :class:`mitsplat.scene.planning.viewpoints.View` has it.
         moving: A conveyor's belt, and which pixels show what it carries (H, W); those that show its surface follow
             from their depth.
     """

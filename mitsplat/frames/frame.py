@@ -18,22 +18,20 @@ import trimesh
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
-from mitsplat.colour import decode_srgb
 from mitsplat.errors import InputError
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND, develop_layers, light_layers
 from mitsplat.frames.flow import motions_of, optical_flow, swept_by
 from mitsplat.frames.rolling_shutter import Band, bands_of, project_by_row, stacked_silhouettes
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import decode_srgb
+from mitsplat.images.masks import Silhouette
 from mitsplat.labels.labels import Labels, Projection, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
-from mitsplat.masks import Silhouette
 from mitsplat.physics.settle import settle_layout
-from mitsplat.plugins.device import plain_mesh
 from mitsplat.quality import Quality, resolve_quality
-from mitsplat.render.deferred import Deferred
-from mitsplat.render.emitters import emitter_dict, movable
-from mitsplat.render.layers import (
+from mitsplat.renderer.layers import (
     Layers,
     device_array,
     host_array,
@@ -42,17 +40,20 @@ from mitsplat.render.layers import (
     render_layers,
     render_silhouettes,
 )
-from mitsplat.render.places import Backing, Finish, Place, draw_place, environment_at
-from mitsplat.render.textures import bitmap_texture, finished_mesh, material, texture_image
-from mitsplat.scene.appearance import Appearance, draw_appearances
-from mitsplat.scene.conveyor import Belt, carried, carried_by, carried_instances
+from mitsplat.renderer.lazy_value import Deferred
+from mitsplat.renderer.rays.device_arrays import plain_mesh
+from mitsplat.renderer.scene_emitters import emitter_dict, movable
+from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
+from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.lights import written_out
-from mitsplat.scene.scene import FramePlan, Scene, layout_of, plan_frame
+from mitsplat.scene.planning.conveyor import Belt, carried, carried_by, carried_instances
+from mitsplat.scene.planning.frame_lights import written_out
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.layout_surroundings import Backing, Finish, Place, draw_place, environment_at
+from mitsplat.scene.planning.object_appearance import Appearance, draw_appearances
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.scene.walls import backdrop_distance
-from mitsplat.spec.lights import EnvironmentLight, LightEntry, LightSpec
-from mitsplat.splats import Splats
-from mitsplat.variant import ensure_variant, one_at_a_time
 
 KEPT_LAYOUTS = 4
 """Settled layouts that a renderer keeps for further views of them."""
@@ -247,8 +248,9 @@ class Renderer:
         with ms.Renderer(scene, quality="balanced") as renderer:
             frames = [renderer.render(index) for index in range(12)]
 
-    It takes no device, because that is Mitsuba's variant, of which a process has one (see :mod:`mitsplat.variant`): a
-    second renderer could not keep to another. ``ms.use_device("cuda")`` before the first one takes the GPU.
+    It takes no device, because that is Mitsuba's variant, of which a process has one (see
+    :mod:`mitsplat.runtime.variant`): a second renderer could not keep to another. ``ms.use_device("cuda")`` before the
+    first one takes the GPU.
 
     Attributes:
         scene: The scene.

@@ -16,25 +16,26 @@ import numpy as np
 import trimesh
 
 from mitsplat.asset import Asset
-from mitsplat.colour import decode_srgb
-from mitsplat.device import Device
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError
-from mitsplat.files import library_errors, storage_errors, write_file
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
 from mitsplat.frames.untrusted_xml import check_xml
+from mitsplat.images.colour import decode_srgb
 from mitsplat.physics.settle import settle_layout
-from mitsplat.plugins.sensors import view_of
 from mitsplat.progress import Note
-from mitsplat.render.emitters import emitter_dict
-from mitsplat.render.layers import describe_sensor, ensure_variant
-from mitsplat.render.places import Finish, draw_place
-from mitsplat.render.textures import finished_mesh, material, texture_image
-from mitsplat.scene.appearance import draw_appearances
-from mitsplat.scene.conveyor import Belt, carried
-from mitsplat.scene.scene import Scene, layout_of, plan_frame
-from mitsplat.spec.shapes import Shape
+from mitsplat.renderer.layers import describe_sensor, ensure_variant
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.renderer.textures import finished_mesh, material, texture_image
+from mitsplat.runtime.device import Device
+from mitsplat.scene.planning.conveyor import Belt, carried
+from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
+from mitsplat.scene.planning.layout_surroundings import Finish, draw_place
+from mitsplat.scene.planning.object_appearance import draw_appearances
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.shape_spec import Shape
+from mitsplat.storage.files import library_errors, storage_errors, write_file
 
 
 def export_xml(scene: Scene, index: int, path: str | Path) -> None:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
-from mitsplat.masks import Silhouette
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.masks import Silhouette
 
 MOST_MOVED = 0.5
 """How far what is seen may move while a band is read [px]."""
@@ -62,7 +62,7 @@ def bands_of(camera: Camera, motion: Mapping[str, Any], swept: Sequence[npt.NDAr
 
     Args:
         camera: Where it is when the middle row is exposed.
-        motion: As :class:`mitsplat.scene.viewpoints.View` has it.
+        motion: As :class:`mitsplat.scene.planning.viewpoints.View` has it.
         swept: How far pixels move during an exposure then [px], see :func:`mitsplat.frames.flow.swept_by`.
     """
     readout = motion.get("readout", 0.0)
@@ -123,7 +123,7 @@ def project_by_row(
 
     Args:
         camera: Where it is when the middle row is exposed.
-        motion: As :class:`mitsplat.scene.viewpoints.View` has it.
+        motion: As :class:`mitsplat.scene.planning.viewpoints.View` has it.
         points: Where they are then [m].
         velocity: At which the points move [m/s], shape (3,).
     """

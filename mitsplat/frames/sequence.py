@@ -11,15 +11,16 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.frames.frame import Frame, Renderer
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
-from mitsplat.scene.conveyor import carried
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, layout_of, whole
-from mitsplat.scene.viewpoints import view_of
-from mitsplat.spec.lights import LightEntry
+from mitsplat.scene.planning.conveyor import carried
+from mitsplat.scene.planning.frame_plan import layout_of, whole
+from mitsplat.scene.planning.viewpoints import view_of
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import LightEntry
 
 Item = TypeVar("Item")
 Shot = tuple[int, Layout | None, Camera | None]

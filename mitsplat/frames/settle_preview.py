@@ -10,11 +10,11 @@ from typing import Any
 from PIL import Image
 from rich.table import Table
 
-from mitsplat.files import storage_errors, write_file
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import replay_layout
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
+from mitsplat.storage.files import storage_errors, write_file
 
 _INTERVAL = 0.04  # between pictures of a drop [s]; GIF counts in hundredths
 _PAUSE = 1500  # on the last picture [ms]

@@ -23,19 +23,19 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
-from mitsplat.camera import Camera
-from mitsplat.colour import encode_srgb
-from mitsplat.device import Device, current_device
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.files import storage_errors, write_file, write_text
 from mitsplat.frames.frame import render_frame
 from mitsplat.frames.volprim import render_volprim, volprim_scene
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
 from mitsplat.progress import Note, Progress
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.render.layers import Layers, ensure_variant, render_splats
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import Layers, ensure_variant, render_splats
+from mitsplat.runtime.device import Device, current_device
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.storage.files import storage_errors, write_file, write_text
 
 INSTANCE_MIN = 50
 """Instances of fewer pixels [px] count in no mask IoU."""
@@ -142,7 +142,7 @@ def measure_steps(
         overrides: Changes to the scene file by key, such as ``output.width``.
         allow_outside: Whether the scene may name files outside of its folder.
         progress: Hears (steps done, steps, name of the next).
-        device: Where; that of :func:`mitsplat.device.current_device` if None.
+        device: Where; that of :func:`mitsplat.runtime.device.current_device` if None.
 
     Raises:
         InputError: If the file is not as it should be, or ``frames`` is below 1.

@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 
 from mitsplat.asset import ASSET_FILE
 from mitsplat.errors import InputError
-from mitsplat.files import is_inside
+from mitsplat.storage.files import is_inside
 
 MAX_BYTES = 64 << 20
 """Of all files of a scene together, and of the texts that they become."""

@@ -7,9 +7,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.camera import Camera
-from mitsplat.splats import Splats
-from mitsplat.variant import ensure_variant
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.runtime.variant import ensure_variant
 
 
 def volprim_scene(splats: Splats, camera: Camera) -> Any:

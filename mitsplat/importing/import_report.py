@@ -13,13 +13,13 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
-from mitsplat.files import is_inside, write_text
-from mitsplat.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.mesh import mass_properties
 from mitsplat.importing.splat_import import Imported
-from mitsplat.mesh import mass_properties
-from mitsplat.reconstruct.evaluation import show_asset
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
+from mitsplat.pages.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
+from mitsplat.reconstruct.asset_evaluation import show_asset
+from mitsplat.storage.files import is_inside, write_text
 
 _VIEW = 420
 _REMOVED_SHOWN = 4

@@ -18,19 +18,19 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera, spiral
-from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import Axis, usual_up
+from mitsplat.geometry.camera import Camera, spiral
+from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.evaluation import AssetView, Thresholds, iou, is_closed, show_asset
+from mitsplat.reconstruct.asset_evaluation import AssetView, Thresholds, iou, is_closed, show_asset
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
-from mitsplat.render.layers import render_splats
-from mitsplat.splat_files import Axis, usual_up
-from mitsplat.splats import Splats
-from mitsplat.variant import one_at_a_time
+from mitsplat.renderer.layers import render_splats
+from mitsplat.runtime.variant import one_at_a_time
 
 FAINT = 1 / 255
 """Opacity below which a Gaussian is in no picture."""

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import Axis
 from mitsplat.reconstruct.segment_splats import visible_area
-from mitsplat.splat_files import Axis
-from mitsplat.splats import Splats
 
 POINTS = 4000
 """Gaussians that planes are looked for among, drawn by the area that they show."""

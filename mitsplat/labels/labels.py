@@ -26,8 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.labels.polygons import fill_polygon, outline
-from mitsplat.masks import (
+from mitsplat.images.masks import (
     BOUNDARY_TOLERANCE,
     Box,
     Silhouette,
@@ -37,10 +36,11 @@ from mitsplat.masks import (
     encode_mask,
     without_fragments,
 )
-from mitsplat.spec.spec import LabelRules as LabelRules
+from mitsplat.labels.polygons import fill_polygon, outline
+from mitsplat.scene.spec.scene_spec import LabelRules as LabelRules
 
 if TYPE_CHECKING:
-    from mitsplat.camera import Camera
+    from mitsplat.geometry.camera import Camera
     from mitsplat.scene.layout import Instance
 
 
@@ -88,7 +88,7 @@ class InstanceLabel:
         silhouette_area: Its pixels.
         depth_area: Pixels of ``amodal`` at which the image has a depth.
         agreement: IoU of the instance's masks by splats and by proxies.
-        boundary_f1: F1 score of their boundaries, see :func:`mitsplat.masks.boundary_f1`.
+        boundary_f1: F1 score of their boundaries, see :func:`mitsplat.images.masks.boundary_f1`.
         world_from_object: Rigid transform of the asset's coordinates to the world's [m], shape (4, 4).
         keypoints: Position [px] and visibility of the asset's named points, shape (K, 3): :data:`VISIBLE`,
             :data:`HIDDEN`, or :data:`UNLABELLED` at (0, 0).

@@ -15,18 +15,19 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
-from mitsplat.decomposition import MOST_PIECES, convex_pieces, widest_gap
 from mitsplat.errors import InputError
-from mitsplat.mesh import mass_properties, prepare_mesh
-from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
+from mitsplat.geometry.decomposition import MOST_PIECES, convex_pieces, widest_gap
+from mitsplat.geometry.mesh import mass_properties, prepare_mesh
+from mitsplat.geometry.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
-from mitsplat.scene.contents import draw_environment, draw_objects, draw_regions
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, LeftOut, NothingRests, RestCertificate
+from mitsplat.scene.planning.contents import draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
 
@@ -48,7 +49,7 @@ _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until the
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What physics needs of an asset; ``standoff`` as in :func:`mitsplat.mesh_distance.standoff`."""
+    """What physics needs of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
 
     body: Body
     surface: Surface

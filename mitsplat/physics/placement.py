@@ -11,10 +11,10 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.mesh_distance import ROUNDING, PlacedSurface, Surface, clearance
+from mitsplat.geometry.mesh_distance import ROUNDING, PlacedSurface, Surface, clearance
+from mitsplat.scene.spec.object_spec import Arrangement
+from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
-from mitsplat.spec.objects import Arrangement
-from mitsplat.spec.shapes import Region
 
 _PLACES = 200  # positions tried for an object before all are drawn anew
 _PLACES_IN_LAYER = 20  # of a pile
@@ -60,7 +60,7 @@ def draw_poses(
     Args:
         items: What to place.
         obstacles: What does not move.
-        regions: Where, and how, see :class:`mitsplat.spec.spec.Settle`; one region after the other.
+        regions: Where, and how, see :class:`mitsplat.scene.spec.scene_spec.Settle`; one region after the other.
         rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
         yaw: Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed; any if
             None.

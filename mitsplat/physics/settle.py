@@ -15,26 +15,28 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mitsplat.cache import cache_folder, keep_file
-from mitsplat.content_hash import ContentHash
 from mitsplat.engine.pool import run_frames
 from mitsplat.errors import InputError
 from mitsplat.progress import Note
+from mitsplat.runtime.variant import one_at_a_time
+from mitsplat.runtime.warp_start import quiet_warp
 from mitsplat.scene.layout import Layout, NothingRests
-from mitsplat.scene.scene import Scene, whole
-from mitsplat.spec.objects import Arrangement
-from mitsplat.variant import one_at_a_time
-from mitsplat.warp_start import quiet_warp
+from mitsplat.scene.planning.frame_plan import whole
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.object_spec import Arrangement
+from mitsplat.storage.cache import cache_folder, keep_file
+from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
 
 _OWN = ("contacts", "drop", "friction", "placement", "rest", "worlds")
 MODULES = (
-    "decomposition",
-    "mesh",
-    "mesh_distance",
+    "geometry.decomposition",
+    "geometry.mesh",
+    "geometry.mesh_distance",
     *(f"physics.{name}" for name in _OWN),
-    "scene.contents",
+    "scene.planning.contents",
+    "scene.splits",
     "scene.streams",
     "scene.walls",
 )

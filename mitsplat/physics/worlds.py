@@ -20,7 +20,7 @@ from newton.solvers import SolverMuJoCo
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.mesh import MassProperties, join_meshes
+from mitsplat.geometry.mesh import MassProperties, join_meshes
 from mitsplat.physics.contacts import ContactFinder, newton_hull
 from mitsplat.physics.friction import PairFrictionSolver, pair_friction
 

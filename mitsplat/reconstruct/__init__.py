@@ -7,7 +7,7 @@ to there.
 
 from __future__ import annotations
 
-from mitsplat.reconstruct.pipeline import make_asset, make_photo_asset
+from mitsplat.reconstruct.asset_from_photos import make_asset, make_photo_asset
 from mitsplat.reconstruct.reconstruct import Reconstruction, ReconstructSettings, reconstruct_asset
 
 __all__ = [

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
+from mitsplat.geometry.camera import Camera
 
 Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
 """Of each photo its camera, colours (H, W, 3) and mask (H, W), all of the same longest edge."""

@@ -21,19 +21,19 @@ from pydantic import Field
 from scipy.spatial import KDTree
 
 from mitsplat.arrays import Float64Array, Int64Array
-from mitsplat.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.errors import InputError
-from mitsplat.mesh_distance import Surface
-from mitsplat.plugins.device import plain_mesh, ray_scene
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.reconstruct.segment_splats import visible_area
-from mitsplat.render.emitters import emitter_dict
-from mitsplat.render.path_tracing import trace_radiance
-from mitsplat.spec.lights import EnvironmentLight, LightSpec
-from mitsplat.spec_types import StrictModel
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
-from mitsplat.variant import ensure_variant
-from mitsplat.yaml_input import load_yaml
+from mitsplat.renderer.path_tracing import trace_radiance
+from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene
+from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.runtime.variant import ensure_variant
+from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
+from mitsplat.storage.field_types import StrictModel
+from mitsplat.storage.yaml_input import load_yaml
 
 _REFLECTANCE = 0.5
 """Of the mesh, in light that it throws onto itself."""

@@ -11,19 +11,19 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
-from mitsplat.decomposition import convex_pieces
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.progress import Progress
+from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
 from mitsplat.reconstruct.causes import find_causes
-from mitsplat.reconstruct.evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
+from mitsplat.reconstruct.fallback_proxy import find_sound_surface
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
-from mitsplat.reconstruct.sound_surface import find_sound_surface
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface, simplify_surface
-from mitsplat.splats import Splats
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.mesh_distance import Surface
-from mitsplat.render.layers import render_splats
-from mitsplat.splats import Splats, split_similarity
+from mitsplat.gaussians.splat_cloud import Splats, split_similarity
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.renderer.layers import render_splats
 
 _OPAQUE = 0.9
 """Alpha of a pixel that shows a surface and no edge of it."""

@@ -23,16 +23,16 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import known_where
 from mitsplat.errors import InputError
-from mitsplat.plugins.backward import pack_cloud, render_differentiable
-from mitsplat.plugins.sensors import view_of
+from mitsplat.gaussians.spherical_harmonics import sh_basis
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.quality import Quality
-from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
-from mitsplat.spherical_harmonics import sh_basis
-from mitsplat.splats import Splats
+from mitsplat.renderer.differentiation.backward import pack_cloud, render_differentiable
+from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.rays.sensors import view_of
 
 INSIDE = 0.5
 """Least share of a Gaussian's visible weight that must fall inside the masks."""
@@ -176,7 +176,8 @@ class VisibleWeights:
         """Weight of each inside and outside the mask, where that is known, shape (N, 2) [px]."""
         colours = dr.zeros(mi.Float, 3 * self._count)
         dr.enable_grad(colours)
-        cloud = pack_cloud(*self._inputs, colours, 1)
+        means, quats, scales, opacities = self._inputs
+        cloud = pack_cloud(means, quats, scales, opacities, colours, 1)
         rgb, _ = render_differentiable(cloud, view_of(make_sensor(view.camera)), _QUALITY)
         inside, outside = np.where(view.known, view.mask, 0), np.where(view.known, 1 - view.mask, 0)
         own, other = (mi.Float(np.ravel(part).astype(np.float32)) for part in (inside, outside))

@@ -27,13 +27,13 @@ import numpy as np
 import trimesh
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.plugins.device import plain_mesh, ray_scene, wrapped
+from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.mend import mend_motion
+from mitsplat.reconstruct.fold_repair import mend_motion
 from mitsplat.reconstruct.segment_splats import MaskedView
-from mitsplat.render.layers import ensure_variant
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 
 _ROOM = 1.1
 """Radius that a view shows around the middle of the mesh, in radii of the mesh."""

@@ -26,13 +26,13 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.mesh import join_meshes
-from mitsplat.plugins.sensors import view_of
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh import join_meshes
 from mitsplat.progress import Progress
-from mitsplat.render.layers import ensure_variant, make_sensor, render_splats
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.rays.sensors import view_of
 
 _OPAQUE = 0.5
 """Alpha from which a pixel shows the splats' surface."""

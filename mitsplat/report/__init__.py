@@ -5,6 +5,6 @@ In: a dataset's folder. Out: one HTML file that needs no network, and warnings o
 
 from __future__ import annotations
 
-from mitsplat.report.report import write_report
+from mitsplat.report.dataset_report import write_report
 
 __all__ = ["write_report"]

@@ -13,8 +13,8 @@ import numpy as np
 from pycocotools import mask as coco_mask
 
 from mitsplat.arrays import Float64Array, Int64Array
-from mitsplat.files import Record
-from mitsplat.svg_charts import Histogram, bars, discs
+from mitsplat.pages.svg_charts import Histogram, bars, discs
+from mitsplat.storage.files import Record
 
 OCCLUDED = 0.05
 """Share of an instance's pixels in the image that are hidden if it is occluded."""

@@ -1,14 +1,16 @@
-"""What is to be rendered: a scene file becomes frozen values.
+"""Scenes: values, loading and planning.
 
 In: a YAML file and the asset folders that it names. Out: a :class:`Scene` (the checked specification with its assets
-and meshes), and for every frame a :class:`FramePlan` (camera, lights, draws) that the seed and the frame's index
-decide. A :class:`Layout` says where objects lie; physics makes it, and every later stage reads it.
+and meshes) and, for every frame, a :class:`FramePlan` (camera, lights, random draws) decided by the seed and the
+frame's index. A :class:`Layout` holds the poses of the objects; physics makes it, and all later stages read it.
 """
 
 from __future__ import annotations
 
 from mitsplat.scene.layout import Instance, Layout, RestCertificate
-from mitsplat.scene.scene import FramePlan, Scene, load_scene, plan_frame, scene_json_schema
+from mitsplat.scene.loading.scene_loading import load_scene, scene_json_schema
+from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
+from mitsplat.scene.scene import Scene
 
 __all__ = [
     "FramePlan",

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.given_poses import asset_named, rigid_pose
+from mitsplat.scene.given_poses import asset_named, rigid_pose
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene

@@ -10,10 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.spec.objects import ObjectPose
-from mitsplat.spec.shapes import Backdrop, Bin, Box, Enclosure, Region, Shape
-from mitsplat.spec.spec import BACKDROP, SceneSpec
-from mitsplat.spec_types import Vec3
+from mitsplat.scene.spec.object_spec import ObjectPose
+from mitsplat.scene.spec.scene_spec import BACKDROP, SceneSpec
+from mitsplat.scene.spec.shape_spec import Backdrop, Bin, Box, Enclosure, Region, Shape
+from mitsplat.storage.field_types import Vec3
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset

@@ -7,6 +7,6 @@ photos hardly show of the support, and a scene file that drops things where it i
 
 from __future__ import annotations
 
-from mitsplat.surroundings.pipeline import make_photo_surroundings, make_surroundings
+from mitsplat.surroundings.environment_from_photos import make_photo_surroundings, make_surroundings
 
 __all__ = ["make_photo_surroundings", "make_surroundings"]

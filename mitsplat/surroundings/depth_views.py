@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.camera import Camera
-from mitsplat.render.layers import Layers, render_splats
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import Layers, render_splats
 
 SIZE = 240
 """Longest edge of the pictures [px]."""

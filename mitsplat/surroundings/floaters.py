@@ -2,9 +2,8 @@
 
 A fit may explain what differs from photo to photo by haze, or by specks close to a camera. Haze is Gaussians so large
 that they reach through much of the place; a fit does not know it from those photos whose camera's plane it reaches
-(``plugins/backward.py``). Specks stand in free space: other photos see surfaces behind them (space carving, Kutulakos
-and Seitz 2000).
-Nothing goes that makes the photos come out worse.
+(``mitsplat/renderer/differentiation/backward.py``). Specks stand in free space: other photos see surfaces behind them
+(space carving, Kutulakos and Seitz 2000). Nothing goes that makes the photos come out worse.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Int64Array
 from mitsplat.capture.capture import Photo
 from mitsplat.fit.image_metrics import psnr
-from mitsplat.reconstruct.evaluation import HeldOutView, show_held_out
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_held_out
 from mitsplat.surroundings.depth_views import DepthView, depth_views
 
 _LARGEST = (2.0, 1.0, 0.6, 0.4, 0.3)

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, grey_closing
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
-from mitsplat.colour import encode_srgb
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
 from mitsplat.surroundings.coverage import ENOUGH, OFF
 from mitsplat.surroundings.depth_views import DepthView, render_sized
 from mitsplat.surroundings.supports import Support

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
-from mitsplat.colour import LUMINANCE
-from mitsplat.lighting.estimate import area_line, radiance_keys
+from mitsplat.capture.lighting.estimate import area_line, radiance_keys
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import LUMINANCE
 from mitsplat.surroundings.shading import ShadingLight
 from mitsplat.surroundings.supports import Support
 

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.progress import Progress
-from mitsplat.splats import Splats
 from mitsplat.surroundings.coverage import OFF, TALL
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views
 from mitsplat.surroundings.ground import CELL, Grid, Ground

@@ -18,8 +18,8 @@ from scipy.optimize import nnls
 from scipy.stats import qmc
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.colour import LUMINANCE
-from mitsplat.lighting.lamps import rectangle_axes
+from mitsplat.capture.lighting.lamps import rectangle_axes
+from mitsplat.images.colour import LUMINANCE
 
 _DISTANCES = (1.0, 1.5, 2.2, 3.3)
 """From the middle to candidates [m]."""

@@ -16,7 +16,7 @@ import trimesh
 from scipy.ndimage import binary_closing, binary_opening, label
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.camera import direction
+from mitsplat.geometry.camera import direction
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 

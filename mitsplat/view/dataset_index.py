@@ -12,10 +12,10 @@ import numpy as np
 from mitsplat.arrays import ByteImage
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.errors import InputError
-from mitsplat.files import Record, file_inside
+from mitsplat.images.picture_files import read_picture
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour, draw_labels
-from mitsplat.picture_files import read_picture
+from mitsplat.storage.files import Record, file_inside
 
 OverlayName = Literal["labels", "silhouettes", "none"]
 OVERLAYS: tuple[OverlayName, ...] = get_args(OverlayName)

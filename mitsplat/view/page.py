@@ -14,11 +14,11 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import ByteImage, Float64Array
-from mitsplat.camera import Camera
-from mitsplat.splat_files import Axis
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import Axis
+from mitsplat.geometry.camera import Camera
 from mitsplat.view.guard import Guard, check_address, guarded
-from mitsplat.view.parts import (
+from mitsplat.view.scene_parts import (
     HIDDEN_FIRST,
     Cloud,
     Frustum,

@@ -9,16 +9,17 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.frames.frame import Frame, Renderer
+from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.quality import PRESETS, PresetName
-from mitsplat.scene.conveyor import carried
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, plan_frame
-from mitsplat.spec.lights import LightSpec
+from mitsplat.scene.planning.conveyor import carried
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import LightSpec
 
 Request = TypeVar("Request")
 Result = TypeVar("Result")

@@ -13,18 +13,20 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.frames.layer_sheet import LAYERS, LayerName, draw_layer
+from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import replay_layout
 from mitsplat.quality import PRESETS, PresetName
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, load_scene, plan_frame
-from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec, PointLight, SpotLight
-from mitsplat.spec.objects import PRIMITIVES
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, PointLight, SpotLight
+from mitsplat.scene.spec.object_spec import PRIMITIVES
 from mitsplat.view.page import Page
-from mitsplat.view.parts import Part, camera_parts, scene_parts
 from mitsplat.view.previews import PAUSES, NewestFirst, Preview, SceneRenders, ViewRequest, presets_up_to
+from mitsplat.view.scene_parts import Part, camera_parts, scene_parts
 from mitsplat.view.yaml_lines import camera_lines, light_line, rounded, seed_line
 
 _INTERVAL = 0.04

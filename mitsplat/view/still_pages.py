@@ -14,13 +14,13 @@ import numpy as np
 from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.choice import chosen_object, pick_along
+from mitsplat.capture.picking import chosen_object, pick_along
 from mitsplat.errors import InputError
-from mitsplat.splat_files import Axis, usual_up
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import Axis, usual_up
 from mitsplat.view.dataset_index import OVERLAYS, DatasetIndex, Filter, OverlayName
 from mitsplat.view.page import Page
-from mitsplat.view.parts import Cloud, Frustum, Part, Points, asset_parts, capture_parts
+from mitsplat.view.scene_parts import Cloud, Frustum, Part, Points, asset_parts, capture_parts
 
 _ANY = "any"
 _EDGE = 960

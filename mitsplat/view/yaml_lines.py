@@ -11,8 +11,8 @@ import numpy.typing as npt
 from ruamel.yaml import YAML
 
 from mitsplat.arrays import Float64Array
-from mitsplat.spec.camera import Intrinsics
-from mitsplat.spec.lights import LightSpec
+from mitsplat.scene.spec.camera_spec import Intrinsics
+from mitsplat.scene.spec.light_spec import LightSpec
 
 
 def light_line(light: LightSpec) -> str:

@@ -12,10 +12,10 @@ import numpy as np
 import mitsplat
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
-from mitsplat.camera import Camera
-from mitsplat.render.layers import ensure_variant
-from mitsplat.spec.spec import SceneSpec
-from mitsplat.yaml_input import load_yaml
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.storage.yaml_input import load_yaml
 from scenes.build.parts import PARTS, build_part
 from scenes.build.workcell import build_workcell, densities
 

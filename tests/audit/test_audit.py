@@ -17,7 +17,7 @@ from pycocotools import mask as coco_mask
 
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.errors import InputError
-from mitsplat.files import Record
+from mitsplat.storage.files import Record
 from tests.cli.typed import run
 
 

@@ -15,19 +15,19 @@ from pycocotools import mask as coco_mask
 from scipy.spatial.transform import Rotation
 
 import mitsplat
-from mitsplat import camera
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.formats import bop, coco, colmap, label_studio, maps, voc, yolo
 from mitsplat.formats import registry as writers
 from mitsplat.frames import frame
+from mitsplat.geometry import camera
 from mitsplat.labels import labels as label
 from mitsplat.scene.scene import Scene
-from mitsplat.spec.camera import Intrinsics
-from mitsplat.spec.image import TimeOfFlightSensor
-from mitsplat.spec.spec import FORMATS
+from mitsplat.scene.spec.camera_spec import Intrinsics
+from mitsplat.scene.spec.image_spec import TimeOfFlightSensor
+from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 

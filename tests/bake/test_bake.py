@@ -13,18 +13,18 @@ from scipy.spatial.transform import Rotation
 import mitsplat
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.parts import bake_lights, mitsuba_scene, read_parts
-from mitsplat.camera import Camera
-from mitsplat.colour import encode_srgb
+from mitsplat.bake.mesh_parts import bake_lights, mitsuba_scene, read_parts
 from mitsplat.errors import InputError
-from mitsplat.mesh_normals import CREASE_ANGLE, corner_normals
-from mitsplat.render.emitters import emitter_dict
-from mitsplat.render.layers import ensure_variant
-from mitsplat.render.path_tracing import render_mesh, trace_radiance
-from mitsplat.spec.lights import AreaLight, EnvironmentLight
-from mitsplat.spherical_harmonics import evaluate_sh
-from mitsplat.splats import Splats
-from mitsplat.surfels import place_surfels, poisson_subset
+from mitsplat.gaussians.spherical_harmonics import evaluate_sh
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.surfels import place_surfels, poisson_subset
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
+from mitsplat.images.colour import encode_srgb
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.path_tracing import render_mesh, trace_radiance
+from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight
 
 FACE_COLOURS = np.array(
     [[230, 40, 40], [40, 200, 60], [50, 70, 220], [220, 200, 40], [40, 200, 210], [200, 60, 200]], dtype=np.uint8

@@ -14,12 +14,12 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
-from mitsplat.bake.materials import Finish, read_material
-from mitsplat.bake.parts import Part, read_parts
-from mitsplat.bake.report import write_bake_report
-from mitsplat.colour import decode_srgb
+from mitsplat.bake.bake_report import write_bake_report
+from mitsplat.bake.mesh_parts import Part, read_parts
+from mitsplat.bake.surface_materials import Finish, read_material
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
+from mitsplat.images.colour import decode_srgb
 
 COLOUR = (200, 120, 40)
 QUICK = BakeSettings(gaussians=300, sh_degree=0, directions=8, samples=4, fit_steps=0, fit_views=1, verify_views=1)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from mitsplat.bake.parts import Part
+from mitsplat.bake.mesh_parts import Part
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import Surface
 
 
 def test_a_scan_of_many_faces_stays_closed() -> None:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.choice import chosen_object, pick_along
+from mitsplat.capture.picking import chosen_object, pick_along
 from mitsplat.errors import InputError
-from tests.isolation.balls import THINGS, capture_of_balls, ground
+from tests.capture.isolation.balls import THINGS, capture_of_balls, ground
 
 EYE = np.array([0.5, -0.4, 0.5])
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.exposure import even_exposure, relative_gains
-from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import decode_srgb, encode_srgb
 
 COUNT, POINTS = 9, 120
 

@@ -12,9 +12,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mitsplat.boards.targets import Board, find_tags
-from mitsplat.camera import Camera
 from mitsplat.capture import metric_frame as anchor
+from mitsplat.capture.boards.targets import Board, find_tags
 from mitsplat.capture.metric_frame import (
     find_metric_frame,
     find_table,
@@ -23,7 +22,8 @@ from mitsplat.capture.metric_frame import (
 )
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
-from mitsplat.triangulation import meeting_point, triangulate
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.triangulation import meeting_point, triangulate
 
 BOARD = Board(6, 4, 0.03)
 LOST = np.eye(4)

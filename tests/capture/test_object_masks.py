@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.masks import agreed_masks, geometric_masks, object_masks, object_points
-from mitsplat.capture.pipeline import CaptureResult, _hidden_parts
+from mitsplat.capture.capture_photos import CaptureResult, _hidden_parts
+from mitsplat.capture.isolation import ChosenObject
+from mitsplat.capture.photo_masks import agreed_masks, geometric_masks, object_masks, object_points
 from mitsplat.errors import InputError
-from mitsplat.isolation import ChosenObject
-from mitsplat.reconstruct.evaluation import iou
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import iou
 from tests import rendered
 
 

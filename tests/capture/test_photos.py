@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
 from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 
 
 def texture(seed: int = 0, size: tuple[int, int] = (60, 80)) -> np.ndarray:

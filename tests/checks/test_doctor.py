@@ -10,10 +10,10 @@ import pytest
 from mitsplat.checks import doctor
 from mitsplat.checks.doctor import examine
 from mitsplat.checks.trial import KNOWN, TOLERANCE, render_trial, trial_faults, trial_means
-from mitsplat.device import Gpu, Lack
 from mitsplat.engine import resources
 from mitsplat.engine.resources import unused_memory
-from mitsplat.plugins.proxies import Proxies
+from mitsplat.renderer.occluders.proxies import Proxies
+from mitsplat.runtime.device import Gpu, Lack
 
 
 def found():

@@ -8,9 +8,9 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.checks.preflight import SIZES, check_asset, check_scene
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
+from mitsplat.checks.path_checks import SIZES, check_asset, check_scene
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
 from tests.cli.typed import run
 from tests.conftest import box_asset
 

@@ -12,7 +12,7 @@ from mitsplat.capture.capture import Capture
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.write import DatasetSummary
 from mitsplat.fit import trainer as fit
-from mitsplat.fit.folder import FitResult
+from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.training_view import HeldOut
 from tests.cli.typed import Calls
 from tests.conftest import WriteScene, box_asset

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from mitsplat import device as devices
 from mitsplat.cli import main
 from mitsplat.errors import InputError
 from mitsplat.frames import frame
+from mitsplat.runtime import device as devices
 from tests.cli.typed import Calls, run
 
 

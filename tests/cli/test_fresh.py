@@ -13,7 +13,7 @@ import pytest
 
 import mitsplat
 from mitsplat.errors import InputError
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import WriteScene, box_asset
 
 ROOT = Path(__file__).parents[2]
@@ -214,7 +214,7 @@ except RuntimeError as error:
 
 FAULT = """
 from mitsplat.cli import main
-from mitsplat.boards import targets as board
+from mitsplat.capture.boards import targets as board
 
 def write_pdf(*args):
     raise ZeroDivisionError("on purpose\\nat length")

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from mitsplat.asset import Asset
-from mitsplat.capture.pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.capture_photos import CaptureSettings, capture_photos
+from mitsplat.capture.lighting import refuse_to_replace
+from mitsplat.capture.video import choose_frames
 from mitsplat.errors import InputError, MissingResourceError, exit_status
-from mitsplat.files import write_file, write_text
-from mitsplat.fit.folder import FitFolder
-from mitsplat.lighting import refuse_to_replace
-from mitsplat.video import choose_frames
+from mitsplat.fit.fit_folder import FitFolder
+from mitsplat.storage.files import write_file, write_text
 from tests.cli.typed import run
 from tests.conftest import WriteScene, box_asset, contents
 

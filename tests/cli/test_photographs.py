@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from mitsplat import surroundings
-from mitsplat.boards.targets import Board
-from mitsplat.capture import pipeline as capturing
+from mitsplat.capture import capture_photos as capturing
+from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.pipeline import CaptureSettings
+from mitsplat.capture.capture_photos import CaptureSettings
 from mitsplat.cli.options import stage_bar
 from mitsplat.errors import InputError
 from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
 from mitsplat.fit.depth_priors import DepthMaps
 from mitsplat.fit.trainer import FitProgress, FitSettings
-from mitsplat.reconstruct import pipeline
-from mitsplat.reconstruct.evaluation import Verdict
-from mitsplat.reconstruct.pipeline import AssetResult
+from mitsplat.reconstruct import asset_from_photos as pipeline
+from mitsplat.reconstruct.asset_evaluation import Verdict
+from mitsplat.reconstruct.asset_from_photos import AssetResult
 from mitsplat.reconstruct.surface import SurfaceSettings
 from tests.cli.typed import Calls, run
 from tests.conftest import box_asset

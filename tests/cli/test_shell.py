@@ -23,19 +23,19 @@ import trimesh
 import typer.main
 from ruamel.yaml import YAML
 
-from mitsplat.checks.preflight import check_scene
+from mitsplat.capture.lighting.panorama import write_exr
+from mitsplat.checks.path_checks import check_scene
 from mitsplat.cli import app
-from mitsplat.lighting.panorama import write_exr
+from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.physics.settle import settle_layout
-from mitsplat.scene.scene import load_scene
-from mitsplat.surfels import place_surfels
+from mitsplat.scene.loading.scene_loading import load_scene
 from tests import rendered
+from tests.capture.lighting import room
 from tests.cli.typed import run as type_in
 from tests.conftest import box_asset
-from tests.lighting import room
 
 if TYPE_CHECKING:
-    from mitsplat.capture.pipeline import CaptureResult
+    from mitsplat.capture.capture_photos import CaptureResult
 
 ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts))

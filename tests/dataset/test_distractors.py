@@ -15,15 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset import frame_job
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.formats.registry import write_frame
-from mitsplat.scene.contents import draw_objects
 from mitsplat.scene.layout import Instance, Layout
+from mitsplat.scene.planning.contents import draw_objects
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.scene.streams import random_stream
-from mitsplat.spec.spec import FORMATS
 from tests.conftest import box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes
 from tests.synthetic import CERTIFICATE

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from mitsplat.audit import audit_dataset
-from mitsplat.camera import Camera
 from mitsplat.dataset.given_frames import write_frames
 from mitsplat.errors import InputError
 from mitsplat.frames.sequence import render_frames
+from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
-from mitsplat.spec.camera import Motion
-from mitsplat.spec.spec import FORMATS
+from mitsplat.scene.spec.camera_spec import Motion
+from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes
 

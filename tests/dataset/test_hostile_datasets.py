@@ -20,9 +20,9 @@ from mitsplat.dataset.shards import merge_shards
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError, PartialResultError
-from mitsplat.files import DEEPEST_JSON, open_in_place, parse_json, read_json, write_file
-from mitsplat.report.report import write_report
-from mitsplat.scene.scene import load_scene
+from mitsplat.report.dataset_report import write_report
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.storage.files import DEEPEST_JSON, open_in_place, parse_json, read_json, write_file
 from mitsplat.view.dataset_index import DatasetIndex
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, write

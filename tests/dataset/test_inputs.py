@@ -15,9 +15,9 @@ from mitsplat.asset import Asset
 from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.errors import InputError
 from mitsplat.frames.mitsuba_xml import export_xml
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import box_asset
 from tests.dataset.test_write import never_render, write
 

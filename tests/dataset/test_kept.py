@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.folds import write_folds
 from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.shards import merge_shards
@@ -18,7 +18,8 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.engine.ray import Cluster
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.mitsuba_xml import render_xml
-from mitsplat.scene.scene import Scene, make_scene
+from mitsplat.scene.loading.scene_loading import make_scene
+from mitsplat.scene.scene import Scene
 from tests.cli.typed import run
 from tests.conftest import BOTH, contents, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.manifest import encode_line, parse_line
 from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 from mitsplat.errors import InputError
-from mitsplat.report.report import write_report
+from mitsplat.report.dataset_report import write_report
 from mitsplat.scene.layout import Layout, LeftOut, NothingRests
 from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, small_scene

@@ -9,17 +9,18 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.camera import Camera
-from mitsplat.checks.preflight import check_scene
-from mitsplat.dataset import prospects
+from mitsplat.checks.path_checks import check_scene
+from mitsplat.dataset import preflight as prospects
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.prospects import disk_faults, doubts, image_faults, refuse, run_faults, sees
+from mitsplat.dataset.preflight import disk_faults, doubts, image_faults, refuse, run_faults, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames import speed_accuracy as chart
-from mitsplat.mesh_points import points_inside
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
-from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
 from tests.bodies import pose_at
 from tests.cli.typed import run
 from tests.dataset.test_write import render, settle

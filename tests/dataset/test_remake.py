@@ -12,7 +12,8 @@ import pytest
 from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
-from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, WriteScene, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 

@@ -17,8 +17,8 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.folds import assign_folds, write_folds
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
-from mitsplat.scene.scene import load_scene
-from mitsplat.spec.spec import FORMATS, HoldOut
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.spec.scene_spec import FORMATS, HoldOut
 from tests.audit.test_audit import records_of, store
 from tests.cli.typed import run
 from tests.conftest import box_asset, small_scene

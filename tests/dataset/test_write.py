@@ -16,24 +16,26 @@ import pytest
 from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
-from mitsplat import device as devices
-from mitsplat.dataset import folder, manifest
+from mitsplat.dataset import dataset_folder as folder
+from mitsplat.dataset import manifest
 from mitsplat.dataset.manifest import Manifest
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import write_dataset
-from mitsplat.device import Device, Gpu
 from mitsplat.engine import pool
 from mitsplat.engine.pool import FrameError
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.files import SPLITS
 from mitsplat.formats.yolo import data_yaml
 from mitsplat.frames.layer_sheet import layer_sheet
+from mitsplat.images.masks import Silhouette
 from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
 from mitsplat.labels.overlay import class_colour, draw_labels
-from mitsplat.masks import Silhouette
+from mitsplat.runtime import device as devices
+from mitsplat.runtime.device import Device, Gpu
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.scene import load_scene, plan_frame
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.streams import random_stream
+from mitsplat.storage.files import SPLITS
 from tests.synthetic import CERTIFICATE, frame_around
 
 PARSE_LINE = manifest.parse_line

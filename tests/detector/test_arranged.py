@@ -10,10 +10,10 @@ import pytest
 import trimesh
 
 from benchmarks.detector import arranged, meshes
-from mitsplat.bake.parts import Part
-from mitsplat.colour import encode_srgb
-from mitsplat.scene.appearance import Appearance
+from mitsplat.bake.mesh_parts import Part
+from mitsplat.images.colour import encode_srgb
 from mitsplat.scene.layout import Instance
+from mitsplat.scene.planning.object_appearance import Appearance
 
 BOX = trimesh.creation.box((0.06, 0.08, 0.12))
 

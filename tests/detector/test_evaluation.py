@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.detector.evaluation import Evaluation, evaluate_detector, truth_of, write_evaluation
-from mitsplat.detector.report import worst_images
+from mitsplat.detector.detector_evaluation import Evaluation, evaluate_detector, truth_of, write_evaluation
+from mitsplat.detector.detector_report import worst_images
 from mitsplat.detector.scores import Confusion, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set
 from mitsplat.errors import InputError

@@ -23,7 +23,7 @@ from benchmarks import record
 from benchmarks.detector import __main__ as side_by_side
 from benchmarks.detector import experiment, workshop
 from benchmarks.detector.packages import make_bag, make_package, relabel
-from mitsplat.spec.spec import SceneSpec
+from mitsplat.scene.spec.scene_spec import SceneSpec
 
 PLANS = [experiment.PLAN, Path("workshop.yaml")]
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mitsplat.detector.photo_tiles import cut_photographs
 from mitsplat.detector.sets import Instance, LabelledSet, Sample, read_set
-from mitsplat.detector.tiles import cut_photographs
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from tests.detector.painted import HEIGHT, WIDTH, paint, write_coco, write_yolo

@@ -20,15 +20,15 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsplat.cli import app
-from mitsplat.content_hash import file_hash
 from mitsplat.detector import libraries
-from mitsplat.detector.evaluation import evaluate_detector, truth_of
+from mitsplat.detector.detector_evaluation import evaluate_detector, truth_of
 from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.scores import average_precision
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import RUN, Run, TrainSettings, open_run, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.storage.content_hash import file_hash
 from tests.conftest import contents
 from tests.detector.painted import write_coco, write_yolo
 

@@ -9,28 +9,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsplat.camera import Camera
 from mitsplat.checks import doctor
 from mitsplat.engine import pool as engine
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.frames import budget
 from mitsplat.frames.budget import worker_memory
-from mitsplat.plugins.gaussian import upload_cloud
-from mitsplat.plugins.project import Placement, merge_clouds
-from mitsplat.plugins.sensors import view_of
-from mitsplat.plugins.tiles import bin_gaussians
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS
-from mitsplat.render.layers import make_sensor
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.renderer.splatting.gaussian import upload_cloud
+from mitsplat.renderer.splatting.projection import Placement, merge_clouds
+from mitsplat.renderer.splatting.tiles import bin_gaussians
+from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 
 CHILD = """
 import sys, numpy as np
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
-from mitsplat.render.layers import make_sensor
-from mitsplat.scene.scene import load_scene
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 scene = load_scene(sys.argv[1])
 poses = [np.eye(4) for _ in range(6)]

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from mitsplat.device import VISIBLE, Device, Gpu
 from mitsplat.engine import mps
 from mitsplat.engine.mps import CONTROL, PIPES, SharedGpu
 from mitsplat.engine.pool import run_frames
+from mitsplat.runtime.device import VISIBLE, Device, Gpu
 
 SERVICE = """#!/bin/sh
 # Notes what it is told; serves once it was started, where its environment says.

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsplat.device import CPU, Device, Gpu, Lack, visible_gpus
 from mitsplat.engine import pool as engine
 from mitsplat.engine.pool import Failure, Finished, FrameError, LostWorkersError, run_frames, run_pool
 from mitsplat.engine.resources import TYPICAL
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.runtime.device import CPU, Device, Gpu, Lack, visible_gpus
 
 LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsplat.dataset.folder import Shard
+from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames
 from mitsplat.dataset.manifest import Manifest, encode_line
 from mitsplat.dataset.shards import merge_shards
@@ -28,8 +28,9 @@ from mitsplat.engine.ray import Cluster
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import Renderer
-from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.spec.spec import FORMATS
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.cli.typed import run
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, render, settle, write

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from mitsplat.asset import Asset
-from mitsplat.cache import cache_folder
 from mitsplat.engine import shared_arrays
 from mitsplat.engine.pool import run_frames
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.storage.cache import cache_folder
 from tests.conftest import box_asset
 
 MIB = 2**20

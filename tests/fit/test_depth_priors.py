@@ -12,7 +12,6 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.depth_network import DepthNetwork, model_maps
@@ -26,6 +25,7 @@ from mitsplat.fit.depth_priors import (
     read_map,
     resize_map,
 )
+from mitsplat.geometry.camera import Camera
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.look_at((0, -2, 1), (0, 0, 0), width=WIDTH, height=HEIGHT, fov_x=50)

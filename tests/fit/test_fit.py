@@ -17,20 +17,20 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.colour import encode_srgb
 from mitsplat.errors import InputError
 from mitsplat.fit import strategy_classic as densify_classic
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.depth_priors import DepthMaps, align_maps
-from mitsplat.fit.folder import FitResult
+from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.fit.training_view import TrainingView
-from mitsplat.render.layers import ensure_variant, render_splats
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
+from mitsplat.renderer.layers import ensure_variant, render_splats
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 20
 SMALL = FitSettings(gaussians=800, iterations=60, sh_degree=1, refine_every=10, coarse=0.1)

@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.capture.capture import Capture
 from mitsplat.fit import trainer as fit
-from mitsplat.fit.folder import FitResult
+from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.fit.trainer import FitSettings, fit_capture
-from mitsplat.render.layers import render_splats
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.renderer.layers import render_splats
 from tests.fit.test_fit import SMALL, photograph, seeing
 
 BOTH = pytest.mark.parametrize("densification", ["mcmc", "classic"])

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsplat.camera import Camera
-from mitsplat.colour import encode_srgb
 from mitsplat.fit.refine_splats import QUALITY, Picture, RefineSettings, refine_splats
-from mitsplat.render.layers import render_splats
-from mitsplat.splats import Splats
-from tests.render.test_render import make_splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
+from mitsplat.renderer.layers import render_splats
+from tests.renderer.test_render import make_splats
 
 
 def cameras(count: int) -> list[Camera]:

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.strategy_classic import Classic, control_density, image_gradient, lower_opacities
 from mitsplat.fit.strategy_mcmc import seed_splats
-from mitsplat.render.layers import ensure_variant, make_sensor
-from mitsplat.splats import Splats
-from tests.plugins.test_backward import QUALITY, loss_of_twin, separated, weights
-from tests.render.test_render import CAMERA
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.renderer.layers import ensure_variant, make_sensor
+from tests.renderer.test_backward import QUALITY, loss_of_twin, separated, weights
+from tests.renderer.test_render import CAMERA
 
 UNIT = 0.7
 
@@ -24,8 +24,8 @@ UNIT = 0.7
 def tracked(splats: Splats) -> GaussianModel:
     """A model with the gradients of the loss of :func:`loss_of_twin`."""
     ensure_variant()
-    from mitsplat.plugins.backward import render_differentiable
     from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.differentiation.backward import render_differentiable
 
     own = GaussianModel(splats, UNIT)
     own.track()

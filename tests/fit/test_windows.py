@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Photo
 from mitsplat.fit.depth_priors import crop_map
 from mitsplat.fit.trainer import FitSettings, _training_view
 from mitsplat.fit.windows import object_windows
+from mitsplat.geometry.camera import Camera
 
 BOXES = {"left": (0, 20, 30, 50), "middle": (70, 40, 110, 60), "large": (60, 10, 120, 74)}
 

@@ -20,20 +20,20 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.files import Record
 from mitsplat.formats import coco, maps, voc
 from mitsplat.formats.registry import Catalogue, CollectionWriter, write_frame
 from mitsplat.formats.yolo import rotated_box
 from mitsplat.frames.flow import optical_flow
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.masks import Silhouette
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
 from mitsplat.labels.polygons import fill_polygon
-from mitsplat.masks import Silhouette
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import load_scene
-from mitsplat.spec.image import StereoSensor
-from mitsplat.spec.spec import FORMATS
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.spec.image_spec import StereoSensor
+from mitsplat.scene.spec.scene_spec import FORMATS
+from mitsplat.storage.files import Record
 from tests.labels.test_labels import Seen, read_yolo, resample, whole
 from tests.synthetic import CERTIFICATE, frame_around
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import mitsplat as ms
-from mitsplat.colour import decode_srgb
 from mitsplat.frames.background import cut_out
-from mitsplat.render.places import Backing
+from mitsplat.images.colour import decode_srgb
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
+from mitsplat.scene.planning.layout_surroundings import Backing
 from tests.conftest import WriteScene
 
 
@@ -45,7 +45,7 @@ def test_the_part_that_is_shown(angle: float, size: tuple[int, int], crop: float
     """Of a ramp, colours say where they are from: a turned rectangle of the picture's proportions, inside of it."""
     width, height = 80, 60
     colours = cut_out(ramp(*size), backing(rotate=angle, crop=crop, place=place), width, height)
-    from mitsplat.colour import encode_srgb
+    from mitsplat.images.colour import encode_srgb
 
     shown = encode_srgb(colours)[..., :2] * size
     rounding = np.array(size) / 255 + 0.5

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsplat.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
 from mitsplat.frames.camera_response import (
     GREY,
     SENSOR,
@@ -27,8 +26,9 @@ from mitsplat.frames.camera_response import (
     shadow_from_image,
     tone_curve,
 )
-from mitsplat.render.layers import Layers, device_array, host_array
-from mitsplat.spec.image import Composite, ImageShadow, Sensor
+from mitsplat.images.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
+from mitsplat.renderer.layers import Layers, device_array, host_array
+from mitsplat.scene.spec.image_spec import Composite, ImageShadow, Sensor
 
 
 def encode(linear: np.ndarray) -> np.ndarray:

@@ -13,13 +13,13 @@ import pytest
 
 import mitsplat as ms
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.camera import Camera
 from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.flow import UNKNOWN_FLOW, swept_by
-from mitsplat.scene.conveyor import Belt
+from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.spec.shapes import Box
+from mitsplat.scene.planning.conveyor import Belt
+from mitsplat.scene.spec.shape_spec import Box
 from tests.audit.test_audit import records_of, store
 from tests.conftest import WriteScene
 

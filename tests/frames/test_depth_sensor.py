@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.frames.depth_sensor import (
     LIGHT_SPEED,
@@ -17,8 +16,9 @@ from mitsplat.frames.depth_sensor import (
     stereo_depth,
     time_of_flight_depth,
 )
-from mitsplat.scene.scene import load_scene
-from mitsplat.spec.image import StereoSensor, TimeOfFlightSensor
+from mitsplat.geometry.camera import Camera
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.spec.image_spec import StereoSensor, TimeOfFlightSensor
 from tests.conftest import WriteScene
 
 FOCAL = 400.0

@@ -15,18 +15,18 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 import mitsplat as ms
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.camera_response import develop, light_image
 from mitsplat.frames.frame import NOTHING
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
+from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS
-from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers
-from mitsplat.scene.scene import FramePlan
-from mitsplat.spec.lights import LightSpec
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.scene.planning.frame_plan import FramePlan
+from mitsplat.scene.spec.light_spec import LightSpec
 from tests.conftest import WriteScene
-from tests.render.test_render import make_splats
+from tests.renderer.test_render import make_splats
 
 
 @pytest.fixture(scope="module")

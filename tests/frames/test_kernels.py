@@ -11,12 +11,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.camera import Camera
 from mitsplat.frames.frame import Renderer
-from mitsplat.render.layers import render_layers, render_silhouettes
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import render_layers, render_silhouettes
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightDraw
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw
 
 WORKCELL = Path(__file__).parents[2] / "scenes/workcell.yaml"
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mitsplat.camera import Camera
 from mitsplat.frames.camera_response import _drawn_apart, _smeared, develop
 from mitsplat.frames.flow import optical_flow, swept_by
-from mitsplat.render.layers import device_array, host_array
-from mitsplat.scene.viewpoints import moved_by
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import device_array, host_array
+from mitsplat.scene.planning.viewpoints import moved_by
 
 SHAPE = 23, 31
 

@@ -14,13 +14,13 @@ import pytest
 
 import mitsplat as ms
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.colour import encode_srgb
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.mitsuba_xml import export_xml
-from mitsplat.render.places import draw_place
-from mitsplat.scene.contents import draw_regions
+from mitsplat.images.colour import encode_srgb
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.spec.spec import FORMATS
+from mitsplat.scene.planning.contents import draw_regions
+from mitsplat.scene.planning.layout_surroundings import draw_place
+from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]

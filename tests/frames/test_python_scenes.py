@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 import mitsplat as ms
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.flow import UNKNOWN_FLOW, motions_of, optical_flow
-from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.spec.camera import CameraOrbit, Motion
-from mitsplat.spec.lights import AreaLight
-from mitsplat.spec.shapes import Shape
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.spec.camera_spec import CameraOrbit, Motion
+from mitsplat.scene.spec.light_spec import AreaLight
+from mitsplat.scene.spec.shape_spec import Shape
 from tests.conftest import WriteScene, box_asset
 from tests.drawn import render_boxes, scatter_boxes
 

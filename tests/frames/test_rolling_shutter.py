@@ -12,14 +12,14 @@ import pytest
 
 import mitsplat as ms
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.camera import Camera
 from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.frames import rolling_shutter
 from mitsplat.frames.rolling_shutter import Band, bands_of, project_by_row, stacked_silhouettes
-from mitsplat.masks import Silhouette
-from mitsplat.render.layers import Layers, render_layers
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.masks import Silhouette
+from mitsplat.renderer.layers import Layers, render_layers
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from tests.conftest import WriteScene
 from tests.frames.test_conveyor import belt_data as belt_data

@@ -16,7 +16,7 @@ from mitsplat.cli import app
 from mitsplat.errors import InputError
 from mitsplat.frames.speed_accuracy import Row, Step, cheapest, curve_of, draw_chart, measure_steps, tolerance_steps
 from mitsplat.quality import PRESETS
-from tests.render.test_render import make_splats
+from tests.renderer.test_render import make_splats
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mitsplat.frames.frame import render_frame
-from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.scene import Scene
 from tests.conftest import WriteScene
 
 torch = pytest.importorskip("torch", reason="the extra torch is not installed")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from mitsplat.camera import Camera  # sets up LLVM before Dr.Jit
+from mitsplat.geometry.camera import Camera  # sets up LLVM before Dr.Jit
 
 import mitsuba as mi
 import numpy as np
@@ -24,11 +24,11 @@ from ruamel.yaml import YAML
 
 # isort: on
 import mitsplat as ms
-from mitsplat.lost_rays import refuse_lost_rays
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
-from mitsplat.render.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
-from mitsplat.splats import Splats
-from tests.plugins.test_light import WHITE_SKY, floor, nothing, slab
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
+from mitsplat.runtime.dropped_rays import refuse_lost_rays
+from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
 
 SIZE = 160, 120
 Arrays = dict[str, np.ndarray]
@@ -103,7 +103,7 @@ def silhouettes(source: str) -> Arrays:
 
 
 def gradients() -> Arrays:
-    from tests.plugins.test_backward import gradients, separated
+    from tests.renderer.test_backward import gradients, separated
 
     return {f"gradient_{name}": value for name, value in gradients(separated(200, 16)).items()}
 
@@ -112,7 +112,7 @@ def fit_gradients() -> Arrays:
     """Those of the loss that fits descend."""
     import drjit as dr
 
-    from mitsplat.plugins.photometric import photometric_loss
+    from mitsplat.renderer.differentiation.photometric_loss import photometric_loss
 
     make_integrator()
     rng = np.random.default_rng(5)

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.importing.import_report import write_import_report, write_scene
 from mitsplat.importing.splat_import import Imported, ImportSettings, _cut_base, _topples, import_splats
 from mitsplat.importing.upright import axis_vector, cut_support, find_up, rotation_to_z
 from mitsplat.reconstruct.surface import SurfaceSettings
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
-from mitsplat.surfels import place_surfels
+from mitsplat.scene.loading.scene_loading import load_scene
 
 COARSE = SurfaceSettings(voxels=48, faces=2000, blur=1.0)
 

@@ -15,9 +15,9 @@ from scipy import ndimage
 
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.formats.yolo import yolo_lines
+from mitsplat.images.masks import Silhouette, bounds_of_ids, encode_mask, without_fragments
 from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
 from mitsplat.labels.polygons import fill_polygon, outline
-from mitsplat.masks import Silhouette, bounds_of_ids, encode_mask, without_fragments
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.dataset.prospects import layout_faults
+from mitsplat.dataset.preflight import layout_faults
 from mitsplat.errors import InputError
 from mitsplat.physics.placement import standing_turns
 from mitsplat.physics.settle import settle_layout
-from mitsplat.scene.contents import draw_regions
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.contents import draw_regions
 from tests.bodies import lowest, pose_at
 from tests.conftest import box_asset
 
@@ -29,7 +29,7 @@ def drop_layout(scene_data, write_scene, **changes):
 
 def placed_clearances(scene, layout):
     """Clearances of a layout's objects from one another and from the colliders."""
-    from mitsplat.mesh_distance import all_clearances
+    from mitsplat.geometry.mesh_distance import all_clearances
     from mitsplat.physics.drop import drop_of
 
     drop = drop_of(scene, lambda text: None)
@@ -42,7 +42,7 @@ BIN = {"name": "bin", "bin": {"size": [0.12, 0.09, 0.05], "position": [0, 0, 0.0
 
 def test_a_bin_is_five_boxes_around_its_inside(scene_data, write_scene):
     """Volume of the walls: outer less inner; the inside is empty and the middle of its floor where it should be."""
-    from mitsplat.mesh_distance import Surface
+    from mitsplat.geometry.mesh_distance import Surface
 
     scene_data["shapes"].append(BIN)
     mesh = load_scene(write_scene(scene_data)).shape_meshes[1]

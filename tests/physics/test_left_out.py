@@ -13,7 +13,7 @@ import trimesh
 from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts, try_alone
 from mitsplat.scene.layout import Layout, NothingRests
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import box_asset
 
 pytestmark = pytest.mark.usefixtures("physics")

@@ -21,16 +21,16 @@ from scipy.stats import kstest
 
 from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
-from mitsplat.render.places import draw_place
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.layout_surroundings import draw_place
 from tests.bodies import STEPPERS, lowest, pose_at
 
 pytestmark = pytest.mark.usefixtures("physics")
 
 
 def test_clearance_of_boxes():
-    from mitsplat.mesh_distance import PlacedSurface, Surface, clearance
+    from mitsplat.geometry.mesh_distance import PlacedSurface, Surface, clearance
 
     box = Surface(trimesh.creation.box((0.02, 0.02, 0.02)))
     here = PlacedSurface("here", box)
@@ -49,7 +49,7 @@ def test_clearance_of_boxes():
 
 
 def test_draws_are_uniform_and_apart(scene_data, write_scene):
-    from mitsplat.mesh_distance import all_clearances
+    from mitsplat.geometry.mesh_distance import all_clearances
     from mitsplat.physics.drop import drop_of
 
     drop = drop_of(load_scene(write_scene(scene_data)), lambda text: None)
@@ -279,7 +279,7 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
 @pytest.mark.parametrize(("size", "depth", "refused"), [(0.05, 3.5e-4, True), (0.2, 3.5e-4, False), (0.2, 7e-4, True)])
 def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
     """0.3 mm, or 0.3 % of its size: 0.6 mm of 200."""
-    from mitsplat.mesh_distance import Clearance, PlacedSurface, Surface
+    from mitsplat.geometry.mesh_distance import Clearance, PlacedSurface, Surface
     from mitsplat.physics.drop import _fault
 
     item, table = (PlacedSurface(name, Surface(trimesh.creation.box((size,) * 3))) for name in ("part", "table"))
@@ -343,7 +343,7 @@ def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
 
 def test_standoff_of_a_hull():
     """Pieces that are the mesh stand off by nothing; the hull of an L by half a leg, where its long face spans it."""
-    from mitsplat.mesh_distance import Surface, standoff
+    from mitsplat.geometry.mesh_distance import Surface, standoff
 
     floor, wall = trimesh.creation.box((0.022, 0.01, 0.002)), trimesh.creation.box((0.002, 0.01, 0.022))
     floor.apply_translation((0.009, 0, -0.001))
@@ -357,8 +357,8 @@ def test_standoff_of_a_hull():
 
 def test_standoff_is_the_largest_signed_distance_of_all_points():
     """What is deep inside is farther from the surface than what stands off, and must not count."""
-    from mitsplat.mesh import contact_points
-    from mitsplat.mesh_distance import _SAMPLES, Surface, standoff
+    from mitsplat.geometry.mesh import contact_points
+    from mitsplat.geometry.mesh_distance import _SAMPLES, Surface, standoff
 
     surface = Surface(trimesh.creation.box((0.04, 0.04, 0.04)))
     inside = trimesh.creation.icosphere(3, 0.005)

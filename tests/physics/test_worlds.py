@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.decomposition import convex_pieces
-from mitsplat.mesh import mass_properties
+from mitsplat.geometry.decomposition import convex_pieces
+from mitsplat.geometry.mesh import mass_properties
 from tests.bodies import STEPPERS, lowest, pose_at
 
 GRAVITY = 9.81

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import Thresholds
 from mitsplat.reconstruct.causes import blurred_photos, find_causes, missing_views, views_from
-from mitsplat.reconstruct.evaluation import Thresholds
 from tests.reconstruct.test_reconstruct import GOOD
 
 

@@ -11,17 +11,17 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
-from mitsplat.colour import decode_srgb, encode_srgb
+from mitsplat.capture.lighting.panorama import unit_vector, write_exr
 from mitsplat.errors import InputError
-from mitsplat.lighting.panorama import unit_vector, write_exr
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.surfels import place_surfels
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.reconstruct.asset_evaluation import Verdict
+from mitsplat.reconstruct.asset_from_photos import AssetJob, delighted
 from mitsplat.reconstruct.delight import FOLLOWS, LightFile, delight, trace_irradiance
-from mitsplat.reconstruct.evaluation import Verdict
-from mitsplat.reconstruct.pipeline import AssetJob, delighted
 from mitsplat.reconstruct.reconstruct import Reconstruction
-from mitsplat.spec.lights import AreaLight, EnvironmentLight, LightSpec
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
-from mitsplat.surfels import place_surfels
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec
 
 RADIUS = 0.05
 SKY = 0.5

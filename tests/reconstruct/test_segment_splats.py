@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mitsplat.errors import InputError
-from mitsplat.reconstruct.evaluation import sized_photo
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.segment_splats import MaskedView, VisibleWeights, find_floaters, isolate_object
-from mitsplat.splats import Splats
 from tests.conftest import KnownObject
-from tests.plugins.test_backward import separated
 from tests.reference import responses
-from tests.render.test_render import CAMERA
+from tests.renderer.test_backward import separated
+from tests.renderer.test_render import CAMERA
 
 
 def test_weights_are_those_of_the_twin() -> None:

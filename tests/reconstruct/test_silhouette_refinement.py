@@ -12,12 +12,12 @@ import trimesh
 
 from benchmarks.assets.known import chamfer
 from benchmarks.assets.refine_mesh import masked
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.reconstruct.evaluation import iou
-from mitsplat.reconstruct.mend import edges_through_faces, mend_motion
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.reconstruct.asset_report import write_asset_report
+from mitsplat.reconstruct.fold_repair import edges_through_faces, mend_motion
 from mitsplat.reconstruct.reconstruct import ImportedMesh, reconstruct_asset
-from mitsplat.reconstruct.report import write_asset_report
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, Outline, Silhouettes, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings

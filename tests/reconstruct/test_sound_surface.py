@@ -9,11 +9,11 @@ import pytest
 
 from benchmarks.assets.known import chamfer
 from mitsplat.errors import InputError
-from mitsplat.reconstruct.evaluation import sized_photo
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.reconstruct.asset_evaluation import sized_photo
+from mitsplat.reconstruct.fallback_proxy import CONVEX, FINEST, HULL, find_sound_surface
 from mitsplat.reconstruct.segment_splats import MaskedView, isolate_object
-from mitsplat.reconstruct.sound_surface import CONVEX, FINEST, HULL, find_sound_surface
 from mitsplat.reconstruct.surface import SurfaceSettings
-from mitsplat.splats import Splats
 from tests.conftest import KnownObject
 from tests.reconstruct.test_reconstruct import GOOD
 

@@ -13,11 +13,11 @@ from skimage.measure import marching_cubes
 
 from benchmarks.assets.known import chamfer
 from mitsplat.asset import read_mesh
-from mitsplat.camera import Camera
 from mitsplat.errors import InputError
-from mitsplat.mesh import prepare_mesh
-from mitsplat.mesh_distance import Surface
-from mitsplat.reconstruct.evaluation import sized_photo
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh import prepare_mesh
+from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.surface import SurfaceSettings, _sealed, reconstruct_surface, simplify_surface
 from tests.conftest import KnownObject

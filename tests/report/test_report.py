@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsplat.report.report import SAMPLES, write_report
-from mitsplat.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.pages.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.report.dataset_report import SAMPLES, write_report
 from tests.audit.test_audit import records_of, store, swap_a_class
 from tests.cli.typed import run
 

@@ -12,11 +12,11 @@ import pytest
 from pycocotools import mask as coco_mask
 from scipy.spatial.transform import Rotation
 
-from mitsplat.camera import look_at_pose
+from mitsplat.geometry.camera import look_at_pose
+from mitsplat.pages.svg_charts import discs
 from mitsplat.report import variety
-from mitsplat.report.report import write_report
+from mitsplat.report.dataset_report import write_report
 from mitsplat.report.variety import FEW_VIEWS, RINGS, SECTORS, Variety, cell_of
-from mitsplat.svg_charts import discs
 from tests.audit.test_audit import records_of, store
 from tests.cli.typed import run
 

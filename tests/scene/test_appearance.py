@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.colour import hue_matrix, saturation_matrix
 from mitsplat.errors import InputError
+from mitsplat.images.colour import hue_matrix, saturation_matrix
 from mitsplat.physics.settle import _scene_hash
-from mitsplat.scene.appearance import Appearance, draw_appearances
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.object_appearance import Appearance, draw_appearances
+from mitsplat.scene.scene import Scene
 from tests.conftest import WriteScene
 
 RANGES = {

@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from mitsplat.errors import InputError
-from mitsplat.scene.contents import draw_environment, draw_objects, is_empty, split_of
-from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.contents import draw_objects
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.splits import draw_environment, is_empty, split_of
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]

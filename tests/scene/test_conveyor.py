@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from mitsplat.errors import InputError
-from mitsplat.scene.conveyor import belt_of, carried
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
-from mitsplat.scene.scene import Scene, load_scene
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.conveyor import belt_of, carried
+from mitsplat.scene.scene import Scene
 from tests.conftest import WriteScene
 
 SceneData = dict[str, Any]

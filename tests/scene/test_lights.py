@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from mitsplat.dataset.inputs import describe_inputs
-from mitsplat.dataset.prospects import doubts
+from mitsplat.dataset.preflight import doubts
 from mitsplat.errors import InputError
-from mitsplat.scene.scene import Scene, load_scene, plan_frame
-from mitsplat.spec.lights import AreaLight, EnvironmentLight
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight
 from tests.conftest import WriteScene
 
 SIDES = {

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from mitsplat.primitives import make_primitives
-from mitsplat.scene.scene import load_scene
+from mitsplat.scene.loading.primitives import make_primitives
+from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.streams import random_stream
 from tests.conftest import WriteScene
 

@@ -15,9 +15,11 @@ import pytest
 
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.scene.scene import FramePlan, Scene, layout_of, load_scene, plan_frame, scene_json_schema
+from mitsplat.scene.loading.scene_loading import load_scene, scene_json_schema
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION
 from mitsplat.scene.streams import random_stream
-from mitsplat.spec.spec import SCHEMA_VERSION
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]

@@ -14,14 +14,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.camera import Camera
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, layout_of, load_scene, plan_frame
-from mitsplat.sight import Sight
-from mitsplat.spec.camera import Occlusion, Truncation
-from mitsplat.spec_types import StrictModel
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
+from mitsplat.scene.planning.visibility_prediction import Sight
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.camera_spec import Occlusion, Truncation
+from mitsplat.storage.field_types import StrictModel
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 

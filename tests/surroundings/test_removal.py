@@ -14,15 +14,16 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
-from mitsplat.reconstruct.evaluation import show_asset
-from mitsplat.reconstruct.pipeline import AssetJob
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import show_asset
+from mitsplat.reconstruct.asset_from_photos import AssetJob
 from mitsplat.reconstruct.reconstruct import ImportedMesh
-from mitsplat.spherical_harmonics import SH_C0
-from mitsplat.splats import Splats
-from mitsplat.surroundings import make_surroundings, pipeline
+from mitsplat.surroundings import environment_from_photos as pipeline
+from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.removal import remove_things
 from mitsplat.surroundings.supports import find_supports, find_walls

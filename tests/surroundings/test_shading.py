@@ -12,8 +12,8 @@ from scipy.ndimage import binary_erosion
 
 from benchmarks.assets.photographing import paint
 from benchmarks.assets.room import papered, things
-from mitsplat.plugins.device import plain_mesh
-from mitsplat.render.layers import ensure_variant
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.rays.device_arrays import plain_mesh
 from mitsplat.surroundings.shading import ShadingLight, light_of_shading
 
 WIDE, DEEP, ACROSS = 1.3, 0.75, 104

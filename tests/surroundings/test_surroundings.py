@@ -12,20 +12,20 @@ from PIL import Image
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
-from mitsplat.camera import Camera
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.checks.preflight import check_scene
-from mitsplat.reconstruct.evaluation import show_asset
-from mitsplat.reconstruct.pipeline import AssetJob, AssetResult
+from mitsplat.checks.path_checks import check_scene
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import show_asset
+from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
-from mitsplat.scene.scene import load_scene
-from mitsplat.splats import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.coverage import ENOUGH, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.environment_from_photos import reconstruct_surroundings
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
-from mitsplat.surroundings.pipeline import reconstruct_surroundings
 from mitsplat.surroundings.supports import find_supports, fit_plane
 
 TABLE, HEIGHT = (1.2, 0.7), 0.11

@@ -24,10 +24,10 @@ import pytest
 from PIL import Image
 from ruamel.yaml import YAML
 
-from mitsplat.splats import Splats
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.view.page import Address, Page
+from tests.capture.isolation.balls import capture_of_balls
 from tests.conftest import box_asset, small_scene
-from tests.isolation.balls import capture_of_balls
 
 pytestmark = pytest.mark.slow
 

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from mitsplat.asset import Asset
-from mitsplat.camera import look_at_pose
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import look_at_pose
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.scene import Scene, load_scene, plan_frame
-from mitsplat.spec.lights import AreaLight, EnvironmentLight, PointLight, SpotLight
-from mitsplat.splats import Splats
-from mitsplat.view.parts import (
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, PointLight, SpotLight
+from mitsplat.view.scene_parts import (
     Cloud,
     Frustum,
     Lines,

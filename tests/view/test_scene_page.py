@@ -15,8 +15,8 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import ByteImage
-from mitsplat.camera import look_at_pose
-from mitsplat.scene.viewpoints import view_of
+from mitsplat.geometry.camera import look_at_pose
+from mitsplat.scene.planning.viewpoints import view_of
 from mitsplat.view.page import Address, Page
 from mitsplat.view.previews import SceneRenders, ViewRequest
 from mitsplat.view.scene_page import ScenePage

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from mitsplat.camera import look_at_pose
-from mitsplat.scene.scene import load_scene, plan_frame
-from mitsplat.spec.camera import Intrinsics
-from mitsplat.spec.lights import AreaLight, EnvironmentLight, PointLight, SpotLight
+from mitsplat.geometry.camera import look_at_pose
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.spec.camera_spec import Intrinsics
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, PointLight, SpotLight
 from mitsplat.view.scene_page import changed_light
 from mitsplat.view.yaml_lines import camera_lines, light_line, seed_line
 

@@ -44,8 +44,8 @@ def colmap_capture(place: Place) -> Path:
 
 def capture_folder(place: Place) -> Path:
     """A valid capture of four photographs, beside a COLMAP model of them; returns its folder."""
-    from mitsplat.camera import Camera
     from mitsplat.capture.capture import Capture, Photo
+    from mitsplat.geometry.camera import Camera
 
     colmap_capture(place)
     photos = [

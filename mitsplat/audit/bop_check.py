@@ -1,0 +1,226 @@
+"""BOP scenes and models read back as the BOP toolkit reads them, and tried on the masks: poses must project onto them.
+
+After the toolkit's ``inout.load_scene_camera``, ``load_scene_gt`` and ``scripts/calc_gt_info.py``: matrices by rows,
+lengths in millimetres, boxes (x, y, x_max - x_min, y_max - y_min), pixel centres at whole numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist
+
+from mitsplat.arrays import Float64Array
+from mitsplat.asset import read_mesh
+from mitsplat.audit.described import Cursor, are_objects, differing, is_close
+from mitsplat.audit.owned import labelled_assets
+from mitsplat.audit.read_back import Violations
+from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
+from mitsplat.errors import InputError
+from mitsplat.images.picture_files import read_picture
+from mitsplat.storage.files import read_json
+from mitsplat.storage.json_stream import read_entries
+
+_PARTS = ("camera", "gt", "gt_info")
+_MODEL_ROUNDED = 0.01
+"""Difference that the decimals of a model's file make [mm]."""
+_FIT = 0.5
+"""Least IoU, by the median over its instances, of the boxes of a model in its poses and of its silhouettes."""
+_BINS = 20
+_FEW = 3
+"""Instances of which nothing is concluded."""
+_LEAST_AREA = 64
+"""Silhouettes of fewer pixels are not tried [px]."""
+
+
+class BopReader:
+    """``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json`` of all scenes, and the models."""
+
+    def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
+        self._root, self._content = root, content
+        self._folder = ""
+        self._cursors: dict[str, Cursor] = {}
+        self._corners: dict[int, Float64Array] = {}
+        self._fits: dict[int, list[int]] = {}
+        self._models = list(self._check_models())
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """Compare with the frame's masks, depth picture, camera and poses."""
+        if frame.bop_folder != self._folder:
+            yield from self._finish_scene()
+            self._folder = frame.bop_folder
+            self._cursors = {
+                part: Cursor(file := f"{self._folder}/scene_{part}.json", _by_frame(self._root / file))
+                for part in _PARTS
+            }
+        found = {}
+        for part, cursor in self._cursors.items():
+            entries = [] if cursor.broken else list(cursor.take(frame.index))
+            yield from cursor.errors()
+            if cursor.broken:
+                continue
+            if len(entries) != 1:
+                yield cursor.file, f"has {len(entries)} entries of frame {frame.index}"
+                continue
+            if part != "camera" and (not are_objects(entries[0]) or len(entries[0]) != len(frame.instances)):
+                yield cursor.file, f"frame {frame.index} must have {len(frame.instances)} instances"
+                continue
+            found[part] = entries[0]
+        if "camera" in found:
+            yield from self._said("camera", frame, _check_camera(frame, found["camera"]))
+        if "gt" in found:
+            for label, pose in zip(frame.instances, found["gt"], strict=True):
+                yield from self._said("gt", frame, _check_pose(frame, label, pose))
+                self._try_on(frame, label, found.get("camera", {}), pose)
+        if "gt_info" in found:
+            picture = self._root / f"{frame.bop_folder}/depth/{frame.index:06d}.png"
+            depth = read_picture(picture, cv2.IMREAD_UNCHANGED) if picture.is_file() else None
+            for label, info in zip(frame.instances, found["gt_info"], strict=True):
+                yield from self._said("gt_info", frame, _check_info(frame, label, info, depth))
+
+    def _said(self, part: str, frame: TrueFrame, texts: Iterator[str]) -> Violations:
+        for text in texts:
+            yield self._cursors[part].file, f"frame {frame.index}{text}"
+
+    def _try_on(self, frame: TrueFrame, label: TrueInstance, camera: Any, pose: Any) -> None:
+        """Count how well the model's box in the image, by the files alone, fits that of the silhouette."""
+        number = label.entry["asset"] + 1
+        corners = self._corners.get(number)
+        stated = _numbers(camera, cam_K=9), _numbers(pose, cam_R_m2c=9), _numbers(pose, cam_t_m2c=3)
+        if corners is None or any(values is None for values in stated) or label.silhouette_area < _LEAST_AREA:
+            return
+        matrix, rotation, shift = (np.zeros(9) if values is None else values for values in stated)
+        seen = (corners @ rotation.reshape(3, 3).T + shift) @ matrix.reshape(3, 3).T
+        if seen[:, 2].max() > 0 >= seen[:, 2].min():
+            return  # it reaches behind the camera, where its box has no bounds
+        with np.errstate(all="ignore"):
+            pixels = seen[:, :2] / seen[:, 2:]
+        box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0) + 1])
+        fit = _box_iou(box, np.array(label.entry["silhouette_box"])) if seen[:, 2].min() > 0 else 0.0
+        self._fits.setdefault(number, [0] * _BINS)[min(_BINS - 1, int(np.nan_to_num(fit) * _BINS))] += 1
+
+    def _finish_scene(self) -> Violations:
+        for cursor in self._cursors.values():
+            if not cursor.broken:
+                yield from cursor.finish()
+
+    def finish(self) -> Violations:
+        """What is left, and whether the models fit the masks."""
+        yield from self._finish_scene()
+        yield from self._models
+        for number, counts in sorted(self._fits.items()):
+            middle = int(np.searchsorted(np.cumsum(counts), sum(counts) / 2)) / _BINS
+            if sum(counts) >= _FEW and middle < _FIT:
+                yield (
+                    f"bop/models/obj_{number:06d}.ply",
+                    f"does not fit its silhouettes in the poses of scene_gt.json: half of {sum(counts)} boxes have an "
+                    f"IoU below {middle + 1 / _BINS:.2f}",
+                )
+
+    def _check_models(self) -> Violations:
+        """Whether the models are there and measure what is said of them."""
+        file = "bop/models/models_info.json"
+        try:
+            info = read_json(self._root / file)
+        except FileNotFoundError:
+            yield file, "is missing"
+            info = None
+        except (OSError, ValueError) as error:
+            yield file, f"cannot be read ({error})"
+            info = None
+        labelled = labelled_assets(self._content)
+        numbers = {str(position + 1) for position in labelled}
+        if isinstance(info, dict) and info.keys() - numbers:
+            yield file, f"measures {min(info.keys() - numbers)}, which is no object that is labelled"
+        for number in (position + 1 for position in labelled):
+            model = f"bop/models/obj_{number:06d}.ply"
+            if not (self._root / model).is_file():
+                yield model, "is missing"
+                continue
+            try:
+                points = np.asarray(read_mesh(self._root / model).vertices, dtype=np.float64)
+                self._corners[number] = points[ConvexHull(points).vertices]
+            except (InputError, QhullError) as error:
+                yield model, f"cannot be read ({error})"
+                continue
+            low, high = points.min(axis=0), points.max(axis=0)
+            measured = {"diameter": float(pdist(self._corners[number]).max())}
+            measured |= {f"min_{axis}": value for axis, value in zip("xyz", low, strict=True)}
+            measured |= {f"size_{axis}": value for axis, value in zip("xyz", high - low, strict=True)}
+            stated = info.get(str(number), {}) if isinstance(info, dict) else {}
+            if info is not None and not all(
+                isinstance(stated, dict) and is_close(stated.get(key), value, _MODEL_ROUNDED / max(1.0, abs(value)))
+                for key, value in measured.items()
+            ):
+                yield file, f"does not give the measures of {model}"
+
+
+def _by_frame(path: Path) -> Iterator[tuple[int, Any]]:
+    for key, value in read_entries(path):
+        yield int(key), value
+
+
+def _check_camera(frame: TrueFrame, entry: Any) -> Iterator[str]:
+    centres = frame.intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    pose = frame.camera_from_world
+    yield from _check_numbers(
+        entry, {"cam_K": centres.ravel(), "cam_R_w2c": pose[:3, :3].ravel(), "cam_t_w2c": 1000 * pose[:3, 3]}
+    )
+    if wrong := differing(entry, {"depth_scale": frame.record["depth_scale"]}):
+        yield f": {wrong}"
+
+
+def _check_pose(frame: TrueFrame, label: TrueInstance, entry: Mapping[str, Any]) -> Iterator[str]:
+    pose = frame.camera_from_world @ label.pose
+    numbers = {"cam_R_m2c": pose[:3, :3].ravel(), "cam_t_m2c": 1000 * pose[:3, 3]}
+    for text in _check_numbers(entry, numbers):
+        yield f", {label.name}{text}"
+    if wrong := differing(entry, {"obj_id": label.entry["asset"] + 1}):
+        yield f", {label.name}: {wrong}"
+
+
+def _check_info(frame: TrueFrame, label: TrueInstance, info: Mapping[str, Any], depth: Any) -> Iterator[str]:
+    x0, y0, x1, y1 = label.amodal_box
+    expected = {
+        "bbox_obj": _bop_box(label.entry["silhouette_box"]),
+        "bbox_visib": _bop_box(bounds_of(frame.whole(label))),
+        "px_count_all": label.silhouette_area,
+        "px_count_visib": label.area,
+    }
+    if depth is not None and depth.shape == frame.size[::-1]:
+        expected["px_count_valid"] = int(np.count_nonzero(label.amodal & (depth[y0:y1, x0:x1] > 0)))
+    if wrong := differing(info, expected):
+        yield f", {label.name}: {wrong}"
+    if not is_close(info.get("visib_fract"), label.area / label.silhouette_area):
+        yield f", {label.name}: visib_fract is {info.get('visib_fract')}, not {label.area / label.silhouette_area:.6f}"
+
+
+def _check_numbers(entry: Any, expected: Mapping[str, Float64Array]) -> Iterator[str]:
+    for key, values in expected.items():
+        found = entry.get(key) if isinstance(entry, dict) else None
+        if not is_close(found, values):
+            yield f": {key} is {str(found)[:60]}, not that of the manifest's camera and poses"
+
+
+def _numbers(entry: Any, **sizes: int) -> Float64Array | None:
+    ((key, size),) = sizes.items()
+    try:
+        values = np.array(entry[key], dtype=np.float64)
+    except (KeyError, TypeError, ValueError):
+        return None
+    return values if values.shape == (size,) and np.isfinite(values).all() else None
+
+
+def _bop_box(box: Box | list[int]) -> list[int]:
+    x0, y0, x1, y1 = box
+    return [x0, y0, x1 - 1 - x0, y1 - 1 - y0]
+
+
+def _box_iou(one: Float64Array, other: Float64Array) -> float:
+    shared = np.clip(np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2]), 0, None).prod()
+    return float(shared / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - shared))

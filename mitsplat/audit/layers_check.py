@@ -1,0 +1,271 @@
+"""Pictures of per-pixel values compared with each other, and with the masks, cameras and poses."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.audit.conveyor_check import BeltTruth
+from mitsplat.audit.read_back import Violations
+from mitsplat.audit.truth import TrueFrame
+from mitsplat.images.exr_header import check_exr_header
+from mitsplat.images.picture_files import read_picture
+
+_FLOW_ROUNDED = 0.02
+"""Difference that single precision and lens models make in optical flow [px]."""
+_KNOWN_FLOW = 1e9
+"""Components above this mean that there is no flow."""
+_MOST_MEASURED = 0.25
+"""Middle error of measured depth, relative to the true one, which no sensor of use has."""
+_FEW = 6
+"""Instances of an asset of which nothing is concluded."""
+_MOST_TRUNCATED = 0.2
+"""Of silhouettes cut off by more, the middle is not the object's."""
+_OFF_PLACE, _OFF_DEPTH = 1.0, 0.2
+"""Distances of silhouettes from where poses put them, in half their size, and of depths, in depths, that are too large.
+
+Of rendered scenes they were up to 0.09 and 0.04; with cameras inverted, silhouettes were off by 2 to 30.
+"""
+
+
+class LayersReader:
+    """``depth/``, ``normals/``, ``flow/`` and ``layers/`` of one frame after the other."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self._content = content
+        self._belt = BeltTruth(content)
+        self._last: tuple[TrueFrame, Float64Array, float] | None = None
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """What is wrong between the frame's pictures, and with the flow from the frame before it to this one."""
+        channels = dict[str, npt.NDArray[Any]]()
+        layers = f"layers/{frame.split}/{frame.index:06d}.exr"
+        if "exr" in frame.formats and (frame.root / layers).is_file():
+            channels, error = _read_exr(frame.root / layers)
+            yield from ((layers, text) for text in _check_channels(frame, channels, error))
+        depth, step = None, 0.0
+        if "Z" in channels and channels["Z"].shape == frame.size[::-1]:
+            depth = channels["Z"].astype(np.float64)
+        for file in _depth_files(frame):
+            stored = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+            if stored is None:
+                continue
+            unit = frame.record["depth_scale"] / 1000
+            if depth is None:
+                depth, step = stored * unit, unit
+            elif wrong := np.count_nonzero(np.abs(stored * unit - np.minimum(depth, 65535 * unit)) > 1.01 * unit):
+                yield file, f"{wrong} pixels have another depth than in {layers if step == 0 else 'depth/'}"
+        yield from _check_sensed(frame, depth)
+        normals = f"normals/{frame.split}/{frame.index:06d}.png"
+        if normals in frame.record["files"]:
+            yield from ((normals, text) for text in _check_normals(frame, normals, channels))
+        if self._last is not None:
+            yield from self._check_flow(frame)
+        self._last = None if depth is None else (frame, depth, step)
+
+    def _check_flow(self, frame: TrueFrame) -> Violations:
+        """The flow of the frame before, by its depth and both cameras."""
+        assert self._last is not None  # noqa: S101
+        before, depth, step = self._last
+        file = f"flow/{before.split}/{before.index:06d}.flo"
+        if (frame.index, frame.record["layout"]) != (before.index + 1, before.record["layout"]):
+            return
+        if file not in before.record["files"] or not (before.root / file).is_file():
+            return
+        flow = cv2.readOpticalFlow(str(before.root / file))
+        if flow is None or flow.shape[:2] != depth.shape:
+            yield file, "cannot be read as optical flow of the frame's size"
+            return
+        height, width = depth.shape
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+        slopes = np.column_stack([before.slopes(pixels), np.ones(len(pixels))])
+        known = depth.ravel() > step
+        motion = frame.camera_from_world @ before.world_from_camera
+        found = flow.reshape(-1, 2)[known]
+        stated = (np.abs(found) < _KNOWN_FLOW).all(axis=1)
+
+        def wrong_if_carried(by: Float64Array) -> BoolArray:
+            """Which of the pixels that have a depth do not move as points that something carries [m]."""
+            run = frame.camera_from_world[:3, :3] @ by
+            ahead = np.zeros(len(found))
+
+            def moved(z: Float64Array) -> Float64Array:
+                points = slopes[known] * z[known, None] @ motion[:3, :3].T + motion[:3, 3] + run
+                ahead[:] = points[:, 2]
+                points[points[:, 2] <= 0] = (0, 0, 1)
+                return frame.project(points)
+
+            near, far = moved(depth.ravel() - step / 2), moved(depth.ravel() + step / 2)
+            expected = moved(depth.ravel()) - pixels[known]
+            room = _FLOW_ROUNDED + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
+            in_front = ahead > frame.record["camera"]["near"] + step
+            wrong: BoolArray = in_front & (~stated | (np.abs(found - expected).max(axis=1) > room))
+            return wrong
+
+        if not known.any():
+            return
+        wrong = wrong_if_carried(np.zeros(3))
+        if (run := self._belt.between(before, frame)).any():
+            # What is no labelled instance may be the belt or what stands still.
+            carried = wrong_if_carried(run)
+            runs, stays = (self._seen(before, carries).ravel()[known] for carries in (True, False))
+            wrong = np.where(runs, carried, np.where(stays, wrong, wrong & carried))
+        if count := np.count_nonzero(wrong):
+            yield file, f"{count} pixels do not move as depth and cameras say"
+
+    def _seen(self, frame: TrueFrame, carried: bool) -> BoolArray:
+        """Pixels of labelled instances that the belt carries, or of the others, (H, W)."""
+        width, height = frame.size
+        seen = np.zeros((height, width), dtype=bool)
+        for instance in frame.instances:
+            if self._belt.carries(instance.pose) == carried:
+                seen |= frame.whole(instance)
+        return seen
+
+    def finish(self) -> Violations:
+        """Nothing is left."""
+        yield from ()
+
+
+class SightReader:
+    """Whether poses and cameras agree with what is seen, over the whole dataset: silhouettes lie where objects are.
+
+    Nothing tells where in its coordinates an asset is. But one point of it is in the middle of all its silhouettes, and
+    at the depth of its pixels, more or less: the point that fits best, and how well it does, follow from sums.
+    """
+
+    def __init__(self) -> None:
+        self._places, self._depths = defaultdict[int, _Fit](_Fit), defaultdict[int, _Fit](_Fit)
+
+    def check(self, frame: TrueFrame) -> Violations:
+        """Add the frame's instances to the sums."""
+        depth = None
+        if (file := next(iter(_depth_files(frame)), None)) is not None:
+            depth = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+        for label in frame.instances:
+            asset, pose = label.entry["asset"], frame.camera_from_world @ label.pose
+            rotation, shift = pose[:3, :3], pose[:3, 3]
+            away = max(abs(float(shift[2])), 1e-6)
+            x0, y0, x1, y1 = label.entry["silhouette_box"]
+            if label.entry["truncation"] <= _MOST_TRUNCATED:
+                slopes = frame.slopes(np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]))[0]
+                reach = away * max(x1 - x0, y1 - y0) / 2 / frame.intrinsics[0, 0]
+                rows = rotation[:2] - np.outer(slopes, rotation[2])
+                self._places[asset].add(rows / reach, (slopes * shift[2] - shift[:2]) / reach)
+            if depth is not None:
+                left, top, right, bottom = label.box
+                seen = float(np.median(depth[top:bottom, left:right][label.mask])) * frame.record["depth_scale"] / 1000
+                unit = max(away, seen)
+                self._depths[asset].add(rotation[2:] / unit, (seen - shift[2:]) / unit)
+        yield from ()
+
+    def finish(self) -> Violations:
+        """What follows from all frames."""
+        for asset, fit in sorted(self._places.items()):
+            if fit.count >= 2 * _FEW and fit.rms > _OFF_PLACE:
+                yield (
+                    "manifest.jsonl",
+                    f"silhouettes of asset {asset} lie {fit.rms / 2:.1f} times their size from where its poses put it",
+                )
+        for asset, fit in sorted(self._depths.items()):
+            if fit.count >= _FEW and fit.rms > _OFF_DEPTH:
+                yield "manifest.jsonl", f"depth pictures put asset {asset} {fit.rms:.0%} of its distance off its poses"
+
+
+class _Fit:
+    """The point p that comes closest to ``rows @ p = values``, by sums."""
+
+    def __init__(self) -> None:
+        self._square, self._product, self._total, self.count = np.zeros((3, 3)), np.zeros(3), 0.0, 0
+
+    def add(self, rows: Float64Array, values: Float64Array) -> None:
+        """Add equations."""
+        self._square += rows.T @ rows
+        self._product += rows.T @ values
+        self._total += float(values @ values)
+        self.count += len(values)
+
+    @property
+    def rms(self) -> float:
+        """What is left of an equation in the mean; infinite if sums overflow, as of poses that are none."""
+        if not (np.isfinite(self._square).all() and np.isfinite(self._product).all()):
+            return np.inf
+        point = np.linalg.lstsq(self._square, self._product, rcond=1e-12)[0]
+        return float(np.sqrt(max(0.0, self._total - float(self._product @ point)) / max(1, self.count)))
+
+
+def _depth_files(frame: TrueFrame) -> list[str]:
+    """The frame's depth pictures that are there."""
+    name = f"{frame.index:06d}.png"
+    files = [f"depth/{frame.split}/{name}", f"{frame.bop_folder}/depth/{name}"]
+    return [file for file in files if file in frame.record["files"] and (frame.root / file).is_file()]
+
+
+def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
+    """Whether measured depth is of the frame's size, and its middle error small where the true depth is known."""
+    file = f"depth-sensor/{frame.split}/{frame.index:06d}.png"
+    if file not in frame.record["files"] or not (frame.root / file).is_file():
+        return
+    stored = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+    if stored is None:
+        yield file, "cannot be read as a 16-bit grey image of the frame's size"
+    elif depth is not None and (both := (stored > 0) & (depth > 0)).any():
+        measured = stored[both] * frame.record["depth_sensor_scale"] / 1000
+        error = float(np.median(np.abs(measured - depth[both]) / depth[both]))
+        if error > _MOST_MEASURED:
+            yield file, f"depths are off by {error:.0%} of the true ones in the middle"
+
+
+def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] | None:
+    picture = read_picture(path, cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.dtype != np.uint16 or picture.shape != shape:
+        return None
+    return picture.astype(np.uint16, copy=False)
+
+
+def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
+    """Channels by name, and what prevents reading them."""
+    try:
+        check_exr_header(path)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return {name: np.array(channel.pixels) for name, channel in file.channels().items()}, ""
+    except Exception as error:  # noqa: BLE001 - OpenEXR raises what it likes
+        return {}, f"cannot be read as OpenEXR ({error})"
+
+
+def _check_channels(frame: TrueFrame, channels: Mapping[str, npt.NDArray[Any]], error: str) -> list[str]:
+    if error:
+        return [error]
+    wanted = {*"RGBAZ", "instance", "proxy_instance", "normal.X", "normal.Y", "normal.Z"}
+    if missing := wanted - channels.keys():
+        return [f"has no channel {min(missing)}"]
+    if any(values.shape != frame.size[::-1] for values in channels.values()):
+        return ["is not of the frame's size"]
+    source = "instance" if frame.content["scene"]["labels"]["source"] == "splats" else "proxy_instance"
+    wrong = np.count_nonzero((channels[source] != frame.ids) & (frame.ids > 0))
+    return [f"{wrong} pixels of the channel {source} differ from the masks"] if wrong else []
+
+
+def _check_normals(frame: TrueFrame, file: str, channels: Mapping[str, npt.NDArray[Any]]) -> list[str]:
+    """Against the layers where there are any, which nothing else states exactly."""
+    picture = _read_16_bits(frame.root / file, (*frame.size[::-1], 3)) if (frame.root / file).is_file() else None
+    if picture is None:
+        return ["cannot be read as a 16-bit colour image of the frame's size"]
+    if any(f"normal.{axis}" not in channels for axis in "XYZ"):
+        return []
+    normals = np.stack([channels[f"normal.{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
+    if normals.shape != picture.shape:
+        return []
+    known = normals.any(axis=-1, keepdims=True)
+    expected = np.where(known, 65535 * (np.clip(normals, -1, 1) + 1) / 2, 0)
+    wrong = np.count_nonzero((np.abs(picture[..., ::-1] - expected) > 1).any(axis=-1))
+    return [f"{wrong} pixels differ from the normals in layers/"] if wrong else []

@@ -1,0 +1,88 @@
+"""One page to look at a baked asset by: the mesh beside its splats, figures, and what a user should know."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+
+import numpy as np
+
+from mitsplat.bake.bake import BakeResult
+from mitsplat.bake.verification import BakedView
+from mitsplat.geometry.decomposition import widest_gap
+from mitsplat.geometry.mesh import mass_properties
+from mitsplat.geometry.mesh_distance import Surface, standoff
+from mitsplat.pages.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
+from mitsplat.storage.files import write_text
+
+_VIEW = 420
+_MOST_DIFFERENCE = 0.3
+"""Error of a display-encoded channel that is drawn white."""
+
+
+def write_bake_report(folder: Path, result: BakeResult) -> Path:
+    """Write ``report.html`` into an asset's folder.
+
+    Raises:
+        OSError: If the page cannot be written.
+    """
+    name = result.asset.name
+    path = folder / REPORT_FILE
+    body = "\n".join([f"<h1>{html.escape(name)}</h1>", _figures(result), _views(result)])
+    write_text(path, make_page(f"{name}: bake report", body))
+    return path
+
+
+def _figures(result: BakeResult) -> str:
+    asset, warnings = result.asset, list(result.warnings)
+    rows: dict[str, str | None] = {
+        "Gaussians": f"{len(asset.splats)}",
+        "PSNR on unseen views": figure_of(_known(result.psnr), "{:.2f} dB"),
+        "PSNR of the mesh's pixels": figure_of(_known(result.psnr_object), "{:.2f} dB"),
+        "Brightness relative to the file's textures": figure_of(result.brightness, "{:.2f}"),
+    }
+    if asset.mesh is not None:
+        rows["Size"] = " x ".join(f"{1e3 * extent:.4g}" for extent in asset.mesh.extents) + " mm"
+        rows["Mesh"] = f"{len(asset.mesh.faces)} faces, {'watertight' if asset.mesh.is_watertight else 'open'}"
+        if asset.pieces:
+            mass = mass_properties(asset.mesh, asset.pieces, density=asset.density, mass=asset.mass)
+            rows["Mass"] = f"{mass.mass:.4g} kg at {asset.density:.4g} kg/m^3"
+            truth = asset.mesh if result.surface is None else result.surface
+            gap, bearable = standoff(Surface(truth), asset.pieces), widest_gap(float(asset.mesh.extents.max()))
+            rows["Convex pieces"] = f"{len(asset.pieces)}, at most {1e3 * gap:.2f} mm outside of the mesh"
+            if gap > bearable:
+                warnings.append(
+                    f"convex pieces close hollows of the mesh by up to {1e3 * gap:.1f} mm, more than the "
+                    f"{1e3 * bearable:.1f} mm that layouts bear: those in which something rests there are drawn again"
+                )
+    told = verdict_of(warnings, "Nothing to note.", rows)
+    return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{told}</section>'
+
+
+def _views(result: BakeResult) -> str:
+    note = (
+        "Views that nothing was fitted to: the path-traced mesh, and its splats. "
+        f"In differences white is an error of {_MOST_DIFFERENCE:g} of the range."
+    )
+    figures = "".join(_view(number + 1, view) for number, view in enumerate(result.views))
+    return (
+        f'<section aria-labelledby="views"><h2 id="views">Views</h2><p>{note}</p>{figures or "<p>none</p>"}</section>'
+    )
+
+
+def _view(number: int, view: BakedView) -> str:
+    pictures = {
+        "mesh": view.mesh,
+        f"splats, {view.psnr:.1f} dB": view.splats,
+        "difference": np.abs(view.splats - view.mesh) / _MOST_DIFFERENCE,
+    }
+    images = "".join(
+        f'<figure><img alt="view {number}, {html.escape(kind, quote=True)}" src="{rgb_image(picture, _VIEW)}">'
+        f"<figcaption>{kind}</figcaption></figure>"
+        for kind, picture in pictures.items()
+    )
+    return f'<div class="row">{images}</div>'
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None

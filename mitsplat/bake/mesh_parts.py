@@ -1,0 +1,326 @@
+"""CAD meshes as Mitsuba scenes: their parts with materials, and the lights to bake them under."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from trimesh.visual import ColorVisuals
+from trimesh.visual.color import to_rgba
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.bake.surface_materials import (
+    DIELECTRIC_SPECULAR,
+    LEAST_ROUGHNESS,
+    MOST_SPECULAR,
+    ROUGHNESS,
+    UNKNOWN_COLOUR,
+    Finish,
+    Material,
+    check_textures,
+    read_material,
+)
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.geometry.mesh import check_faces
+from mitsplat.geometry.mesh_normals import corner_normals
+from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.renderer.rays.device_arrays import ray_scene
+from mitsplat.renderer.scene_emitters import emitter_dict, y_up_to_z_up
+from mitsplat.runtime.variant import ensure_variant
+from mitsplat.scene.spec.light_spec import LightSpec
+from mitsplat.storage.file_kinds import refuse_others
+from mitsplat.storage.files import MESH_ERRORS
+
+_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
+_BY_OTHERS = {".3mf": ("lxml", "lxml"), ".dae": ("collada", "pycollada")}
+"""Modules that trimesh reads some files by, and the packages that have them."""
+_WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+_DETAIL_SAMPLES = 12
+_DETAIL_CONTRAST = 0.12
+"""Standard deviation of the encoded colour inside a face at which detail counts in full."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One material's share of a mesh.
+
+    Attributes:
+        name: Name of the part, to address it in settings.
+        mesh: Geometry [m], vertices at one position merged.
+        colours: Linear base colour of every face corner, shape (F, 3, 3), or None where ``texture`` is.
+        texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
+        uv: Texture coordinates of every face corner, v up, shape (F, 3, 2), or None.
+        metallic: 0 for dielectrics to 1 for metals.
+        roughness: Of the glTF material model, in (0, 1]; None for a matt surface without highlight.
+        shiny: Whether the material reflects a highlight at all.
+        reflectance: At normal incidence, of what of the material is no metal.
+        warnings: What of the file's material is left out, a sentence each.
+    """
+
+    name: str
+    mesh: trimesh.Trimesh
+    colours: Float64Array | None
+    texture: npt.NDArray[np.uint8] | None
+    uv: Float64Array | None
+    metallic: float
+    roughness: float
+    shiny: bool
+    reflectance: float = DIELECTRIC_SPECULAR
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def gloss(self) -> float:
+        """Reflectance at normal incidence that comes on top of the base colour: of a coat without a colour."""
+        return self.reflectance * (1.0 - self.metallic) if self.shiny else 0.0
+
+    @property
+    def specular(self) -> float:
+        """Reflectance at normal incidence, grey."""
+        if not self.shiny:
+            return 0.0
+        base = float(self._face_colours(np.full((1, 3), 1.0 / 3.0)).mean())
+        return self.gloss + base * self.metallic
+
+    def _face_colours(self, barycentric: Float64Array) -> Float64Array:
+        """Linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, by the nearest texel."""
+        if self.colours is not None:
+            return np.asarray(np.einsum("sk,fkc->fsc", barycentric, self.colours))
+        if self.uv is None or self.texture is None:
+            raise InputError(f"part {self.name} has neither colours nor a texture")
+        height, width = self.texture.shape[:2]
+        uv = np.einsum("sk,fkc->fsc", barycentric, self.uv) % 1.0
+        column = np.minimum((uv[..., 0] * width).astype(int), width - 1)
+        row = np.minimum(((1.0 - uv[..., 1]) * height).astype(int), height - 1)
+        return decode_srgb(self.texture[row, column] / 255.0)
+
+    def detail_density(self, gain: float, rng: np.random.Generator) -> Float64Array:
+        """Relative density (F,) that the texture asks for: 1 where it is even, ``1 + gain`` where it changes most."""
+        barycentric = rng.dirichlet(np.ones(3), _DETAIL_SAMPLES)
+        deviation = (self._face_colours(barycentric) ** (1 / 2.2)).std(axis=1).max(axis=1)
+        return np.asarray(1.0 + gain * np.clip(deviation / _DETAIL_CONTRAST, 0.0, 1.0))
+
+
+def read_parts(
+    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    *,
+    metres_per_unit: float = 1.0,
+    up: Literal["y", "z"] = "z",
+    finish: Finish | None = None,
+) -> tuple[Part, ...]:
+    """Parts of a mesh or of a file that trimesh reads, in metres, z up, with ``finish`` over their own materials.
+
+    Raises:
+        InputError: If the file or its textures cannot be read, there are no faces, none has an area, or a position is
+            not finite.
+        MissingResourceError: If what reads such files is not installed.
+    """
+    finish, linear = finish or Finish(), False
+    source = "mesh"
+    if isinstance(mesh, str | Path):
+        source, path = str(mesh), Path(mesh)
+        refuse_others(path, "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
+        if not path.is_file():
+            raise InputError(f"{source}: no such mesh file")
+        check_mesh(path)
+        if finish.colour is None:
+            check_textures(path)
+        linear = path.suffix.lower() in (".glb", ".gltf")
+        try:
+            mesh = trimesh.load_scene(mesh)
+        except (OSError, *MESH_ERRORS) as error:
+            if path.suffix.lower() in _BY_OTHERS:
+                needed = _BY_OTHERS[path.suffix.lower()]
+                if importlib.util.find_spec(needed[0]) is None:
+                    raise MissingResourceError(f"{source}: reading it needs `pip install {needed[1]}`") from error
+            raise InputError(f"{source}: not a mesh that can be read ({error})") from error
+    if not (metres_per_unit > 0 and np.isfinite(metres_per_unit)):
+        raise InputError(f"{source}: metres_per_unit must be > 0 (got {metres_per_unit})")
+    scene = mesh if isinstance(mesh, trimesh.Scene) else trimesh.Scene({"mesh": mesh})
+    to_world = world_from_file(metres_per_unit, up)
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, geometry_name = scene.graph[node]
+        geometry = scene.geometry[geometry_name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            check_faces(geometry, source)
+            if not np.isfinite(geometry.vertices).all():
+                row = int(np.flatnonzero(~np.isfinite(geometry.vertices).all(axis=1))[0])
+                place = np.asarray(geometry.vertices[row]).tolist()
+                raise InputError(f"{source}: vertex positions must be finite (got {place} at vertex {row})")
+            try:
+                part = _read_part(str(geometry_name), geometry, to_world @ transform, finish, linear=linear)
+            except InputError as error:
+                raise InputError(f"{source}: part {geometry_name}: {error}") from error
+            if len(part.mesh.faces):
+                parts.append(part)
+    if not parts and any(len(getattr(g, "faces", ())) for g in scene.geometry.values()):
+        raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
+    if not parts:
+        raise InputError(f"{source}: a mesh needs at least one face (got none)")
+    if not sum(float(part.mesh.area) for part in parts) > 0:
+        raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
+    return tuple(parts)
+
+
+def world_from_file(metres_per_unit: float, up: Literal["y", "z"]) -> Float64Array:
+    """Matrix (4, 4) to metres, z up."""
+    matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
+    if up == "y":
+        matrix = matrix @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    return np.asarray(matrix)
+
+
+def _read_part(name: str, source: trimesh.Trimesh, transform: Float64Array, finish: Finish, *, linear: bool) -> Part:
+    """A part; its vertex colours are ``linear`` or display-encoded."""
+    geometry = trimesh.Trimesh(source.vertices, source.faces, process=False)
+    geometry.merge_vertices(merge_tex=True, merge_norm=True)
+    # Only what has collapsed: dropping slivers would open holes.
+    keep = np.diff(np.sort(geometry.faces, axis=1), axis=1).all(axis=1)
+    geometry.update_faces(keep)
+    geometry.apply_transform(transform)
+    faces = source.faces[keep]
+    visual, per_corner = source.visual, None
+    if isinstance(visual, ColorVisuals):
+        material = Material(np.ones(3), None, shiny=False)
+        if visual.kind == "vertex":
+            per_corner = visual.vertex_colors[faces]
+        elif visual.kind == "face":
+            per_corner = np.repeat(visual.face_colors[keep][:, None], 3, axis=1)
+        else:
+            material = replace(material, factor=np.full(3, UNKNOWN_COLOUR))
+    else:
+        material = read_material(visual.material)
+        stored = visual.vertex_attributes.get("color")
+        if stored is not None and len(stored) == len(source.vertices):
+            per_corner = to_rgba(np.asarray(stored))[faces]
+    warnings = [f"material of part {name!r}: {warning}" for warning in material.warnings]
+    material = _finished(material, finish)
+    if finish.colour is not None:
+        warnings, per_corner = [], None
+    gloss = (material.metallic, material.roughness, material.shiny, material.specular)
+    if material.texture is not None and visual.uv is not None:
+        if per_corner is not None and (per_corner[..., :3] < 255).any():
+            warnings.append(f"part {name!r} has a texture and vertex colours: these are left out")
+        texture = material.texture
+        if not (material.factor == 1.0).all():
+            texture = (255.0 * encode_srgb(decode_srgb(texture / 255.0) * material.factor)).round().astype(np.uint8)
+        return Part(name, geometry, None, texture, np.asarray(visual.uv)[faces], *gloss, tuple(warnings))
+    colours = np.ones((*faces.shape, 3))
+    if per_corner is not None:
+        colours = per_corner[..., :3] / 255.0 if linear else decode_srgb(per_corner[..., :3] / 255.0)
+    return Part(name, geometry, colours * material.factor, None, None, *gloss, tuple(warnings))
+
+
+def _finished(material: Material, finish: Finish) -> Material:
+    """``material`` with what ``finish`` gives."""
+    colour = finish.linear_colour()
+    if colour is not None:
+        material = replace(material, factor=colour, texture=None)
+    given = {
+        name: value for name in ("roughness", "metallic", "specular") if (value := getattr(finish, name)) is not None
+    }
+    if not given:
+        return material
+    if not material.shiny:
+        material = replace(material, roughness=ROUGHNESS, specular=DIELECTRIC_SPECULAR)
+    material = replace(material, **given)
+    return replace(
+        material,
+        roughness=max(material.roughness, LEAST_ROUGHNESS),
+        shiny=material.specular > 0 or material.metallic > 0,
+    )
+
+
+def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
+    """Mitsuba scene of ``parts`` under emitters ``lights``.
+
+    Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
+    """
+    ensure_variant()
+    shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE) if clay else part_shape(part) for k, part in enumerate(parts)}
+    return ray_scene({**shapes, **lights})
+
+
+def part_shape(part: Part) -> mi.Mesh:
+    """Mitsuba's shape of a part in its own material."""
+    return _mitsuba_mesh(part, _bsdf(part))
+
+
+def _bsdf(part: Part) -> dict[str, Any]:
+    if part.texture is not None:
+        colour: dict[str, Any] = {"type": "bitmap", "bitmap": mi.Bitmap(part.texture), "raw": False}
+    else:
+        colour = {"type": "mesh_attribute", "name": "vertex_color"}
+    if not part.shiny:
+        return {"type": "diffuse", "reflectance": colour}
+    return {
+        "type": "principled",
+        "base_color": colour,
+        "metallic": part.metallic,
+        "roughness": part.roughness,
+        "specular": part.reflectance / MOST_SPECULAR,
+    }
+
+
+def _mitsuba_mesh(part: Part, bsdf: dict[str, Any]) -> mi.Mesh:
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    count = len(part.mesh.faces)
+    mesh = mi.Mesh(
+        part.name, 3 * count, count, props=properties, has_vertex_normals=True, has_vertex_texcoords=part.uv is not None
+    )
+    if part.colours is not None:
+        mesh.add_attribute("vertex_color", 3, np.ravel(part.colours).astype(np.float32))
+    buffers = mi.traverse(mesh)
+    buffers["vertex_positions"] = np.ravel(part.mesh.triangles).astype(np.float32)
+    buffers["vertex_normals"] = np.ravel(corner_normals(part.mesh)).astype(np.float32)
+    if part.uv is not None:
+        buffers["vertex_texcoords"] = np.ravel(part.uv * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
+    buffers["faces"] = np.arange(3 * count, dtype=np.uint32)
+    buffers.update()
+    return mesh
+
+
+def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
+    """Mitsuba emitters, by name, of a named light (``uniform``, ``studio``) or of a scene's lights.
+
+    Raises:
+        InputError: If the name is unknown, or there is no light at all.
+    """
+    ensure_variant()
+    if light == "uniform":
+        return {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
+    if light == "studio":
+        return {"light": {"type": "envmap", "bitmap": mi.Bitmap(_studio()), "to_world": y_up_to_z_up(0.0)}}
+    if isinstance(light, str):
+        raise InputError(f"light must be uniform, studio or a scene's lights (got {light!r})")
+    if not light:
+        raise InputError("a scene whose lights are baked needs at least one light (got none)")
+    return {f"light_{k}": emitter_dict(spec) for k, spec in enumerate(light)}
+
+
+def _studio() -> Float32Array:
+    """Latitude-longitude map (H, W, 3) of eight soft boxes, one towards each corner of a cube, of mean radiance 1."""
+    height, width = 64, 128
+    polar = (np.arange(height) + 0.5) / height * np.pi
+    azimuth = (np.arange(width) + 0.5) / width * 2.0 * np.pi
+    direction = np.stack(
+        [
+            np.sin(polar)[:, None] * np.cos(azimuth),
+            np.sin(polar)[:, None] * np.sin(azimuth),
+            np.broadcast_to(np.cos(polar)[:, None], (height, width)),
+        ],
+        axis=-1,
+    )
+    boxes = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3) / np.sqrt(3.0)
+    radiance = 0.35 + np.exp(7.0 * (direction @ boxes.T - 1.0)).sum(axis=-1)
+    radiance /= (radiance * np.sin(polar)[:, None]).sum() / (np.sin(polar).sum() * width)
+    return np.repeat(radiance[..., None], 3, axis=2).astype(np.float32)

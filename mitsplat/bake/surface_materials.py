@@ -1,0 +1,289 @@
+"""What meshes look like: the materials of mesh files, and finishes that users give instead.
+
+Colours of files are display-encoded (PLY, STL, OBJ with its MTL), but for glTF's factors and vertex colours, which are
+linear by its specification (Khronos, *glTF 2.0*, 3.9.2 and 3.7.2.1). A texture without a factor counts as it is. An
+MTL without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageColor
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from mitsplat.arrays import Float64Array
+from mitsplat.errors import InputError
+from mitsplat.images.colour import decode_srgb, eight_bit
+from mitsplat.storage.files import IMAGE_ERRORS
+
+DIELECTRIC_SPECULAR = 0.04
+"""Reflectance at normal incidence of common plastics, lacquers and glass."""
+MOST_SPECULAR = 0.08
+UNKNOWN_COLOUR = 0.5
+"""Linear grey of what has no colour."""
+ROUGHNESS = 0.6
+LEAST_ROUGHNESS = 0.05
+_OPAQUE = 0.999
+_TRIMESH_DIFFUSE = (102, 102, 102)
+"""What trimesh fills in for a ``Kd`` that is absent."""
+
+
+@dataclass(frozen=True)
+class Finish:
+    """A material to use instead of a file's own; each value replaces that of all parts, None leaves it.
+
+    A colour replaces textures and vertex colours. Roughness, metalness or specular on a matt part make it glossy.
+
+    Attributes:
+        colour: Display-encoded: a name or ``#rrggbb`` as in CSS, or red, green, blue from 0 to 1.
+        roughness: Of glTF's material model, 0 (a mirror) to 1.
+        metallic: 0 for what is no metal to 1 for metal.
+        specular: Reflectance at normal incidence of what is no metal, 0 (matt) to 0.08; 0.04 for plastics.
+    """
+
+    colour: str | tuple[float, float, float] | None = None
+    roughness: float | None = None
+    metallic: float | None = None
+    specular: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in (("roughness", 1.0), ("metallic", 1.0), ("specular", MOST_SPECULAR)):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= most:
+                cause = " (more is a metal: give metallic 1)" if name == "specular" and value > most else ""
+                raise InputError(f"{name} must be from 0 to {most:g} (got {value:g}){cause}")
+        self.linear_colour()
+
+    def linear_colour(self) -> Float64Array | None:
+        """Linear red, green and blue, shape (3,), or None."""
+        if self.colour is None:
+            return None
+        if isinstance(self.colour, str):
+            try:
+                encoded = np.array(ImageColor.getrgb(self.colour)[:3]) / 255.0
+            except ValueError:
+                raise InputError(f"colour must be a name or #rrggbb, such as steelblue (got {self.colour!r})") from None
+        else:
+            encoded = np.asarray(self.colour, dtype=np.float64)
+            if encoded.shape != (3,) or not ((encoded >= 0) & (encoded <= 1)).all():
+                raise InputError(f"colour must be red, green and blue from 0 to 1 (got {self.colour!r})")
+        return decode_srgb(encoded)
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """One material, uniform but for its texture.
+
+    Attributes:
+        factor: Linear colour, or what multiplies the texture, shape (3,).
+        texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
+        metallic: 0 to 1.
+        roughness: Of glTF's material model, > 0.
+        specular: Reflectance at normal incidence of what is no metal.
+        shiny: Whether a highlight is reflected at all.
+        warnings: What of the file's material is left out, a sentence each.
+    """
+
+    factor: Float64Array
+    texture: npt.NDArray[np.uint8] | None
+    metallic: float = 0.0
+    roughness: float = 1.0
+    specular: float = DIELECTRIC_SPECULAR
+    shiny: bool = True
+    warnings: tuple[str, ...] = ()
+
+
+def read_material(material: Any) -> Material:
+    """Material of trimesh's."""
+    if isinstance(material, PBRMaterial):
+        return _read_gltf(material)
+    if isinstance(material, SimpleMaterial):
+        return _read_mtl(material)
+    return _read_gltf(material.to_pbr())
+
+
+def _read_gltf(source: PBRMaterial) -> Material:
+    warnings = []
+    # trimesh keeps the file's linear numbers in steps of 1/255.
+    factor = np.ones(3) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
+    if source.alphaMode not in (None, "OPAQUE") and (factor[3:] < _OPAQUE).any():
+        warnings.append("it is transparent, and baked opaque")
+    if source.emissiveTexture is not None or np.any(source.emissiveFactor):
+        warnings.append("it shines by itself, which is not baked")
+    metallic = 0.0 if source.metallicFactor is None else float(source.metallicFactor)
+    roughness = ROUGHNESS if source.roughnessFactor is None else float(source.roughnessFactor)
+    if source.metallicRoughnessTexture is not None:
+        # Absent factors are 1 beside this texture; its green is roughness, its blue metalness.
+        means = np.asarray(source.metallicRoughnessTexture.convert("RGB")).reshape(-1, 3).mean(axis=0) / 255.0
+        metallic = means[2] * (1.0 if source.metallicFactor is None else metallic)
+        roughness = means[1] * (1.0 if source.roughnessFactor is None else roughness)
+        warnings.append("its metalness and roughness are baked as the means of their texture")
+    return Material(
+        factor[:3],
+        _pixels(source.baseColorTexture, warnings),
+        float(np.clip(metallic, 0.0, 1.0)),
+        float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)),
+        warnings=tuple(warnings),
+    )
+
+
+def _read_mtl(source: SimpleMaterial) -> Material:
+    """An MTL's material: the file's own keys, because trimesh fills in a dark grey for a ``Kd`` that is absent."""
+    keys: Mapping[str, Any] = source.kwargs
+    warnings: list[str] = []
+    texture = _pixels(source.image, warnings)
+    diffuse = _numbers(keys, "kd")
+    if diffuse is None and not np.array_equal(source.diffuse[:3], _TRIMESH_DIFFUSE):
+        diffuse = np.asarray(source.diffuse[:3]) / 255.0
+    if diffuse is not None:
+        factor = decode_srgb(np.broadcast_to(np.clip(diffuse, 0, 1), 3))
+    else:
+        factor = np.ones(3) if texture is not None else np.full(3, UNKNOWN_COLOUR)
+    opacity, transparency = _numbers(keys, "d"), _numbers(keys, "tr")
+    if (opacity is not None and opacity[-1] < _OPAQUE) or (transparency is not None and transparency[0] > 1 - _OPAQUE):
+        warnings.append("it is transparent, and baked opaque")
+    emission = _numbers(keys, "ke")
+    if "map_ke" in keys or (emission is not None and emission.any()):
+        warnings.append("it shines by itself, which is not baked")
+    left_out = sorted({"map_pr", "map_pm", "map_ks", "map_ns", "map_d", "map_bump", "bump", "norm"} & set(keys))
+    if left_out:
+        warnings.append(f"its {', '.join(left_out)} {'is' if len(left_out) == 1 else 'are'} left out")
+    given_roughness, metallic = _numbers(keys, "pr"), _numbers(keys, "pm")
+    highlight, illumination = _numbers(keys, "ks"), _numbers(keys, "illum")
+    physical = given_roughness is not None or metallic is not None
+    specular = 0.0 if highlight is None else min(MOST_SPECULAR, MOST_SPECULAR * float(highlight.mean()))
+    if illumination is not None and illumination[0] < 2 and not physical:
+        specular = 0.0
+    if physical and highlight is None:
+        specular = DIELECTRIC_SPECULAR
+    roughness = ROUGHNESS
+    if given_roughness is not None:
+        roughness = float(given_roughness[0])
+    elif (exponent := _numbers(keys, "ns")) is not None:
+        # Phong's exponent as the slope's variance of a microfacet surface (Walter et al. 2007).
+        roughness = (2.0 / (max(0.0, float(exponent[0])) + 2.0)) ** 0.25
+    metal = 0.0 if metallic is None else float(np.clip(metallic[0], 0.0, 1.0))
+    shiny = specular > 0 or metal > 0
+    return Material(
+        factor,
+        texture,
+        metal,
+        float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)) if shiny else 1.0,
+        specular,
+        shiny,
+        tuple(warnings),
+    )
+
+
+def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
+    """Numbers of an MTL's key, or None where it is absent or damaged."""
+    try:
+        found = np.atleast_1d(np.asarray(keys[name], dtype=np.float64))
+    except (KeyError, ValueError):
+        return None
+    return found if len(found) and np.isfinite(found).all() else None
+
+
+def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.uint8] | None:
+    if image is None:
+        return None
+    try:
+        if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
+            warnings.append("its texture has transparent places, which are baked opaque")
+        return np.array(eight_bit(image))
+    except IMAGE_ERRORS as error:
+        raise InputError(f"its texture cannot be read ({error})") from error
+
+
+def check_textures(mesh: Path) -> None:
+    """Refuse a mesh whose material file, materials or textures are missing: without them it would bake in grey.
+
+    Raises:
+        InputError: If what an OBJ, its MTL, a glTF or a PLY names is missing, or is no image.
+    """
+    kind = mesh.suffix.lower()
+    if kind == ".obj":
+        _check_obj(mesh)
+    elif kind == ".gltf":
+        _check_gltf(mesh)
+    elif kind == ".ply":
+        with mesh.open("rb") as file:
+            header = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", errors="replace")
+        for texture in re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE):
+            _check_texture(mesh, texture)
+
+
+_HEADER = 1 << 16
+"""Bytes of a PLY file that its header is looked for in."""
+
+
+def _check_obj(mesh: Path) -> None:
+    libraries = _named(mesh, "mtllib")
+    known: list[str] = []
+    for library in libraries:
+        path = mesh.parent / library
+        if not path.is_file():
+            if all((mesh.parent / word).is_file() for word in library.split()):
+                raise InputError(f"{mesh}: must have one material file (got {library})")
+            raise InputError(f"{mesh}: its material file {library} is missing; put it there, or give a colour")
+        known += _named(path, "newmtl")
+        for texture in _named(path, "map_kd"):
+            if texture.startswith("-"):
+                raise InputError(f"{path}: options of a texture are not read: leave them out (got map_Kd {texture})")
+            _check_texture(path, texture)
+    missing = sorted(set(_named(mesh, "usemtl")) - set(known)) if libraries else []
+    if missing:
+        raise InputError(
+            f"{mesh}: its material {missing[0]} is not in {', '.join(libraries)}: add it, or give a colour"
+        )
+
+
+def _check_gltf(mesh: Path) -> None:
+    try:
+        said = json.loads(mesh.read_text("utf-8"))
+        images = [image.get("uri", "data:") for image in said.get("images", [])]
+        sources = [texture.get("source", 0) for texture in said.get("textures", [])]
+        for material in said.get("materials", []):
+            index = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}).get("index")
+            if index is not None and not (0 <= index < len(sources) and 0 <= sources[index] < len(images)):
+                raise InputError(f"{mesh}: a material's texture {index} is not there; give a colour")
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        return  # its reader says what is wrong
+    for uri in images:
+        if not uri.startswith("data:"):
+            _check_texture(mesh, unquote(uri))
+
+
+def _check_texture(path: Path, texture: str) -> None:
+    try:
+        with Image.open(path.parent / texture) as image:
+            image.load()
+    except IMAGE_ERRORS as error:
+        missing = not (path.parent / texture).is_file()
+        fault = "is missing" if missing else f"cannot be read ({error})"
+        raise InputError(f"{path}: its texture {texture} {fault}; put it there, or give a colour") from None
+
+
+def _named(path: Path, key: str) -> list[str]:
+    """What the lines of an OBJ or an MTL that begin with a key name."""
+    names = []
+    for line in path.read_bytes().splitlines():
+        words = line.split(maxsplit=1)
+        if len(words) == 2 and words[0].lower() == key.encode():
+            try:
+                names.append(words[1].strip().decode("utf-8"))
+            except UnicodeDecodeError:
+                name = words[1].strip().decode("cp1252", errors="replace")
+                raise InputError(f"{path}: names must be UTF-8: save it so, or rename it (got {key} {name})") from None
+    return names

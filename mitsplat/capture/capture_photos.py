@@ -1,0 +1,451 @@
+"""From photographs, or a video, to a :class:`~mitsplat.capture.capture.Capture`, the stage of ``mitsplat capture``."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mitsplat.arrays import BoolArray
+from mitsplat.capture.boards.board_mask import bare_squares
+from mitsplat.capture.boards.targets import Board
+from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
+from mitsplat.capture.exposure import even_exposure
+from mitsplat.capture.isolation import ChosenObject, hidden_part
+from mitsplat.capture.known_poses import read_poses
+from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
+from mitsplat.capture.overview import capture_sheet
+from mitsplat.capture.photo_masks import add_masks, given_masks, model_masks, object_masks, object_points
+from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
+from mitsplat.capture.picking import chosen_object
+from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
+from mitsplat.capture.video import ChosenFrames, choose_frames
+from mitsplat.errors import InputError
+from mitsplat.progress import Progress
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.files import write_file, write_text
+
+MIN_PHOTOS = 3
+MIN_REGISTERED = 0.75
+"""Share of the photos given from which a capture counts as a success."""
+
+FEW_POINTS = 3 * MIN_POINTS
+"""A camera that observes fewer points is worth a warning."""
+
+_HIDDEN = 0.03
+"""Share of the object from which what other things hide of it in a photo is unknown there."""
+_MOST_HIDDEN = 0.5
+"""Share of the object that is unknown in a photo up to which the rest of it is of use."""
+
+_INPUTS = "inputs.json"
+_PHOTOS = "sfm/photos.json"
+"""What the copies of photographs were made of, which is written first."""
+_RECORDED = ("source", "reprojection_error", "doubtful")
+"""What this file holds of a result beside its inputs."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What decides a capture beside its photographs.
+
+    Attributes:
+        kind: An object is cut out by masks; an environment is not.
+        max_size: Longest edge at which photos are used [px].
+        frames: Most frames that are taken of a video.
+        board: ChArUco board to look for.
+        tag: Edge of AprilTags as printed [m]; unknown if None.
+        scale_from: Two places and their distance [m], as in :func:`mitsplat.capture.metric_frame.spot`.
+        poses: COLMAP model or ``transforms.json`` to take cameras from.
+        metric: Whether ``poses`` are in metres with z up, and stay as they are.
+        masks: Folder of masks.
+        mask_model: ONNX file of a segmentation network.
+        undistorted: Whether photos are resampled to pinhole cameras.
+        picks: Places on the object, PHOTO:X,Y in pixels of the capture's photos; without any, it is what they look at.
+        picks_not: Places on things that are not the object.
+        box: Least and largest x, y and z of a box that holds the object, in the capture's frame.
+    """
+
+    kind: Literal["object", "environment"] = "object"
+    max_size: int = 1600
+    frames: int = 150
+    board: Board = DEFAULT_BOARD
+    tag: float | None = None
+    scale_from: tuple[str, str, float] | None = None
+    poses: Path | None = None
+    metric: bool = False
+    masks: Path | None = None
+    mask_model: Path | None = None
+    undistorted: bool = False
+    picks: tuple[str, ...] = ()
+    picks_not: tuple[str, ...] = ()
+    box: tuple[float, float, float, float, float, float] | None = None
+
+    @property
+    def hinted(self) -> bool:
+        """Whether anything is said of where the object is."""
+        return bool(self.picks or self.picks_not or self.box)
+
+    def __post_init__(self) -> None:
+        rules = (
+            (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
+            (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
+            (self.metric and self.poses is None, "poses must be given to be taken as metric"),
+            (self.masks is not None and self.mask_model is not None, "give a folder of masks or a model, not both"),
+            (
+                self.hinted and not (self.kind == "object" and self.masks is None and self.mask_model is None),
+                "picks and a box choose an object to make masks of: leave them out with given masks, a model or an "
+                "environment",
+            ),
+            (
+                self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)),
+                f"a box must be X0 Y0 Z0 X1 Y1 Z1, each X0 < X1, Y0 < Y1, Z0 < Z1 (got {self.box})",
+            ),
+        )
+        for broken, rule in rules:
+            if broken:
+                raise InputError(rule)
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureResult:
+    """A capture and what there is to say about it.
+
+    Attributes:
+        capture: As in its folder.
+        given: Number of photographs given.
+        source: Where scale and gravity come from, a clause.
+        reprojection_error: Mean over all observations [px].
+        doubtful: Share of the matches that a camera explains, where it is low and no board confirms the camera.
+        video: What the photographs are frames of, if they are.
+    """
+
+    capture: Capture
+    given: int
+    source: str
+    reprojection_error: float
+    doubtful: Mapping[str, float]
+    video: ChosenFrames | None = None
+
+    @property
+    def registered(self) -> float:
+        """Share of the photos given that are in the capture."""
+        return len(self.capture.photos) / self.given
+
+    @property
+    def exposure(self) -> str | None:
+        """How far exposures differed, which is corrected, a clause; None where they hardly did."""
+        gains = [np.log(photo.gain).mean() for photo in self.capture.photos if photo.gain is not None]
+        return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}, which is corrected" if gains else None
+
+    @property
+    def weak(self) -> dict[str, int]:
+        """Photos that observe few points, and how many."""
+        counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
+        return {name: count for name, count in counts.items() if count < FEW_POINTS}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of photos that are in the capture, one sentence each."""
+        warnings = [] if self.video is None else [*self.video.warnings]
+        if self.doubtful:
+            shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
+            warnings.append(
+                f"cameras explain few of their matches and may be wrong, leave them out or add others: {shares}"
+            )
+        if self.weak:
+            warnings.append(f"weakly held, more overlap would help: {', '.join(self.weak)}")
+        return tuple(warnings)
+
+    @property
+    def shortcoming(self) -> str | None:
+        """The threshold that was missed and what would help, or None."""
+        if self.registered >= MIN_REGISTERED:
+            return None
+        return (
+            f"only {len(self.capture.photos)} of {self.given} photos ({self.registered:.0%}) could be used, "
+            f"{MIN_REGISTERED:.0%} are wanted: take sharp photos of one thing at steps of about ten degrees, with "
+            "texture under it and even light"
+        )
+
+
+def capture_photos(
+    photos: Path, out: Path, settings: CaptureSettings = CaptureSettings(), *, progress: Progress | None = None
+) -> CaptureResult:
+    """Find cameras, scale, gravity and masks of photographs; what an interrupted or finished run left is used.
+
+    Args:
+        photos: Folder of photographs of one object or place, or a video of it.
+        out: Folder of the capture; ``sfm/`` in it keeps what a repeated run can use, ``frames/`` those of a video.
+        settings: What else decides the result.
+        progress: Told steps done, of how many, and what is being done.
+
+    Raises:
+        InputError: If there are fewer than three usable photographs, or no cameras can be found from them, or what is
+            given lies where the capture is written.
+        MissingResourceError: If COLMAP or the masks' model fails to run.
+    """
+    _keep_apart(out, photos, settings)
+    if settings.masks is not None and not settings.masks.is_dir():
+        raise InputError(f"{settings.masks}: no such folder of masks")
+    if photos.is_file() and photos.suffix.lower() not in SUFFIXES:
+        video = choose_frames(photos, out / "frames", most=settings.frames, least=MIN_PHOTOS, progress=progress)
+        return replace(_capture(video.folder, out, settings, progress), video=video)
+    return _capture(photos, out, settings, progress)
+
+
+def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progress | None) -> CaptureResult:
+    """The capture of a folder of photographs."""
+    files = find_photos(photos, but=settings.masks)
+    if len(files) < MIN_PHOTOS:
+        raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
+    inputs = _inputs(photos, files, settings)
+    if (done := _finished(out, inputs)) is not None:
+        return done
+    work = out / "sfm"
+    for marker in (_INPUTS, CAPTURE_FILE):  # pictures and masks are about to be others
+        (out / marker).unlink(missing_ok=True)
+    _forget_other_photos(out, inputs, settings)
+    prepared, rejected = prepare_photos(
+        photos,
+        out / "images",
+        but=settings.masks,
+        max_size=settings.max_size,
+        upright=settings.poses is None,
+        progress=progress,
+    )
+    if len(prepared) < MIN_PHOTOS:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
+        raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
+    by_file = {photo.file.name: photo for photo in prepared}
+    model, frame, faults = _find_model(photos, by_file, settings, work, progress)
+    rejected |= {by_file[file].name: fault for file, fault in faults.items()}
+    capture = Capture(
+        photos=tuple(
+            Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
+            for file, camera in model.cameras.items()
+        ),
+        points=model.points,
+        colours=model.colours,
+        units=frame.units,
+        up=frame.up,
+        rejected=rejected,
+        scale_error=frame.scale_error,
+    ).transformed(frame.matrix)
+    # What is near depends on what the units are; poses carry none.
+    near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
+    capture = replace(capture, photos=near, table=frame.table)
+    if settings.undistorted:
+        capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
+    capture = even_exposure(capture)
+    if settings.kind == "object":
+        capture = _masked(capture, frame, settings, prepared, out, progress)
+        if len(capture.photos) < MIN_PHOTOS:
+            name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
+            raise InputError(
+                f"{photos}: only {len(capture.photos)} photos can be cut out ({name}: {reason}); give masks"
+            )
+    capture = capture.save(out)
+    used = {photo.file.name for photo in capture.photos}
+    for path in (out / "images").iterdir():
+        if path.name not in used:
+            path.unlink()
+    write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
+    kept = {photo.name for photo in capture.photos}
+    doubtful = {
+        by_file[file].name: share
+        for file, share in model.agreement.items()
+        if share < SURE_AGREEMENT and file not in frame.confirmed and by_file[file].name in kept
+    }
+    result = CaptureResult(capture, len(files), frame.source, model.reprojection_error, doubtful)
+    record = {key: getattr(result, key) for key in _RECORDED}
+    write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
+    return result
+
+
+def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
+    """Refuse to write among what was given, or is no capture's: files that are no longer needed are removed."""
+    if out.resolve().is_relative_to(photos.resolve()):
+        raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
+    if settings.masks is not None and settings.masks.resolve() == photos.resolve():
+        raise InputError(f"{settings.masks}: photographs cannot be their own masks")
+    folders = [out / made for made in ("frames", "images", "masks", "sfm")]
+    for given in (photos, settings.masks, settings.poses, settings.mask_model):
+        for folder in folders:
+            if given is not None and given.resolve().is_relative_to(folder.resolve()):
+                raise InputError(f"{given}: must not lie in {folder}, which is written anew")
+    known = any((out / file).is_file() for file in (_PHOTOS, _INPUTS, CAPTURE_FILE))
+    for folder in folders:
+        if folder.is_symlink() or (folder.name != "frames" and not known and folder.exists() and any(folder.iterdir())):
+            raise InputError(f"{folder}: is there already, and not of a capture: choose another folder")
+
+
+def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
+    """What decides a capture, in JSON: what files hold, and not where they lie."""
+    given = {name: getattr(settings, name) for name in ("poses", "masks", "mask_model")}
+    kept = {name: value for name, value in asdict(settings).items() if name not in ("frames", *given)}
+    others = [(name, at, path) for name, at in given.items() if at is not None for path in [at, *sorted(at.rglob("*"))]]
+    return {
+        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},  # or frames of a video
+        "settings": json.loads(json.dumps(kept, default=str)),
+        "files": {f"{name}/{path.relative_to(at)}": file_hash(path) for name, at, path in others if path.is_file()},
+    }
+
+
+def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
+    """The result that ``out`` holds already, if it is of the same inputs."""
+    try:
+        record = json.loads((out / _INPUTS).read_text())
+        if record["inputs"] != inputs or not (out / "capture.png").is_file():
+            return None
+        capture = Capture.load(out)
+        return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
+    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
+        return None
+
+
+def _forget_other_photos(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
+    """Drop masks, and copies and matches that were made of other photographs or in another way."""
+    way = settings.max_size, settings.poses is None, settings.undistorted
+    marker = json.dumps([inputs["photos"], *way], sort_keys=True)
+    file = out / _PHOTOS
+    if not (file.exists() and file.read_text() == marker):
+        shutil.rmtree(out / "sfm", ignore_errors=True)
+        shutil.rmtree(out / "images", ignore_errors=True)
+        write_text(file, marker)
+    elif settings.undistorted:  # the pictures of an earlier run may bear the names of the copies
+        shutil.rmtree(out / "images", ignore_errors=True)
+    shutil.rmtree(out / "masks", ignore_errors=True)
+
+
+def _find_model(
+    photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
+) -> tuple[SparseModel, MetricFrame, dict[str, str]]:
+    """Cameras that neither each other nor a board contradicts, where they are put, and why other files have none."""
+    faults: dict[str, str] = {}
+    if settings.poses is not None:
+        model = read_poses(settings.poses, list(by_file.values()), work, progress)
+    else:
+        model, faults = _without_faults(find_cameras(list(by_file.values()), work, progress))
+    _demand_cameras(photos, model, by_file, faults)
+    frame = _metric_frame(model, by_file, settings)
+    while frame.wrong:
+        faults |= {
+            file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
+            for file, error in frame.wrong.items()
+        }
+        model, further = _without_faults(model.without(frame.wrong), least=0 if settings.poses else MIN_POINTS)
+        faults |= further
+        _demand_cameras(photos, model, by_file, faults)
+        frame = _metric_frame(model, by_file, settings)
+    absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
+    elsewhere = "it only fits a smaller group of photos, as of another object or side"
+    for file in by_file.keys() - model.cameras.keys() - faults.keys():
+        faults[file] = elsewhere if file in model.elsewhere else absent
+    return model, frame, faults
+
+
+def _demand_cameras(
+    photos: Path, model: SparseModel, by_file: Mapping[str, Prepared], faults: Mapping[str, str]
+) -> None:
+    """Refuse too few cameras."""
+    if len(model.cameras) < MIN_PHOTOS:
+        reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
+        raise InputError(
+            f"{photos}: cameras of only {len(model.cameras)} of {len(by_file)} photos could be found, {MIN_PHOTOS} are "
+            f"needed{f' ({reasons})' if reasons else ''}; take them closer together, and with texture on or under the "
+            "object"
+        )
+
+
+def _without_faults(model: SparseModel, least: int = MIN_POINTS) -> tuple[SparseModel, dict[str, str]]:
+    """The model without cameras that contradict the others or observe fewer points, and why each is left out."""
+    shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
+    wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
+    model, weak = model.without(wrong).without_weak(least)
+    faults = {
+        file: f"its camera is wrong: it explains only {share:.0%} of its matches" for file, share in wrong.items()
+    }
+    return model, faults | {
+        file: f"only {points} points could be matched in it, {least} are needed" for file, points in weak.items()
+    }
+
+
+def _metric_frame(model: SparseModel, by_file: dict[str, Prepared], settings: CaptureSettings) -> MetricFrame:
+    if settings.metric:
+        return MetricFrame(np.eye(4), "metre", "z", table=True, source="the poses given")
+    return find_metric_frame(
+        model,
+        {file: by_file[file].file for file in model.cameras},
+        board=settings.board,
+        tag=settings.tag,
+        scale_from=_spots(settings.scale_from, by_file),
+        centred=settings.kind == "object",
+    )
+
+
+def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepared]) -> tuple[str, str, float] | None:
+    """``scale_from`` with the copies' names instead of the photos'."""
+    if scale_from is None:
+        return None
+    files = {photo.name: file for file, photo in by_file.items()}
+
+    def stored(spot: str) -> str:
+        name, colon, pixel = spot.rpartition(":")
+        return f"{files.get(name, name)}{colon}{pixel}" if colon else files.get(spot, spot)
+
+    one, other, metres = scale_from
+    return stored(one), stored(other), metres
+
+
+def _masked(
+    capture: Capture,
+    frame: MetricFrame,
+    settings: CaptureSettings,
+    prepared: Sequence[Prepared],
+    out: Path,
+    progress: Progress | None,
+) -> Capture:
+    mask_folder = out / "masks"
+    if settings.masks is not None:
+        made = {photo.name: photo for photo in prepared}
+        return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
+    if settings.mask_model is not None:
+        return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
+    if not frame.table and not settings.hinted:
+        raise InputError(
+            "no table was found under the object to cut it out by: pick it (--pick), give masks (--masks or "
+            "--mask-model), put it on something with texture, or capture it as an environment (--kind environment)"
+        )
+    hidden: dict[str, BoolArray] = {}
+    bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
+    if frame.board is not None and not settings.hinted:
+        points = object_points(capture)
+        above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
+    else:
+        chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
+        points, above = chosen.points, chosen.above
+        capture, hidden = _hidden_parts(capture, chosen)
+    return object_masks(capture, points, above, mask_folder, bare=bare, hidden=hidden, progress=progress)
+
+
+def _hidden_parts(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:
+    """The capture without photos in which other things hide much of the object, and what they may hide in others.
+
+    The pixels (H, W) are by the names of the photos.
+    """
+    photos, rejected, hidden = [], dict(capture.rejected), dict[str, BoolArray]()
+    for photo in capture.photos:
+        hides, may_hide, pixels = hidden_part(photo.camera, chosen.above, chosen.others)
+        if hides > _HIDDEN and may_hide > _MOST_HIDDEN:
+            rejected[photo.name] = f"another thing stands before the object and may hide {may_hide:.0%} of it"
+            continue
+        photos.append(photo)
+        if hides > _HIDDEN:
+            hidden[photo.name] = pixels
+    return replace(capture, photos=tuple(photos), rejected=rejected), hidden

@@ -1,0 +1,336 @@
+"""Captured light to lines of a scene file, with a panorama of what is no lamp, and a picture to judge them by."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from mitsplat.arrays import ByteImage, Float32Array, Float64Array
+from mitsplat.capture.lighting.brackets import CLIPPED, exposures_of, merge_exposures, read_photograph
+from mitsplat.capture.lighting.lamps import Lamp, take_lamps
+from mitsplat.capture.lighting.mirror_ball import BallPanorama, Circle, find_ball, unwrap_ball
+from mitsplat.capture.lighting.panorama import HDR_SUFFIXES, level_irradiance, read_radiance, resized, write_exr
+from mitsplat.errors import InputError
+from mitsplat.images.colour import LUMINANCE, encode_srgb
+from mitsplat.storage.files import write_file, write_text
+
+_WIDEST = 4096
+"""Of panoramas that are written [px]."""
+_MIDDLE = 110.0
+"""Mean level of the photograph that the ball is shown in, about."""
+_SMALLEST = 20.0
+"""Radius of a ball in its photograph [px], of which 45 degrees around what is behind it are not seen."""
+_OUTLINE = (230, 40, 40)
+
+
+@dataclass(frozen=True)
+class BallView:
+    """How a mirror ball was photographed.
+
+    Attributes:
+        azimuth, elevation: Where the camera is as seen from the ball [degrees].
+        ball: Middle and radius of the ball in the image [px]; it is looked for if None.
+        fov_x: Horizontal field of view [degrees]; that of EXIF if None, and parallel rays without.
+        exposures: One for each photograph [s]; those of EXIF if None.
+        reflectivity: Of the ball, linear RGB.
+    """
+
+    azimuth: float
+    elevation: float
+    ball: tuple[float, float, float] | None = None
+    fov_x: float | None = None
+    exposures: tuple[float, ...] | None = None
+    reflectivity: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.azimuth) and -90 < self.elevation < 90):
+            raise InputError(
+                f"--camera must be an azimuth and an elevation between -90 and 90 "
+                f"(got {self.azimuth:g} {self.elevation:g})"
+            )
+        if self.fov_x is not None and not 0 < self.fov_x < 180:
+            raise InputError(f"--fov-x must be between 0 and 180 degrees (got {self.fov_x:g})")
+        if not all(0 < channel <= 1 for channel in self.reflectivity):
+            raise InputError(f"--reflectivity must be above 0 and at most 1 (got {self.reflectivity})")
+        if self.ball is not None and not (np.isfinite(self.ball).all() and self.ball[2] > 0):
+            raise InputError(f"--ball must have a radius > 0 (got {self.ball})")
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """How light becomes lines of a scene file.
+
+    Attributes:
+        around: What is lit, where the light was captured [m].
+        distance: From it to the lamps [m], whose sizes grow with it.
+        lamps: Most lamps; the others stay in the image.
+        rest: Whether what is no lamp is an image, or a constant of the same irradiance.
+        rotate_z: Turn of the panorama about the vertical [degrees].
+        irradiance: Horizontal irradiance that all light is scaled to [W/m^2]; None leaves it as it is.
+    """
+
+    around: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distance: float = 1.5
+    lamps: int = 6
+    rest: Literal["image", "constant"] = "image"
+    rotate_z: float = 0.0
+    irradiance: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("distance", self.distance), ("irradiance", self.irradiance)):
+            if value is not None and not 0 < value < np.inf:
+                raise InputError(f"--{name} must be finite and > 0 (got {value:g})")
+        if self.lamps < 0:
+            raise InputError(f"--lamps must be >= 0 (got {self.lamps})")
+        if not np.isfinite([*self.around, self.rotate_z]).all():
+            raise InputError(f"--around and --rotate-z must be finite (got {self.around}, {self.rotate_z:g})")
+
+
+@dataclass(frozen=True, eq=False)
+class LightEstimate:
+    """Light that was captured.
+
+    Attributes:
+        lamps: By falling share of the irradiance.
+        rest: Radiance of what is no lamp, equirectangular, (H, W, 3).
+        panorama: Radiance of everything, (H, W, 3).
+        settings: What it was made by.
+    """
+
+    lamps: Sequence[Lamp]
+    rest: Float32Array
+    panorama: Float32Array
+    settings: LightSettings
+
+    @property
+    def irradiance(self) -> Float64Array:
+        """Of a horizontal plane by everything, linear RGB [W/m^2]."""
+        return level_irradiance(self.panorama)
+
+    @property
+    def ambient(self) -> Float64Array:
+        """Of a horizontal plane by what is no lamp, linear RGB [W/m^2]."""
+        return level_irradiance(self.rest)
+
+    def share(self, irradiance: Float64Array) -> float:
+        """Of the luminance of all irradiance."""
+        return float(irradiance @ LUMINANCE / (self.irradiance @ LUMINANCE))
+
+
+def estimate_light(panorama: Float32Array, settings: LightSettings) -> LightEstimate:
+    """Lamps and the rest of a panorama of radiance, (H, W, 3), which has light above the horizon."""
+    if panorama.shape[1] > _WIDEST:
+        panorama = resized(panorama, _WIDEST // 2, _WIDEST)
+    if settings.irradiance is not None:
+        panorama = panorama * np.float32(settings.irradiance / (level_irradiance(panorama) @ LUMINANCE))
+    lamps, rest = take_lamps(panorama, rotate_z=settings.rotate_z, most=settings.lamps)
+    return LightEstimate(lamps, rest, panorama, settings)
+
+
+@dataclass(frozen=True, eq=False)
+class BallReading:
+    """What a mirror ball showed.
+
+    Attributes:
+        panorama: What it mirrors.
+        ball: Middle and radius in the photograph [px].
+        picture: The photograph with the ball's outline, (H, W, 3).
+        warnings: What makes the panorama doubtful, a sentence each.
+    """
+
+    panorama: BallPanorama
+    ball: Circle
+    picture: ByteImage
+    warnings: Sequence[str]
+
+
+def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
+    """The panorama that a mirror ball shows.
+
+    Args:
+        paths: An HDR photograph, or one or several photographs of 8 bits that differ in their exposure alone.
+        view: How they were taken.
+
+    Raises:
+        InputError: If they cannot be read or merged, or the ball is not found or not whole.
+    """
+    warnings = list[str]()
+    hdr = paths[0].suffix.lower() in HDR_SUFFIXES
+    if hdr and len(paths) > 1:
+        raise InputError(f"{paths[1]}: an HDR photograph must be the only one (got {len(paths)})")
+    if hdr and view.exposures is not None:
+        raise InputError(f"{paths[0]}: --exposures is of photographs of 8 bits; an HDR photograph is taken as it is")
+    if hdr:
+        image = read_radiance(paths[0])
+        pixels, focal = [_shown(image)], None
+    else:
+        photographs = [read_photograph(path) for path in paths]
+        exposures = exposures_of(photographs, view.exposures)
+        pixels, focal = [photograph.pixels for photograph in photographs], photographs[0].focal
+    picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MIDDLE))
+    ball = find_ball(*pixels) if view.ball is None else view.ball
+    if ball is None:
+        raise InputError(f"{paths[0]}: no ball stands out in it: give --ball X Y RADIUS")
+    x, y, radius = ball
+    height, width = picture.shape[:2]
+    if min(x, y, width - x, height - y) < radius:
+        raise InputError(
+            f"{paths[0]}: the ball must be whole in the photograph, {width} x {height} px (got one of radius "
+            f"{radius:.0f} around {x:.0f}, {y:.0f})"
+        )
+    if radius < _SMALLEST:
+        raise InputError(f"{paths[0]}: the ball's radius must be {_SMALLEST:g} px or more (got {radius:.0f})")
+    clipped = np.zeros((height, width), bool)
+    if not hdr:
+        part = tuple(slice(max(0, int(middle - radius) - 1), int(middle + radius) + 2) for middle in (y, x))
+        image = np.zeros((height, width, 3), np.float32)
+        image[part], clipped[part] = merge_exposures([levels[part] for levels in pixels], exposures)
+        if len(paths) < 3:
+            warnings.append(
+                f"{len(paths)} exposure{'s' * (len(paths) > 1)}: radiance is by the curve of sRGB, which cameras bend; "
+                "three or more would show the camera's own"
+            )
+    if view.fov_x is not None:
+        focal = 0.5 * width / float(np.tan(np.radians(view.fov_x) / 2))
+    if focal is None:
+        warnings.append("no focal length in EXIF: the camera's rays count as parallel; give --fov-x")
+    image /= np.array(view.reflectivity, dtype=np.float32)
+    found = unwrap_ball(image, ball, focal, view.azimuth, view.elevation, clipped)
+    if not level_irradiance(found.radiance).any():
+        raise InputError(f"{paths[0]}: the ball must mirror light from above the horizon (got none)")
+    if found.clipped > 0:
+        warnings.append(
+            f"{found.clipped:.2%} of the ball is white (from {CLIPPED} of 255) in the shortest exposure: what lamps "
+            "send there is a lower bound"
+        )
+    return BallReading(found, ball, _with_circle(picture, ball), warnings)
+
+
+def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None = None) -> list[Path]:
+    """Write a scene file's lines, and beside them the images that they name and a picture.
+
+    Args:
+        estimate: What is written.
+        out: NAME.yaml. The others are NAME_panorama.exr of all light, NAME_rest.exr of what is no lamp if the lines
+            name it, and NAME.png.
+        photograph: Shown in the picture beside the panorama.
+
+    Returns:
+        The files.
+    """
+    picture_file, panorama, rest = _beside(out)
+    image = panorama.name
+    files = [out, picture_file, panorama]
+    write_exr(panorama, estimate.panorama)
+    if estimate.lamps and estimate.settings.rest == "image":
+        image = rest.name
+        files.append(rest)
+        write_exr(rest, estimate.rest)
+    shown = _outlined(estimate)
+    if photograph is not None:
+        width = photograph.shape[1] * len(shown) // len(photograph)
+        beside = cv2.resize(photograph, (width, len(shown)), interpolation=cv2.INTER_AREA)
+        shown = np.hstack([np.asarray(beside), shown])
+    picture = Image.fromarray(shown)
+    write_file(files[1], lambda part: picture.save(part, "PNG"))
+    write_text(out, light_lines(estimate, image))
+    return files
+
+
+def _beside(out: Path) -> tuple[Path, Path, Path]:
+    """The picture, and the images of all light and of what is no lamp, of a scene file's lines."""
+    panorama, rest = (out.with_name(f"{out.stem}_{part}.exr") for part in ("panorama", "rest"))
+    return out.with_suffix(".png"), panorama, rest
+
+
+def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
+    """Refuse to write where :func:`write_light` would replace what it was given, or what it has not written.
+
+    Raises:
+        InputError: Which names the file.
+    """
+    written, given = (out, *_beside(out)), {image.resolve() for image in images}
+    if lost := [file for file in written if file.resolve() in given]:
+        raise InputError(f"{lost[0]}: would be replaced: give another --out (got {out})")
+    there = [file for file in written if file.exists()]
+    if there and not (out.is_file() and out.read_bytes().startswith(_TITLE.encode())):
+        raise InputError(f"{there[0]}: is there already, and not of `mitsplat lights`: give another --out (got {out})")
+
+
+_TITLE = "# Captured light: "
+"""How a file of lights begins."""
+
+
+def light_lines(estimate: LightEstimate, image: str) -> str:
+    """The key ``lights`` of a scene file; ``image`` is the file of what is no lamp."""
+    settings = estimate.settings
+    lines = [
+        f"{_TITLE}{estimate.irradiance @ LUMINANCE:.4g} W/m^2 on a horizontal plane, "
+        f"{estimate.share(estimate.ambient):.1%} of it ambient.",
+        "lights:",
+    ]
+    for lamp in estimate.lamps:
+        position = np.array(settings.around) + settings.distance * lamp.direction
+        width, height = settings.distance * np.array(lamp.extents)
+        lines.append(area_line(position, settings.around, (width, height), lamp.radiance))
+    if settings.rest == "constant":
+        lines.append(f"  - {{kind: environment, {radiance_keys(estimate.ambient / np.pi)}}}")
+    else:
+        turn = f", rotate_z: {settings.rotate_z:g}" if settings.rotate_z else ""
+        lines.append(f"  - {{kind: environment, image: {json.dumps(image, ensure_ascii=False)}{turn}}}")
+    return "\n".join(lines) + "\n"
+
+
+def area_line(
+    position: Float64Array, target: Sequence[float] | Float64Array, size: tuple[float, float], radiance: Float64Array
+) -> str:
+    """One of the entries of ``lights``."""
+    return (
+        f"  - {{kind: area, position: {list_of(position)}, target: {list_of(target)}, "
+        f"size: {list_of(size)}, {radiance_keys(radiance)}}}"
+    )
+
+
+def radiance_keys(rgb: Float64Array) -> str:
+    """Its luminance as radiance, and its colour."""
+    luminance = float(rgb @ LUMINANCE)
+    return f"radiance: {luminance:.5g}, colour: {list_of(rgb / luminance)}"
+
+
+def list_of(values: Sequence[float] | Float64Array) -> str:
+    """Numbers as a scene file has them."""
+    return f"[{', '.join(f'{value:.5g}' for value in values)}]"
+
+
+def _shown(radiance: Float32Array) -> ByteImage:
+    """Radiance as a picture whose median luminance is a middle grey."""
+    middle = float(np.median(radiance @ LUMINANCE)) or float(radiance.mean())
+    return np.asarray(np.rint(255 * np.minimum(encode_srgb(radiance * (0.18 / middle)), 1.0)), dtype=np.uint8)
+
+
+def _with_circle(photograph: ByteImage, circle: Circle) -> ByteImage:
+    """The photograph with a circle drawn in."""
+    x, y, radius = (round(16 * value) for value in circle)
+    thick = max(1, photograph.shape[0] // 250)
+    return np.asarray(cv2.circle(photograph.copy(), (x - 8, y - 8), radius, _OUTLINE, thick, cv2.LINE_AA, shift=4))
+
+
+def _outlined(estimate: LightEstimate) -> ByteImage:
+    """The panorama with its lamps outlined and numbered."""
+    width = 1024
+    shown = np.ascontiguousarray(_shown(resized(estimate.panorama, width // 2, width)))
+    for number, lamp in enumerate(estimate.lamps, start=1):
+        mask = cv2.resize(lamp.pixels.astype(np.uint8), (width, width // 2), interpolation=cv2.INTER_NEAREST)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(shown, contours, -1, _OUTLINE, 2)
+        x, y, across, _ = cv2.boundingRect(max(contours, key=cv2.contourArea))
+        place = (min(x + across + 4, width - 20), max(y + 14, 20))
+        cv2.putText(shown, str(number), place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, _OUTLINE, 2, cv2.LINE_AA)
+    return shown

@@ -1,0 +1,471 @@
+"""Which pixels of a photograph are the object: masks given by the user, from a segmentation model, or from geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import ExifTags, Image, ImageOps
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.capture.capture import Capture, Photo, mask_name
+from mitsplat.capture.photos import Prepared
+from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
+from mitsplat.progress import Progress
+from mitsplat.runtime.cores import usable_cores
+from mitsplat.runtime.onnx_networks import load_library
+from mitsplat.storage.files import IMAGE_ERRORS, write_file
+
+ByteImage = npt.NDArray[np.uint8]
+MaskMaker = Callable[[Photo], BoolArray]
+"""Makes the mask of a photo, shape (H, W)."""
+
+Hidden = Mapping[str, BoolArray]
+"""Pixels (H, W) of a photo in which another thing may hide the object, by its name; photos without such are absent."""
+_NOTHING: Hidden = {}
+
+Bare = Callable[[Camera, npt.NDArray[np.uint8]], BoolArray]
+"""Pixels (H, W) of a grey image (H, W) by a camera that are surely not the object."""
+
+MIN_SHARE = 0.02
+"""Share of a photo that its object must cover; models that find nothing mark less than that."""
+
+MIN_AGREEMENT = 0.7
+"""Share of the object's points in a photo that its mask must cover."""
+
+_WORK_EDGE = 480
+"""Longer edge of a photo at which GrabCut begins, and of the object at which it ends [px]."""
+
+_FAR_OFF = 100
+"""Sizes of the image within which a point must be projected to count."""
+
+_ROUNDS = 3
+_EXTENSIONS = 4
+_RING = 0.1
+"""Width of what is in question around the object, as a share of its size."""
+
+_CELLS = 96
+"""Cells along the longest edge of the box in which masks are brought together."""
+
+_DISSENT = 0.04
+"""Share of the photos whose masks may leave a point out and be overruled by the others."""
+
+_DOUBT = 0.04
+"""Width on either side of the common outline in which a photo decides for itself, as a share of the object's size."""
+
+_FEWEST = 3
+"""Photos that can agree on an outline."""
+
+_ABOVE = 0.01
+"""Height over the table from which a point belongs to the object, as a share of the cameras' distance."""
+
+
+def add_masks(
+    capture: Capture,
+    make: MaskMaker,
+    folder: Path,
+    *,
+    progress: Progress | None = None,
+    points: Float64Array | None = None,
+    hidden: Hidden = _NOTHING,
+    threads: int = 1,
+) -> Capture:
+    """The capture with a mask for each photo; photos whose mask is unusable are rejected.
+
+    Args:
+        capture: Its photos' files must exist.
+        make: Makes one mask.
+        folder: Where the masks are written.
+        progress: Told the photos done.
+        points: Points known to be of the object, shape (N, 3), that masks must cover.
+        hidden: Where other things may hide the object.
+        threads: How many masks are made at a time.
+    """
+    photos, rejected = [], dict(capture.rejected)
+
+    def cut(photo: Photo) -> str | None:
+        """Write the mask of a photo, or say why it is unusable."""
+        mask, unknown = make(photo), hidden.get(photo.name)
+        mask = mask if unknown is None else mask & ~unknown
+        reason = _fault(mask, photo.camera, points, unknown)
+        if reason is None:
+            write_file(folder / mask_name(photo.name), partial(_save, mask, unknown))
+        return reason
+
+    with ThreadPoolExecutor(threads) as pool:
+        for done, (photo, reason) in enumerate(
+            zip(capture.photos, pool.map(cut, capture.photos), strict=True), start=1
+        ):
+            if reason is None:
+                photos.append(replace(photo, mask=folder / mask_name(photo.name)))
+            else:
+                rejected[photo.name] = reason
+            if progress is not None:
+                progress(done, len(capture.photos), "cutting out")
+    return replace(capture, photos=tuple(photos), rejected=rejected)
+
+
+def object_masks(
+    capture: Capture,
+    points: Float64Array,
+    above: Float64Array,
+    folder: Path,
+    *,
+    bare: Bare | None = None,
+    hidden: Hidden = _NOTHING,
+    progress: Progress | None = None,
+) -> Capture:
+    """The capture with masks of an object that some of its points are on, cut out of each photo and then of all.
+
+    Args:
+        capture: Its photos' files must exist.
+        points: Of the object and of where it stands, shape (N, 3).
+        above: Of the object alone, which masks must cover, shape (M, 3).
+        folder: Where the masks are written.
+        bare: Finds what is surely not the object.
+        hidden: Where other things may hide the object: there masks show nothing, and are transparent.
+        progress: Told the photos done.
+    """
+    add = partial(
+        add_masks, capture, folder=folder, progress=progress, points=above, hidden=hidden, threads=usable_cores()
+    )
+    masked = add(geometric_masks(points, bare, hidden))
+    if len(masked.photos) < _FEWEST:
+        return masked
+    # What a photo was rejected for may be what the others set right.
+    return add(agreed_masks(masked, points, bare, hidden))
+
+
+def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
+    """Masks of the user: ``<photo>.png`` with or without the photo's own suffix, in any case, in the size of the photo.
+
+    White, or what is opaque in a picture with transparency, marks the object. A mask lies as viewers show the photo;
+    one that lies on its side, as the camera held by EXIF's account, is turned.
+
+    Raises:
+        InputError: The maker, if a mask is missing or of another shape.
+    """
+    below = sorted(path for path in folder.rglob("*") if path.is_file())
+    by_name = {path.relative_to(folder).as_posix().lower(): path for path in below}
+
+    def make(photo: Photo) -> BoolArray:
+        name = Path(photo.name)
+        candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
+        path = next((by_name[file.lower()] for file in candidates if file.lower() in by_name), None)
+        if path is None:
+            raise InputError(f"{folder}: there must be a mask for every photo (got none named {candidates[1]})")
+        try:
+            with Image.open(path) as image:
+                upright = ImageOps.exif_transpose(image)
+                mask = upright.getchannel("A") if "A" in upright.getbands() else upright.convert("L")
+                if mask.getextrema() == (255, 255):  # opaque everywhere says nothing
+                    mask = upright.convert("L")
+        except IMAGE_ERRORS as error:
+            raise InputError(f"{path}: not a readable image ({error})") from error
+        size = (photo.camera.width, photo.camera.height)
+        if shapes_differ(mask.size, size) and not shapes_differ(mask.size[::-1], size):
+            mask.getexif()[ExifTags.Base.Orientation] = prepared[photo.name].orientation
+            mask = ImageOps.exif_transpose(mask)
+        if shapes_differ(mask.size, size):
+            raise InputError(
+                f"{path}: must have the shape of its photo, {size[0]}x{size[1]} px (got {mask.width}x{mask.height})"
+            )
+        return np.asarray(mask.resize(size, Image.Resampling.BOX)) >= 128
+
+    return make
+
+
+def model_masks(model: Path) -> MaskMaker:
+    """Masks by a segmentation network through rembg: any ONNX file of the kind of IS-Net (dichotomous segmentation).
+
+    Raises:
+        InputError: If the file does not exist or is no such network.
+        MissingResourceError: If rembg is not installed, or ONNX Runtime is too old.
+    """
+    if not model.is_file():
+        raise InputError(f"{model}: no such file")
+    rembg = load_library("masks", "rembg")
+    try:
+        session: Any = rembg.new_session("dis_custom", model_path=str(model.resolve()))
+    except Exception as error:  # onnxruntime's have no other base
+        raise InputError(f"{model}: not a segmentation network in ONNX ({' '.join(str(error).split())})") from error
+
+    def make(photo: Photo) -> BoolArray:
+        with Image.open(photo.file) as image:
+            cut = rembg.remove(image.convert("RGB"), session=session, only_mask=True, post_process_mask=False)
+        return _largest_part(np.asarray(cut.convert("L")) >= 128)
+
+    return make
+
+
+def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidden = _NOTHING) -> MaskMaker:
+    """Masks by GrabCut (Rother et al. 2004), begun from the hull of points on the object.
+
+    Args:
+        points: Of the object, in the capture's frame, shape (N, 3); see :func:`object_points`.
+        bare: Finds what is surely not the object.
+        hidden: Where other things may hide the object.
+    """
+
+    def make(photo: Photo) -> BoolArray:
+        camera, bgr, _ = _reduced(photo)
+        unknown = _shrunk(hidden.get(photo.name), camera)
+        pixels, _ = camera.project(points)
+        # A point that all but lies in the camera's plane may be at any number of pixels, more than an integer holds.
+        near = (np.abs(pixels) < _FAR_OFF * max(camera.width, camera.height)).all(axis=1)
+        return _enlarged(_grab(bgr, pixels[near], _free(bare, camera, bgr), unknown), photo.camera)
+
+    return make
+
+
+def agreed_masks(
+    masked: Capture, points: Float64Array, bare: Bare | None = None, hidden: Hidden = _NOTHING
+) -> MaskMaker:
+    """Masks by GrabCut within a band around the outline that the masks of all photos agree on.
+
+    What one photo cannot tell from its object, such as a dark corner behind it, others see beside it: the visual hull
+    (Laurentini 1994) of all masks, less the few that contradict the rest, says where the outline may be.
+
+    Args:
+        masked: The capture with first masks.
+        points: Of the object, in the capture's frame, shape (N, 3); the hull is looked for around them.
+        bare: Finds what is surely not the object.
+        hidden: Where other things may hide the object.
+    """
+    small = {photo.name: _reduced(photo) for photo in masked.photos}
+    shown = [(camera, mask | _shrunk(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]
+    hull, cell = _agreed_hull(shown, points)
+
+    def make(photo: Photo) -> BoolArray:
+        rough = small[photo.name][2] if photo.name in small else None
+        camera, bgr, mask = _reduced(photo, 1 if rough is None else _share(rough))
+        unknown = _shrunk(hidden.get(photo.name), camera)
+        silhouette = _silhouette(hull, cell, camera)
+        size = float(np.sqrt(np.count_nonzero(silhouette)))
+        if size > 0:
+            near = _grown(silhouette, _DOUBT * size)
+            core = ~_grown(~silhouette, _DOUBT * size)
+            free = _free(bare, camera, bgr)
+            mask = _cut(bgr, near, silhouette & (mask | core), core, free, unknown, _DOUBT * size)
+        return _enlarged(mask, photo.camera)
+
+    return make
+
+
+def object_points(capture: Capture) -> Float64Array:
+    """Points (N, 3) of what stands on the table (z = 0) where the cameras look: the nearest large cluster.
+
+    Points as low as the table cannot be told from it, so the feet of the lowest are added; of all, if none is low.
+
+    Raises:
+        InputError: If there is no such cluster.
+    """
+    centres = np.array([photo.camera.centre for photo in capture.photos])
+    distance = float(np.median(np.linalg.norm(centres, axis=1)))
+    counts = np.zeros(len(capture.points), dtype=np.int64)
+    for photo in capture.photos:
+        counts[photo.seen] += 1
+    points = capture.points[counts >= 3]
+    points = points[(points[:, 2] > _ABOVE * distance) & (np.linalg.norm(points, axis=1) < 0.9 * distance)]
+    if len(points) < 20:
+        raise InputError(
+            f"no object stands out of the table in the photos ({len(points)} points above it): give masks, or take "
+            "photos of one object on a textured table"
+        )
+    tree = cKDTree(points)
+    reach = float(np.clip(4 * np.median(tree.query(points, k=6)[0][:, -1]), 0.05 * distance, 0.1 * distance))
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    sizes = np.bincount(label)
+    offset = np.array([np.linalg.norm(points[label == k, :2].mean(axis=0)) for k in range(len(sizes))])
+    chosen = int(np.argmax(sizes / (0.1 + offset / distance)))
+    cluster = points[label == chosen]
+    low = cluster[cluster[:, 2] < 0.15 * cluster[:, 2].max()]
+    return np.concatenate([cluster, (low if len(low) >= 5 else cluster) * (1, 1, 0)])
+
+
+def _free(bare: Bare | None, camera: Camera, bgr: ByteImage) -> BoolArray:
+    """What is surely not the object, shape (H, W)."""
+    if bare is None:
+        return np.zeros(bgr.shape[:2], dtype=bool)
+    return bare(camera, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+
+
+def _shrunk(hidden: BoolArray | None, camera: Camera) -> BoolArray:
+    """What may be hidden, in the size of a camera's picture; nothing if None."""
+    if hidden is None:
+        return np.zeros((camera.height, camera.width), dtype=bool)
+    return np.asarray(
+        cv2.resize(hidden.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
+    )
+
+
+def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: BoolArray) -> BoolArray:
+    """GrabCut of a BGR image (H, W, 3) from where points of the object are in it, shape (N, 2), and where it is not.
+
+    Sides without points lie outside of the hull. So the region in question begins at it and follows what was found.
+    """
+    height, width = image.shape[:2]
+    nothing = np.zeros((height, width), dtype=bool)
+    if len(pixels) < 3:
+        return nothing
+    filled = np.zeros((height, width), dtype=np.uint8)
+    cv2.fillConvexPoly(filled, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
+    if not filled.any():
+        return nothing
+    dots = np.zeros_like(filled)
+    x, y = pixels[((pixels >= 0) & (pixels < (width, height))).all(axis=1)].astype(np.intp).T
+    dots[y, x] = 1
+    size = float(np.sqrt(filled.sum()))
+    core = _grown(dots, 0.02 * size) & ~_grown(filled == 0, 0.03 * size)
+    inside = filled > 0
+    for _ in range(_EXTENSIONS):
+        near = _grown(inside | (filled > 0), _RING * size)
+        before, inside = inside, _cut(image, near, inside, core, free, unknown, _RING * size)
+        if np.count_nonzero(inside & ~before) < 0.01 * np.count_nonzero(inside):
+            break
+    return inside
+
+
+def _cut(
+    image: ByteImage,
+    near: BoolArray,
+    inside: BoolArray,
+    core: BoolArray,
+    free: BoolArray,
+    unknown: BoolArray,
+    ring: float,
+) -> BoolArray:
+    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably, surely and not ``inside``.
+
+    Nothing is found where it is ``unknown`` whether a thing hides the object, but parts may be joined by that.
+    """
+    trimap = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
+    trimap[near] = cv2.GC_PR_BGD
+    trimap[inside] = cv2.GC_PR_FGD
+    trimap[core] = cv2.GC_FGD
+    trimap[free | unknown] = cv2.GC_BGD
+    # The background that is learnt from is what surrounds the object, and the cost is that of its box.
+    edge = round(ring) + 4
+    y, x = np.nonzero(near)
+    box = np.s_[max(0, y.min() - edge) : y.max() + edge + 1, max(0, x.min() - edge) : x.max() + edge + 1]
+    part = np.ascontiguousarray(trimap[box])
+    found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
+    if found.any() and not found.all():
+        cv2.setRNGSeed(0)  # of this thread
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+        found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
+    cut = np.zeros_like(near)
+    cut[box] = _largest_part(found | unknown[box]) & found
+    return cut
+
+
+def _agreed_hull(views: Sequence[tuple[Camera, BoolArray]], points: Float64Array) -> tuple[Float64Array, float]:
+    """Middles (N, 3) of the cells that all masks but a few show as object, and the edge of a cell."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.3 * float((high - low).max())
+    low, high = low - (margin, margin, 0.0), high + margin
+    cell = float((high - low).max()) / _CELLS
+    axes = [np.arange(a + cell / 2, b, cell) for a, b in zip(low, high, strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    most = max(1, round(_DISSENT * len(views)))
+    misses = np.zeros(len(cells), dtype=np.int64)
+    seen = np.zeros(len(cells), dtype=np.int64)
+    for camera, mask in views:
+        left = np.flatnonzero(misses <= most)
+        pixels, _ = camera.project(cells[left])
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        x, y = pixels[inside].astype(np.intp).T
+        seen[left[inside]] += 1
+        misses[left[inside]] += ~mask[y, x]
+    return cells[(misses <= most) & (seen > len(views) // 4)], cell
+
+
+def _silhouette(cells: Float64Array, cell: float, camera: Camera) -> BoolArray:
+    """The pixels that cells with an edge of ``cell`` cover, shape (H, W)."""
+    shown = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    pixels, depths = camera.project(cells)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    if not inside.any():
+        return shown > 0
+    x, y = pixels[inside].astype(np.intp).T
+    shown[y, x] = 1
+    # Middles of cells lie apart by an edge at most, and half an edge inside of the outline.
+    edge = cell * camera.fx / float(np.median(depths[inside]))
+    return ~_grown(~_grown(shown, edge), edge / 2)
+
+
+def _share(mask: BoolArray) -> float:
+    """What share of the longer edge of its picture a mask spans."""
+    shown = np.argwhere(mask)
+    return float(np.ptp(shown, axis=0).max() + 1) / max(mask.shape) if len(shown) else 1.0
+
+
+def _reduced(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolArray]:
+    """Camera, BGR picture (H, W, 3) and mask (H, W) in the size for GrabCut of a ``share`` of a photo's longer edge."""
+    scale = min(1.0, _WORK_EDGE / share / max(photo.camera.width, photo.camera.height))
+    rgb, mask = photo.picture(scale)
+    bgr = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
+    height, width = bgr.shape[:2]
+    return photo.camera.resized(width, height), bgr, np.zeros((height, width), bool) if mask is None else mask >= 0.5
+
+
+def _enlarged(mask: BoolArray, camera: Camera) -> BoolArray:
+    """A mask in the size of the camera."""
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
+    return np.asarray(cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC) >= 0.5)
+
+
+def _grown(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
+    """The mask dilated by a disc of at least one pixel."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(radius)) + 1,) * 2)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
+
+
+def shapes_differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two image sizes are of different shape, up to the rounding of a reduced copy."""
+    return abs(one[0] * other[1] - one[1] * other[0]) > max(*one, *other)
+
+
+def _largest_part(mask: BoolArray) -> BoolArray:
+    """The largest connected part of a mask."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask
+
+
+def _fault(mask: BoolArray, camera: Camera, points: Float64Array | None, hidden: BoolArray | None) -> str | None:
+    share = float(mask.mean())
+    if share < MIN_SHARE:
+        return f"its mask covers only {share:.1%} of it"
+    if share > 0.98:
+        return f"its mask covers {share:.1%} of it"
+    if points is not None:
+        pixels, _ = camera.project(points)
+        pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
+        x, y = pixels.astype(np.intp).T
+        if hidden is not None:
+            x, y = x[~hidden[y, x]], y[~hidden[y, x]]
+        agreement = float(mask[y, x].mean()) if len(x) else 0.0
+        if agreement < MIN_AGREEMENT:
+            return f"its mask covers only {agreement:.0%} of the object's points"
+    return None
+
+
+def _save(mask: BoolArray, hidden: BoolArray | None, part: Path) -> None:
+    picture = Image.fromarray(np.uint8(255) * mask.astype(np.uint8))
+    if hidden is not None:
+        picture.putalpha(Image.fromarray(np.uint8(255) * (~hidden).astype(np.uint8)))
+    picture.save(part, "PNG")

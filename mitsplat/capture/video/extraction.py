@@ -1,0 +1,145 @@
+"""The folder of a video's chosen frames: made by a process of its own, kept until the video changes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mitsplat.errors import InputError
+from mitsplat.progress import Progress
+from mitsplat.runtime.child_process import python_command, python_environment
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.files import write_text
+
+_RECORD = "video.json"
+_METHOD = 1
+"""How frames are chosen; another number where others would be."""
+_TOLD = 6
+"""Most cuts that are told by their time."""
+
+
+@dataclass(frozen=True)
+class ChosenFrames:
+    """Frames of a video, as pictures in a folder.
+
+    Attributes:
+        video: The video.
+        folder: Where the pictures are.
+        names: Of the pictures, by their times, such as ``01m15s040.jpg``.
+        read: Frames that were looked at.
+        seconds: Time of the last of them [s].
+        cuts: Times at which the picture jumps [s].
+        moved: How far the picture moves in all, as a share of its width; jumps do not count.
+    """
+
+    video: Path
+    folder: Path
+    names: tuple[str, ...]
+    read: int
+    seconds: float
+    cuts: tuple[float, ...]
+    moved: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of the video, one sentence each."""
+        if not self.cuts:
+            return ()
+        times = ", ".join(f"{time:.1f} s" for time in self.cuts[:_TOLD])
+        more = f" and {len(self.cuts) - _TOLD} times more" if len(self.cuts) > _TOLD else ""
+        return (
+            f"{self.video}: jumps at {times}{more}, by a cut or a movement too fast to follow: what shares no view "
+            "with the rest gets no cameras",
+        )
+
+
+def choose_frames(
+    video: Path, folder: Path, *, most: int, least: int, progress: Progress | None = None
+) -> ChosenFrames:
+    """Write frames of a video that are sharp and show it in even steps, unless they are there already.
+
+    The same video and numbers give the same frames. Pictures have the video's size, turned as it is to be shown.
+
+    Args:
+        video: A file that FFmpeg reads.
+        folder: Of the frames; it is written anew.
+        most: Frames that may be taken.
+        least: Frames that are needed.
+        progress: Told frames done, of how many, and what is being done.
+
+    Raises:
+        InputError: If the file is no video, ends too early, or has too few or too many different views, or the folder
+            holds something else.
+    """
+    if most < least:
+        raise InputError(f"at least {least} frames must be taken of a video (got {most})")
+    inputs = {"video": file_hash(video), "most": most, "method": _METHOD}
+    if (kept := _kept(video, folder, inputs)) is not None:
+        return kept
+    if folder.exists() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
+        raise InputError(f"{folder}: is there already, and not of frames of a video: choose another folder")
+    # Apart, so that earlier frames are there until all of these are.
+    made = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    try:
+        found = _run(video, made, most, least, progress)
+        write_text(made / _RECORD, json.dumps({"inputs": inputs, **found}, indent=1))
+        shutil.rmtree(folder, ignore_errors=True)
+        made.rename(folder)
+    except BaseException:
+        shutil.rmtree(made, ignore_errors=True)
+        raise
+    return _chosen(video, folder, found)
+
+
+def _kept(video: Path, folder: Path, inputs: dict[str, Any]) -> ChosenFrames | None:
+    """The frames that an earlier run left, if they are all there and of the same inputs."""
+    try:
+        record = json.loads((folder / _RECORD).read_text())
+        if record.pop("inputs") != inputs:
+            return None
+        chosen = _chosen(video, folder, record)
+    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
+        return None
+    return chosen if {path.name for path in folder.glob("*.jpg")} == set(chosen.names) else None
+
+
+def _chosen(video: Path, folder: Path, found: dict[str, Any]) -> ChosenFrames:
+    return ChosenFrames(video, folder, **found | {"names": tuple(found["names"]), "cuts": tuple(found["cuts"])})
+
+
+def _run(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> dict[str, Any]:
+    """What the child found of the video whose frames it wrote."""
+    command = python_command("-m", "mitsplat.capture.video.video_worker", video, folder, str(most), str(least))
+    # A list of files to play is no video.
+    environment = python_environment({"OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file"})
+    found, error = None, None
+    with (
+        (folder / "log.txt").open("wb") as log,
+        # What ends this process closes the pipe, which ends the child.
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment) as child,
+    ):
+        try:
+            for line in child.stdout or ():
+                message = json.loads(line)
+                found, error = message.get("found"), message.get("error")
+                if progress is not None and "progress" in message:
+                    progress(*message["progress"])
+        except BaseException:
+            child.kill()
+            raise
+    if error is not None:
+        raise InputError(error)
+    if child.returncode < 0:
+        raise InputError(
+            f"{video}: must be a video that FFmpeg can decode (got signal {-child.returncode} of its decoder): convert "
+            "it to another format"
+        )
+    if found is None:
+        raise RuntimeError((folder / "log.txt").read_text()[-2000:])
+    return dict(found)

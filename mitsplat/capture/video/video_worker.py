@@ -1,0 +1,118 @@
+"""Chooses and writes frames of a video: ``python -m mitsplat.capture.video.video_worker VIDEO FOLDER MOST LEAST``.
+
+A damaged video can end the process that decodes it, and decoders write what they think of it to standard error. So
+:mod:`mitsplat.capture.video.extraction` starts this module and reads what it says on standard output, a JSON object a
+line: ``progress``, as :data:`mitsplat.progress.Progress` is told; then ``error``, a sentence, or ``found``, what there
+is to say of the frames that lie in FOLDER.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import ByteImage
+from mitsplat.capture.video.decoding import open_video
+from mitsplat.capture.video.frame_selection import STEP, Choice, FrameMeasure, choose
+from mitsplat.capture.video.motion import MotionClock
+from mitsplat.capture.video.sharpness import sharpness
+from mitsplat.errors import InputError
+from mitsplat.storage.files import write_file
+
+_MEMORY = 12 << 30
+"""Address space [bytes]; decoders of large frames reserve some for each thread."""
+
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+
+
+def main(video: Path, folder: Path, most: int, least: int) -> None:
+    """Do it, and say what came of it."""
+    try:
+        measures = _measure(video)
+        choice = choose(measures, most)
+        _refuse(video, choice, measures[-1].time, most, least)
+        names = _write(video, folder, choice)
+    except InputError as error:
+        _say(error=str(error))
+        return
+    _say(
+        found={
+            "names": names,
+            "read": len(measures),
+            "seconds": measures[-1].time,
+            "cuts": choice.cuts,
+            "moved": choice.moved,
+        }
+    )
+
+
+def _measure(video: Path) -> list[FrameMeasure]:
+    """How far the picture has moved in each frame, and how sharp it is."""
+    clock, measures = MotionClock(), list[FrameMeasure]()
+    with open_video(video) as reader:
+        for index, time in reader.times():
+            grey: ByteImage = np.asarray(cv2.cvtColor(reader.picture(), cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+            measures.append(FrameMeasure(index, time, clock.add(grey), sharpness(grey)))
+            _say(progress=(index + 1, max(index + 1, reader.stated), "watching the video"))
+    return measures
+
+
+def _refuse(video: Path, choice: Choice, seconds: float, most: int, least: int) -> None:
+    """Refuse a video of which there would be too few frames, or too many."""
+    if len(choice.frames) < least:
+        if not choice.cuts and choice.moved < STEP:
+            raise InputError(
+                f"{video}: its picture must move by {least * STEP:.0%} of its width or more (got {choice.moved:.1%} in "
+                f"{seconds:.1f} s): walk around what is filmed, which must have texture that can be followed"
+            )
+        raise InputError(
+            f"{video}: must show at least {least} views that differ by {STEP:.0%} of the picture's width (got "
+            f"{len(choice.frames)} in {seconds:.1f} s): walk farther around what is filmed"
+        )
+    if len(choice.frames) > most:
+        raise InputError(
+            f"{video}: must not jump more often than frames are taken of it (got {len(choice.cuts)} cuts, or movements "
+            f"too fast to follow, for {most} frames): film in one go, slowly, or take more frames (--frames)"
+        )
+
+
+def _write(video: Path, folder: Path, choice: Choice) -> list[str]:
+    """Write the frames, as JPEG of quality 95 with colours of full resolution; returns their names."""
+    names = {frame.index: _name(frame.time) for frame in choice.frames}
+    with open_video(video) as reader:
+        for index, _ in reader.times():
+            if index in names:
+                _, coded = cv2.imencode(".jpg", reader.picture(), _JPEG)
+                write_file(folder / names[index], partial(_store, coded.tobytes()))
+                _say(progress=(index + 1, max(index + 1, reader.stated), "taking frames of the video"))
+            if index >= choice.frames[-1].index:
+                break
+    return list(names.values())
+
+
+def _store(data: bytes, file: Path) -> None:
+    file.write_bytes(data)
+
+
+def _name(time: float) -> str:
+    """Name of a frame's file by its time [s]: 75.04 is ``01m15s040.jpg``."""
+    minutes, milliseconds = divmod(round(1000 * time), 60_000)
+    return f"{minutes:02}m{milliseconds // 1000:02}s{milliseconds % 1000:03}.jpg"
+
+
+def _say(**message: Any) -> None:
+    sys.stdout.write(f"{json.dumps(message)}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY if hard == resource.RLIM_INFINITY else min(_MEMORY, hard), hard))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

@@ -1,0 +1,258 @@
+"""What is questionable about an asset or a scene before time is spent on it, and what to do about each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError
+
+from mitsplat.arrays import Float64Array
+from mitsplat.asset import Asset, opaque_core
+from mitsplat.dataset.preflight import doubts, run_faults
+from mitsplat.errors import InputError
+from mitsplat.findings import Finding
+from mitsplat.formats.registry import Catalogue
+from mitsplat.geometry.mesh import mass_properties, solid_of
+from mitsplat.physics.settle import try_alone, warp_settings
+from mitsplat.reconstruct.registration import measure_offset
+from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.named_files import environments, object_assets
+
+SIZES = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
+"""Longest extents that are expected [m]."""
+DENSITIES = (20.0, 22600.0)
+"""From foam to osmium [kg/m^3]."""
+FEW = 0.01
+"""Share of Gaussians of which nothing is said."""
+INVISIBLE = 1 / 255
+MIN_OVERLAP = 0.5
+MAX_OFFSET = 0.02
+MAX_SPREAD = 0.05
+"""Shift and median distance between splats and mesh, in shares of the mesh's diagonal."""
+MAX_FILL = 0.35
+"""Share of the region's volume that objects which are dropped may take; loose packing of boxes ends at about 0.6."""
+TILT = 0.5
+"""Share by which another axis than z must be the thinner one for an environment to look as if it lay on its side."""
+
+
+def check_path(path: Path, *, allow_outside: bool = False) -> Iterator[Finding]:
+    """Findings on an asset's folder or on a scene file with all that it names.
+
+    Raises:
+        InputError: If it cannot be read at all.
+    """
+    if path.is_dir():
+        yield from check_asset(Asset.load(path))
+        return
+    yield from check_scene(load_scene(path, allow_outside=allow_outside))
+
+
+def check_asset(asset: Asset) -> Iterator[Finding]:
+    """Findings on an asset, one for each thing that was looked at."""
+    splats = asset.splats
+    core = opaque_core(splats).astype(np.float64)
+    if not len(core):
+        yield Finding("splats", False, f"none of {len(splats)} is opaque", "fit or bake the asset anew")
+        return
+    yield Finding("splats", True, f"{len(splats)}, all values finite")  # what is not finite has not been loaded
+    extents = np.ptp(core, axis=0) if asset.mesh is None else asset.mesh.extents
+    size = float(extents.max())
+    yield _units(asset, size)
+    yield _up(asset, core)
+    yield from _gaussians(asset, size)
+    yield from _mesh(asset, core)
+
+
+def _units(asset: Asset, size: float) -> Finding:
+    low, high = SIZES[asset.kind]
+    if asset.units == "unknown":
+        return Finding("units", False, "unknown", "measure the longest extent and give it as size [m] in asset.yaml")
+    wrong = next((factor for factor in (1e-3, 1e3, 0.01, 100.0) if low <= size * factor <= high), None)
+    hint = "set units or size in asset.yaml" if wrong is None else f"is units: {wrong:g} missing in asset.yaml?"
+    return Finding("units", low <= size <= high, f"the longest extent is {size:.4g} m", hint)
+
+
+def _up(asset: Asset, core: Float64Array) -> Finding:
+    spread = core.std(axis=0)
+    if asset.kind == "object":
+        return Finding("up axis", True, "z; how an object lies is for physics to say")
+    thin = int(np.argmin(spread))
+    tilted = thin != 2 and spread[thin] < (1 - TILT) * spread[2]
+    text = f"z; the surroundings are thinnest along {'xyz'[thin]}"
+    return Finding(
+        "up axis", not tilted, text, f"if they lie on their side, set up: {'xyz'[thin]} (or -) in asset.yaml"
+    )
+
+
+def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
+    splats = asset.splats
+    needles = long_needles(splats, size)
+    share = float(needles.mean())
+    remedy = "`mitsplat import` removes them; `mitsplat mesh` those that stick out of the object's masks"
+    yield Finding("needles", share <= FEW, f"{needles.sum()} long ones ({share:.1%})", remedy)
+    floaters = len(find_floaters(splats, visible_area(splats))) / len(splats)
+    yield Finding("floaters", floaters <= FEW, f"{floaters:.1%} of the Gaussians touch no large part", remedy)
+    faint = float((splats.opacities < INVISIBLE).mean())
+    yield Finding("opacity", faint <= 0.2, f"{faint:.0%} are invisible", "prune them: they only cost time")
+    unused = splats.sh_degree > 0 and not splats.sh[:, 1:].any()
+    text = f"degree {splats.sh_degree}{', but all of it zero' if unused else ''}"
+    yield Finding("spherical harmonics", not unused, text, "store degree 0: the colours do not change with the view")
+
+
+def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
+    mesh = asset.mesh
+    if mesh is None:
+        remedy = "nothing casts shadows, occludes or carries objects; `mitsplat mesh` makes one"
+        yield Finding("mesh", asset.kind == "environment", "none", remedy)
+        return
+    if asset.kind == "object":  # what surrounds is only known in part, by either
+        overlap = _overlap(np.stack([core.min(axis=0), core.max(axis=0)]), mesh.bounds)
+        yield Finding(
+            "overlap", overlap > MIN_OVERLAP, f"the boxes of splats and mesh share {overlap:.0%} of both",
+            "make the mesh from the same photographs, or register it: `mitsplat mesh --import`",
+        )  # fmt: skip
+    with warp_settings():
+        offset = measure_offset(mesh, core[:: max(1, len(core) // 4000)])
+    yield Finding(
+        "offset", offset.shift <= MAX_OFFSET and offset.spread <= MAX_SPREAD,
+        f"splats are shifted by {offset.shift:.2%} and off by {offset.spread:.2%} of the mesh's diagonal",
+        "register the mesh to the splats: `mitsplat mesh --import`",
+    )  # fmt: skip
+    yield Finding(
+        "watertightness", bool(mesh.is_watertight) or asset.kind == "environment",
+        "closed" if mesh.is_watertight else "open",
+        "close it (`mitsplat mesh`, or a mesh editor): mass and inertia are those of its convex pieces else",
+    )  # fmt: skip
+    if asset.kind == "object":
+        yield from _mass(asset, mesh)
+    if not asset.pieces:
+        yield Finding("colliders", True, "none stored; convex pieces are made when they are needed, once")
+        return
+    joint = np.stack(
+        [np.min([p.bounds[0] for p in asset.pieces], axis=0), np.max([p.bounds[1] for p in asset.pieces], axis=0)]
+    )
+    yield Finding(
+        "colliders", _overlap(joint, mesh.bounds) > 0.8,
+        f"{len(asset.pieces)} convex pieces that share {_overlap(joint, mesh.bounds):.0%} of the mesh's box",
+        "remove pieces from asset.yaml, so that they are made of the mesh",
+    )  # fmt: skip
+
+
+def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
+    try:
+        pieces = asset.pieces or (mesh.convex_hull,)
+    except QhullError:
+        yield Finding("mass", False, "its mesh spans no volume", "give it another mesh, or another size")
+        return
+    solid = solid_of(mesh, pieces)
+    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
+    density = mass / abs(float(solid.volume)) if solid.volume else float("inf")
+    hull = "" if solid is mesh or asset.pieces else " if it filled its convex hull: its convex pieces are not made yet"
+    yield Finding(
+        "mass", DENSITIES[0] <= density <= DENSITIES[1], f"{mass:.3g} kg, of {density:.0f} kg/m^3{hull}",
+        "set mass [kg] or density [kg/m^3] in asset.yaml; a wrong unit of length shows here too",
+    )  # fmt: skip
+
+
+def check_scene(scene: Scene) -> Iterator[Finding]:
+    """Findings on a scene, and what is wrong with each of its assets, whose names they begin with."""
+    spec = scene.spec
+    try:
+        Catalogue.of(scene)
+    except InputError as error:
+        yield Finding("formats", False, str(error), "change output.formats, or what they need")
+    faults = list(run_faults(scene))
+    yield from faults or doubts(scene)
+    for sizes in _sized(scene):
+        name = sizes[0].name
+        wrong = dict.fromkeys(finding for asset in sizes for finding in check_asset(asset) if not finding.ok)
+        for finding in wrong:
+            yield replace(finding, name=f"{name}: {finding.name}")
+        if not wrong:
+            yield Finding(name, True, f"{len(sizes[0].splats)} Gaussians, nothing to say")
+    most = [entry.count[1] for entry in spec.objects]
+    meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
+    volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
+    space = sum(float(np.prod(np.subtract(region.max, region.min))) for region, _ in spec.all_regions)
+    fill = float(np.dot(most, volumes)) / space
+    yield Finding(
+        "room", fill <= MAX_FILL or not spec.objects, f"at most {sum(most)} objects take {fill:.0%} of the region",
+        "make the region larger, lower objects[].count, or use settle.arrangement: pile",
+    )  # fmt: skip
+    support = any(shape.collider and not shape.name.startswith("enclosure ") for shape in spec.shapes)
+    support |= spec.environment_collides and bool(scene.environments)
+    text = "objects have something to lie on" if support else "nothing collides with objects"
+    yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
+    if support and not faults:
+        yield from _rest(scene)
+    yield _sight(scene)
+    drawn = (*scene.environments, *scene.assets)
+    lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
+    yield Finding(
+        "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
+    )
+
+
+def _sized(scene: Scene) -> Iterator[list[Asset]]:
+    """Each asset in all sizes that it has in a scene: one by its folder, as several may have one name."""
+    folders = [folder for _, folder in environments(scene.spec)]
+    folders += [folder for _, folder, entry in object_assets(scene.spec) for _ in entry.scales]
+    found: dict[str, dict[int, Asset]] = {}
+    for folder, asset in zip(folders, (*scene.environments, *scene.assets), strict=True):
+        found.setdefault(folder, {})[id(asset.splats)] = asset
+    for sizes in found.values():
+        yield list(sizes.values())
+
+
+def _rest(scene: Scene) -> Iterator[Finding]:
+    """Which objects do not come to rest even alone."""
+    rested = set()
+    try:
+        for name, arrangement, refused in try_alone(scene):
+            if not refused:
+                rested.add(name)
+                continue
+            reason, times = Counter(refused).most_common(1)[0]
+            said = f"it{reason.removeprefix(name)}" if reason.startswith(f"{name} ") else reason
+            text = f"{name} cannot take arrangement {arrangement}: {said} in {times} of {len(refused)} tries"
+            remedy = "choose another settle.arrangement, mend its mesh or its up axis, or leave it out of objects"
+            yield Finding("rest", False, text, remedy)
+    except InputError as error:
+        yield Finding("rest", False, str(error), "change what objects rest on, or their region")
+    if rested:
+        yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
+
+
+def _sight(scene: Scene) -> Finding:
+    """Whether the cameras look at where objects are dropped: the middle of a region, at its bottom."""
+    corners = np.array([(region.min, region.max) for region, _ in scene.spec.all_regions])
+    middles = np.column_stack([corners.mean(axis=1)[:, :2], corners[:, 0, 2]])
+    views = range(0, scene.num_frames, max(1, scene.num_frames // 24))
+    blind = []
+    for index in views:
+        camera = plan_frame(scene, index).camera
+        pixels, depths = camera.project(middles)
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        if not (inside & (depths > camera.near)).any():
+            blind.append(index)
+    where = "a region" if len(middles) > 1 else "the region"
+    text = f"{len(views) - len(blind)} of {len(views)} views show the middle of {where}"
+    remedy = f"turn the camera there: `mitsplat preview --frame {blind[0] if blind else 0}` shows one that does not"
+    return Finding("sight", len(blind) * 2 <= len(views), text, remedy)
+
+
+def _overlap(one: Float64Array, other: Float64Array) -> float:
+    """Intersection over union of two boxes (2, 3); flat ones are given a thickness."""
+    thin = 1e-3 * float(max(np.ptp(one, axis=0).max(), np.ptp(other, axis=0).max()))
+    grown = [box + np.array([[-thin], [thin]]) for box in (one, other)]
+    common = np.minimum(grown[0][1], grown[1][1]) - np.maximum(grown[0][0], grown[1][0])
+    shared = float(np.prod(np.maximum(common, 0)))
+    return shared / (sum(float(np.prod(np.ptp(box, axis=0))) for box in grown) - shared)

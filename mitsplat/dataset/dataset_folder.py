@@ -1,0 +1,389 @@
+"""The folder of a dataset: who writes it, what is in it, and what may be there before."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import shlex
+import shutil
+import socket
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import zip_longest
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ConfigDict
+from ruamel.yaml import YAML
+
+from mitsplat.dataset.contact_sheet import ContactSheet
+from mitsplat.dataset.inputs import describe_inputs
+from mitsplat.dataset.manifest import Manifest, append_line, cut_torn_line
+from mitsplat.dataset.own_files import (
+    CONTENT,
+    LOCK,
+    MANIFEST,
+    RUNS,
+    SHARD,
+    SHEET,
+    TIMINGS,
+    is_unfinished,
+    refuse_links,
+    remove_dataset,
+    remove_partial,
+)
+from mitsplat.dataset.schema import check_record
+from mitsplat.errors import InputError, PartialResultError
+from mitsplat.formats.registry import Catalogue, CollectionWriter
+from mitsplat.storage.files import (
+    Record,
+    open_in_place,
+    open_regular,
+    read_json,
+    storage_errors,
+    write_file,
+    write_text,
+)
+from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
+from mitsplat.version import __version__
+
+if TYPE_CHECKING:
+    from mitsplat.runtime.device import Kind
+    from mitsplat.scene.scene import Scene
+
+IMPLIED = {FORMAT_VERSION: 1, "device": "cpu"}
+"""What ``dataset.json`` means where it does not say so."""
+_LOCK_TEXT = 200
+"""Most characters of a lock that are shown."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a dataset, made apart from the others.
+
+    Attributes:
+        number: From 1.
+        count: Of all shards.
+
+    Raises:
+        InputError: If there is no such part.
+    """
+
+    number: int
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.number <= self.count:
+            raise InputError(f"a shard must be I/N with I from 1 to N (got {self.number}/{self.count})")
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """The shard that a text such as ``2/8`` names."""
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal()):
+            raise InputError(f"a shard must be I/N, such as 2/8 (got {text})")
+        return cls(int(number), int(count))
+
+    def frames(self, total: int, views: int) -> range:
+        """Its frames of ``total``: neighbours, and whole layouts of ``views`` frames where there are enough of them.
+
+        Raises:
+            InputError: If there are fewer frames than shards.
+        """
+        if self.count > total:
+            raise InputError(f"there must not be more shards than frames, {total} (got {self.count})")
+        layouts = -(-total // views)
+        unit, units = (views, layouts) if layouts >= self.count else (1, total)
+        first, last = (unit * (units * part // self.count) for part in (self.number - 1, self.number))
+        return range(first, min(last, total))
+
+    def to_json(self, total: int) -> dict[str, int]:
+        """What ``shard.json`` says of this part of ``total`` frames."""
+        return {"shard": self.number, "of": self.count, "frames": total}
+
+
+class _StoredShard(BaseModel):
+    """Content of ``shard.json``."""
+
+    model_config = ConfigDict(strict=True)
+
+    shard: int
+    of: int
+    frames: int
+
+
+@contextmanager
+def open_folder(
+    out: Path,
+    content: dict[str, Any],
+    scene_file: Path,
+    shard: dict[str, int] | None,
+    *,
+    resume: bool,
+    overwrite: bool,
+    any_device: bool = False,
+) -> Iterator[Manifest]:
+    """Lock and prepare the folder of a dataset; its manifest, without the frames that miss a file.
+
+    Args:
+        out: The folder, made if missing.
+        content: For ``dataset.json``.
+        scene_file: Kept in ``scene/``.
+        shard: For ``shard.json``, or None.
+        resume: Whether a dataset may be there already.
+        overwrite: Remove it first.
+        any_device: Whether it may have been begun on another device.
+
+    Raises:
+        InputError: If the folder cannot be written, is in use, or holds something else.
+        MissingResourceError: If the disk is full.
+    """
+    _check_own(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = open_in_place(out / LOCK, "a+")
+    except OSError as error:
+        raise InputError(_lock_sentence(out, error)) from error
+    with lock:
+        _take_lock(out, lock)
+        try:
+            with storage_errors(out):
+                lock.truncate(0)
+                lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+                lock.flush()
+                refuse_links(out)
+                if overwrite:
+                    remove_dataset(out)
+                _check_resumable(out, content, shard, resume=resume, any_device=any_device)
+                _prepare(out, scene_file, content, shard)
+                yield Manifest(
+                    out / MANIFEST,
+                    keep=lambda record: missing_file(out, record) is None,
+                    check=partial(check_record, content=content),
+                )
+        finally:
+            remove_partial(out)
+
+
+def _lock_sentence(out: Path, error: OSError) -> str:
+    if error.errno in (errno.ELOOP, errno.EMLINK, errno.EINVAL):
+        return f"{error.filename}: {error.strerror}"
+    return f"cannot write into {out}: {error.strerror}"
+
+
+@contextmanager
+def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iterator[Manifest]:
+    """The manifest of a dataset that nobody is writing, and nobody is as long as this is open.
+
+    Args:
+        out: The dataset. It may lie where nothing can be written, as on a share of another machine.
+        content: Of its ``dataset.json``.
+        write: Whether files are added to it. If not, nothing in it is changed or made.
+
+    Raises:
+        InputError: If it is in use or damaged, or a link would be written through.
+    """
+    lock: IO[str] | None = None
+    try:
+        if write:
+            lock = open_in_place(out / LOCK, "a+")
+        else:
+            with suppress(FileNotFoundError):  # nobody has begun to write it here
+                lock = io.TextIOWrapper(open_regular(out / LOCK), errors="replace")
+    except OSError as error:
+        raise InputError(_lock_sentence(out, error)) from error
+    with lock or nullcontext():
+        if lock is not None:
+            _take_lock(out, lock)
+        if write:
+            refuse_links(out)
+        yield Manifest(out / MANIFEST, check=partial(check_record, content=content), grow=False)
+
+
+def _take_lock(out: Path, lock: IO[str]) -> None:
+    """Refuse a folder that another run writes; the lock goes with the open file, however its process ends.
+
+    Who cannot write there shares it with others that read.
+    """
+    try:
+        fcntl.flock(lock, (fcntl.LOCK_EX if lock.writable() else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.seek(0)
+        raise InputError(f"{out} is being written by another run ({lock.read(_LOCK_TEXT)})") from None
+
+
+def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] = ()) -> None:
+    """Note that this process adds frames, how, and by what command, in the log of runs."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    run = {"command": command, "python": platform.python_version(), "workers": workers, "device": device}
+    append_line(out / RUNS, run | ({"gpus": list(gpus)} if gpus else {}))
+
+
+def finish_folder(
+    out: Path,
+    manifest: Manifest,
+    content: dict[str, Any],
+    catalogue: Catalogue,
+    hear: Callable[[Record], object],
+) -> None:
+    """Sort the manifest and describe the whole dataset, all of whose frames are there, in one pass over its records.
+
+    Args:
+        out: The dataset.
+        manifest: Its records.
+        content: What ``dataset.json`` says.
+        catalogue: What the labels refer to.
+        hear: Is told every record.
+
+    Raises:
+        PartialResultError: If a file was removed in the meantime.
+    """
+
+    def check(missing: Path | None) -> None:
+        if missing is not None:
+            raise PartialResultError(f"{missing}: must not be removed while its dataset is written; run again")
+
+    def describe(record: Record) -> None:
+        check(missing_file(out, record))
+        collection.add(record)
+        sheet.add(record)
+        hear(record)
+
+    check(None if (out / CONTENT).is_file() else out / CONTENT)
+    sheet = ContactSheet(out, len(manifest))
+    with CollectionWriter(out, catalogue, content["scene"]["output"]["formats"]) as collection:
+        manifest.sort(describe)
+        collection.keep()
+    sheet.write(out / SHEET)
+
+
+def missing_file(out: Path, record: Record) -> Path | None:
+    """The first of a frame's files that is not there, or None."""
+    missing = next((file for file in record["files"] if not os.path.isfile(f"{out}/{file}")), None)  # noqa: PTH113
+    return None if missing is None else out / missing
+
+
+def _check_own(out: Path) -> None:
+    """Refuse a folder that holds something other than a dataset of mitsplat, which must not be mixed up or removed."""
+    present: Any = None
+    try:
+        present = read_json(out / CONTENT)
+        own = isinstance(present, dict) and "mitsplat" in present
+    except (FileNotFoundError, NotADirectoryError):
+        own = not out.is_dir() or all(is_unfinished(entry.name) for entry in out.iterdir())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{out / CONTENT} cannot be read ({error})") from error
+    if not own:
+        raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds other files)")
+    check_format_version(present, FORMAT_VERSIONS[CONTENT], out / CONTENT)
+
+
+def _check_resumable(
+    out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool, any_device: bool
+) -> None:
+    """Refuse to continue a dataset against the caller's will, or one that another scene or device began."""
+    if not (out / CONTENT).exists():
+        return
+    if not resume:
+        raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
+    present = {**IMPLIED, **read_json(out / CONTENT)}
+    elsewhere: dict[str, Any] = {"libraries": None, "device": None}
+    if difference := first_difference({**present, **elsewhere}, {**content, **elsewhere}):
+        key, before, now = difference
+        raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
+    if present["device"] != content["device"] and not any_device:
+        raise InputError(
+            f"{out} cannot be resumed on the device {content['device']}: it was begun on {present['device']}, whose "
+            f"pictures differ a little; give --device {present['device']}, or --any-device for frames of both"
+        )
+    stored = read_shard(out)
+    if stored != shard:
+        before, now = (
+            f"shard {part['shard']}/{part['of']} of {part['frames']} images" if part else "a whole dataset"
+            for part in (stored, shard)
+        )
+        raise InputError(f"{out} cannot be resumed: it was {before} and is {now}; overwrite it or choose another")
+
+
+def read_shard(out: Path) -> dict[str, int] | None:
+    """What ``shard.json`` says, None for a whole dataset.
+
+    Raises:
+        InputError: If it is damaged.
+    """
+    path = out / SHARD
+    try:
+        stored = _StoredShard.model_validate(read_json(path))
+        Shard(stored.shard, stored.of).frames(stored.frames, 1)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: must say which shard this is ({' '.join(str(error).split())})") from error
+    return stored.model_dump()
+
+
+def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[str, int] | None) -> None:
+    """Make what describes the run, by which the folder is known for a dataset, then the rest; clear what is torn."""
+    remove_partial(out)
+    if not (out / CONTENT).exists():
+        if shard is not None:
+            write_text(out / SHARD, json.dumps(shard) + "\n")
+        write_text(out / CONTENT, json.dumps(content, indent=1) + "\n")
+    (out / "layouts").mkdir(exist_ok=True)
+    if not (out / "scene" / scene_file.name).exists():
+        write_file(out / "scene" / scene_file.name, lambda temporary: _write_scene(scene_file, content, temporary))
+    for file in (out / name for name in (MANIFEST, TIMINGS, RUNS)):
+        if file.is_file() and file.stat().st_nlink > 1:  # as in a copy by hard links, whose original must stay
+            write_file(file, partial(shutil.copyfile, file))
+    cut_torn_line(out / TIMINGS)
+    cut_torn_line(out / RUNS)
+
+
+def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
+    """Keep the scene file as it was given; of a scene made in Python, one that says the same."""
+    if scene_file.exists():
+        shutil.copyfile(scene_file, path)
+    else:
+        YAML(typ="safe", pure=True).dump(content["scene"], path)
+
+
+def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, Any]:
+    """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
+    libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
+    return {
+        FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
+        "device": device,
+        "mitsplat": __version__,
+        # Frames may be added, and what a run bears changes none.
+        "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}, "settle": {"incomplete"}}),
+        "classes": list(scene.class_names),
+        "keypoints": [list(names) for names in catalogue.keypoint_names],
+        "assets": list(catalogue.assets),
+        **({"distractors": list(catalogue.distractors)} if catalogue.distractors else {}),
+        "inputs": describe_inputs(scene),
+        "libraries": {name: importlib.metadata.version(name) for name in libraries},
+    }
+
+
+def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
+    """Dotted key and the two values, as JSON (null where there is none), where two JSON values differ first."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in sorted({*before, *now}):
+            inner = first_difference(before.get(name), now.get(name), f"{key}.{name}" if key else name)
+            if inner is not None:
+                return inner
+        return None
+    if isinstance(before, list) and isinstance(now, list):
+        pairs = enumerate(zip_longest(before, now))
+        found = (first_difference(one, other, f"{key}[{place}]") for place, (one, other) in pairs)
+        if (inner := next(filter(None, found), None)) is not None:
+            return inner
+    return None if before == now else (key, json.dumps(before), json.dumps(now))

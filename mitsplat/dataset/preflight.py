@@ -1,0 +1,426 @@
+"""What can be known of a scene before work starts: why a run could end in nothing, or in more than the machine holds.
+
+Each function yields the faults that it finds, as :class:`mitsplat.findings.Finding`; ``mitsplat check`` tells all of
+them, and commands refuse the first (:func:`refuse`). Only what is certain is a fault: bounds are generous everywhere,
+for a scene that is refused wrongly cannot be rendered at all.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import Float64Array
+from mitsplat.dataset.own_files import MANIFEST
+from mitsplat.engine.resources import unused_memory
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.findings import Finding
+from mitsplat.frames.budget import worker_memory
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh import check_size
+from mitsplat.geometry.mesh_points import points_inside
+from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
+from mitsplat.scene.planning.visibility_prediction import solid_around
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import LocalLight
+from mitsplat.scene.spec.object_spec import Arrangement
+from mitsplat.scene.spec.shape_spec import Region
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
+
+MOST_OBJECTS = 65535
+"""Instance ids have 16 bits."""
+MOST_FRAMES = 2**31 - 1
+MOST_STEPS = 1_000_000
+"""Of a simulation; 30 objects take a second for 250 or 1000 of them, as they are stepped."""
+VIEWS = 48
+"""Views that are looked at, spread over the run."""
+NARROWEST = 0.01
+"""Share of the smallest object that an image must show at least."""
+PIXEL_BYTES, PROCESS_GIB = 500, 0.5
+"""Least memory of a pixel at the peak of a frame, and of a process besides; the workcell takes 1.0 GiB at 640x360,
+2.6 at 2000x2000 and 8.4 at 4000x4000."""
+SLOW_OBJECTS = 40
+"""Objects of a layout from which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
+FRAME_BYTES = 8192
+"""Least room on the disk of a frame: an image and a label, a block each."""
+_CELLS = 24  # of a region along each axis, in which is looked for room
+
+
+def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
+    """Refuse a scene for the first of its faults.
+
+    Raises:
+        InputError: If there is one.
+        MissingResourceError: If it is that of the machine.
+    """
+    for fault in faults:
+        kind = MissingResourceError if fault.name in ("memory", "disk") else InputError
+        raise kind(f"{scene.path}: {fault.text}; {fault.remedy}")
+
+
+def run_faults(
+    scene: Scene,
+    frames: Sequence[int] | None = None,
+    *,
+    out: Path | None = None,
+    workers: int | None = None,
+    elsewhere: bool = False,
+) -> Iterator[Finding]:
+    """Everything that stands against making a dataset.
+
+    Args:
+        scene: What to render.
+        frames: Which of its frames; all if None.
+        out: Where to write them; here if None.
+        workers: Processes that make them.
+        elsewhere: Whether they are made on other machines.
+    """
+    yield from count_faults(scene)
+    yield from layout_faults(scene)
+    if not elsewhere:
+        yield from image_faults(scene, workers)
+    frames = range(min(scene.num_frames, MOST_FRAMES)) if frames is None else frames
+    yield from label_faults(scene, frames)
+    yield from disk_faults(len(frames), out)
+
+
+def count_faults(scene: Scene) -> Iterator[Finding]:
+    """More objects or images than have numbers."""
+    most = sum(entry.most for entry in scene.spec.objects)
+    if most > MOST_OBJECTS:
+        text = f"objects: a layout must have at most {MOST_OBJECTS} objects, as many as there are ids (got {most})"
+        yield Finding("count", False, text, "lower objects[].count")
+    if scene.num_frames > MOST_FRAMES:
+        text = f"output: layouts x views must be at most {MOST_FRAMES} images (got {scene.num_frames})"
+        yield Finding("frames", False, text, "lower output.layouts or output.views")
+
+
+def layout_faults(scene: Scene) -> Iterator[Finding]:
+    """Why no layout can come to rest."""
+    settle = scene.spec.settle
+    if settle.max_time / settle.timestep > MOST_STEPS:
+        yield Finding(
+            "time",
+            False,
+            f"settle: max_time / timestep must be at most {MOST_STEPS} steps "
+            f"(got {settle.max_time:g} s / {settle.timestep:g} s)",
+            "lower settle.max_time",
+        )
+    dropped = [i for i, entry in enumerate(scene.spec.objects) if not entry.poses]
+    if not dropped:
+        return
+    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
+        if shape.collider:
+            try:
+                check_size(mesh, f"shapes[{number}]")
+            except InputError as error:
+                yield Finding("shape", False, str(error), "correct it, or let it be no collider")
+                return
+    for number, (region, arrangement) in enumerate(scene.spec.all_regions):
+        where = f"regions[{number - 1}]" if number else "region"
+        here = [i for i in dropped if scene.spec.regions_of(scene.spec.objects[i]) == (number,)]
+        if here or not scene.spec.regions:
+            yield from _region_faults(scene, where, here, region, arrangement)
+
+
+def _region_faults(
+    scene: Scene, where: str, dropped: Sequence[int], region: Region, arrangement: Arrangement
+) -> Iterator[Finding]:
+    """Why the entries ``dropped``, which go nowhere else, cannot come to rest in a region."""
+    low, high = np.array(region.min), np.array(region.max)
+    supports = [mesh.bounds for name, mesh in _colliders(scene) if not name.startswith(ENCLOSURE)]
+    if supports and not any(
+        (box[0, :2] < high[:2]).all() and (box[1, :2] > low[:2]).all() and box[0, 2] < high[2] for box in supports
+    ):
+        text = f"{where}: nothing that collides is below it, so that all objects fall for ever"
+        yield Finding("support", False, text, "move region above the table, or the table below it")
+        return
+    if arrangement == "pile":
+        high[2] += PILE_HEIGHT
+    yield from _room_faults(scene, where, dropped, low, high)
+
+
+def _room_faults(
+    scene: Scene, where: str, dropped: Sequence[int], low: Float64Array, high: Float64Array
+) -> Iterator[Finding]:
+    """Whether there is room for the objects in a region: of what is in the way, and of their number."""
+    pools = [[mesh for asset in scene.pools[i] if (mesh := scene.assets[asset].mesh) is not None] for i in dropped]
+    meshes = [mesh for pool in pools for mesh in pool]
+    finest = min(float(mesh.extents.min()) for mesh in meshes) / 2
+    cells = np.clip(np.ceil((high - low) / finest), 5, _CELLS).astype(int)
+    axes = [start + (end - start) * (np.arange(n) + 0.5) / n for start, end, n in zip(low, high, cells, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    taken = np.zeros(len(points), dtype=bool)
+    in_way = []
+    for name, mesh in _colliders(scene):
+        inside = points_inside(mesh, points)
+        if inside.any():
+            in_way.append(repr(name))
+        taken |= inside
+    if taken.all():
+        text = f"{where}: lies inside of what collides with objects, {' and '.join(in_way)}"
+        yield Finding("region", False, text, "move region above it")
+        return
+    volume = float(np.prod(high - low)) * float((~taken).mean())
+    hulls = {id(mesh): float(mesh.convex_hull.volume) for mesh in meshes}
+    numbers = [scene.spec.objects[i].count[1] for i in dropped]
+    need = float(np.dot(numbers, [min(hulls[id(mesh)] for mesh in pool) for pool in pools]))
+    if need > volume:
+        yield Finding(
+            "room",
+            False,
+            f"{where}: at most {sum(numbers)} objects of {1e3 * need:.3g} l must start in it at once "
+            f"(it has {1e3 * volume:.3g} l)",
+            "lower objects[].count or make region larger",
+        )
+
+
+def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
+    """Images, or workers that make them, that this machine has no memory for."""
+    output, free = scene.spec.output, unused_memory()
+    need = PROCESS_GIB + output.width * output.height * PIXEL_BYTES / 2**30
+    size = f"an image of {output.width}x{output.height} px"
+    if need > free:
+        text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
+        yield Finding("memory", False, text, "lower output.width and height")
+    elif workers is not None and workers * need > free:
+        text = f"workers: {workers} that each make {size} take at least {workers * need:.0f} GiB of memory"
+        yield Finding("memory", False, f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
+
+
+def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
+    """More images than the disk can hold, beside those that are there."""
+    place = (out or Path.cwd()).absolute()
+    while not place.is_dir():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if frames * FRAME_BYTES > free and out is not None and (out / MANIFEST).is_file():
+        with (out / MANIFEST).open("rb") as lines:
+            frames -= sum(1 for _ in lines)
+    need = frames * FRAME_BYTES
+    if need > free:
+        text = f"output: {frames} images take at least {_amount(need)} ({_amount(free)} are free at {place})"
+        yield Finding("disk", False, text, "lower output.layouts or views, give --frames, or write to another disk")
+
+
+def _amount(size: int) -> str:
+    """Bytes as one reads them."""
+    return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.3g} MiB"
+
+
+def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
+    """Why no image can have a label: cameras do not see where objects can be, or not as large as labels must be."""
+    spec, least = scene.spec, scene.spec.labels.min_pixels
+    labelled = [scene.assets[i] for i in range(len(scene.assets)) if scene.class_index(i) is not None]
+    meshes = [asset.mesh for asset in labelled if asset.mesh is not None]
+    if not meshes or not len(frames):
+        return
+    pixels = spec.output.width * spec.output.height
+    if pixels < least:
+        text = f"output: an image of {pixels} px cannot show labels.min_pixels = {least}"
+        yield Finding("labels", False, text, "make output.width and height larger")
+        return
+    cameras = _cameras(scene, frames)
+    hidden = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
+    if len(hidden) == len(cameras):
+        text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
+        yield Finding("sight", False, text, "move camera out of it")
+        return
+    low, high = _reach(scene)
+    if not any(sees(camera, low, high) for camera in cameras):
+        yield _blind(cameras, low, high)
+        return
+    depths = [_depths(camera, low, high) for camera in cameras]
+    across = [far * c.width / c.fx for c, (_, far) in zip(cameras, depths, strict=True)]
+    smallest = min(float(mesh.extents.max()) for mesh in meshes)
+    if max(across) < NARROWEST * smallest:
+        text = (
+            f"camera.intrinsics: an image shows at most {max(across):.2g} m (the smallest object has {smallest:.2g} m)"
+        )
+        yield Finding("lens", False, text, "fx and fy are focal lengths in pixels")
+    largest = max(float(np.linalg.norm(mesh.extents)) for mesh in meshes)
+    shown = max(_most_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
+    if shown < least:
+        text = f"camera: no object covers more than {shown:.2g} px in any view (labels.min_pixels is {least})"
+        yield Finding("labels", False, text, "move camera nearer, or make fx or the image larger")
+
+
+def doubts(scene: Scene) -> Iterator[Finding]:
+    """What a run survives but was hardly meant: some views from inside of solids, lights inside of them, small bins."""
+    spec = scene.spec
+    plans = _plans(scene, range(min(scene.num_frames, MOST_FRAMES)))
+    cameras = [plan.camera for plan in plans]
+    inside = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
+    low, high = _reach(scene)
+    blind = sum(not sees(camera, low, high) for camera in cameras)
+    yield Finding(
+        "views",
+        not inside and not blind,
+        f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
+        "move camera, its keys or its ranges: such images have no labels",
+    )
+    yield from _cost_doubts(scene)
+    yield from _backdrop_doubts(scene, plans)
+    for number, light in enumerate(spec.lights):
+        if isinstance(light, LocalLight) and not light.moved and (name := _light_inside(scene, light)):
+            text = f"lights[{number}] is inside of shape {name!r}"
+            yield Finding("lights", False, text, "move it out: it lights nothing")
+    if any(isinstance(light, LocalLight) and light.moved for light in spec.lights):
+        lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
+        names = [name for light in lights if (name := _light_inside(scene, light))]
+        if names:
+            text = f"{len(names)} of {len(lights)} lights that were drawn are inside of a shape, such as {names[0]!r}"
+            yield Finding("lights", False, text, "narrow lights[].draw: they light nothing")
+    for shape in spec.shapes:
+        if shape.bin is None:
+            continue
+        opening = np.sort(shape.bin.size[:2])
+        for asset in {asset.name: asset for asset in scene.assets}.values():
+            if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
+                text = f"{asset.name!r} does not fit into {shape.name!r}"
+                yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
+
+
+def _cost_doubts(scene: Scene) -> Iterator[Finding]:
+    """Warn of frames that may exceed the memory, and of layouts that settle for minutes."""
+    output, free = scene.spec.output, unused_memory()
+    need = worker_memory(scene).own / 2**30
+    if need > free:
+        size = f"{output.width}x{output.height} px"
+        text = f"an image of {size} may take {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
+        yield Finding("memory", False, text, "lower output.width and height: it may be refused after the first layout")
+    most = sum(entry.most for entry in scene.spec.objects if not entry.poses)
+    if most > SLOW_OBJECTS:
+        text = f"a layout of up to {most} objects takes minutes to settle"
+        yield Finding("settling", False, text, "lower objects[].count, or add views to each layout by output.views")
+
+
+def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
+    """Views and lights from behind a backdrop's walls."""
+    walls = backdrop_walls(scene.spec)
+    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
+
+    def behind(point: Iterable[float]) -> bool:
+        """Whether a wall's middle plane parts a point from the middle of the region."""
+        for box in walls:
+            axis = int(np.argmin(box.size))
+            turn = stated_pose(box)[:3, :3].T
+            here, there = (turn @ np.subtract(tuple(place), box.position) for place in (point, middle))
+            if here[axis] * there[axis] < 0:
+                return True
+        return False
+
+    if hidden := sum(behind(plan.camera.centre) for plan in plans):
+        text = f"of {len(plans)} views {hidden} are from behind a wall of the backdrop, which hides everything"
+        yield Finding("backdrop", False, text, "make backdrop.size larger, or leave that side out of backdrop.sides")
+    lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
+    if hidden := sum(behind(light.position) for light in lights):
+        text = f"{hidden} of {len(lights)} lights are behind a wall of the backdrop"
+        yield Finding("backdrop", False, text, "move lights into the room, or leave that side out of backdrop.sides")
+
+
+def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
+    """Whether a camera sees anything of a box, as far as nothing is in the way.
+
+    A box that is small in the image is met by points of it, one that is large by rays: one of both is dense.
+    """
+    grid = np.stack(np.meshgrid(*([np.linspace(0, 1, 9)] * 3), indexing="ij"), axis=-1).reshape(-1, 3)
+    pixels, depth = camera.project(low + grid * (high - low))
+    with np.errstate(invalid="ignore"):
+        shown = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (depth > camera.near)
+    if shown.any():
+        return True
+    across = np.stack(np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)), axis=-1)
+    slopes = camera.ray_slopes(across.reshape(-1, 2))
+    # Rays of depth 1 for every unit of length, so that their parameter is the depth.
+    rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([(low - camera.centre) / rays, (high - camera.centre) / rays])
+    first, last = np.nanmax(ends.min(axis=0), axis=1), np.nanmin(ends.max(axis=0), axis=1)
+    return bool((np.maximum(first, camera.near) < last).any())
+
+
+def _blind(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> Finding:
+    """Why no camera sees a box."""
+    touching = [replace(camera, near=1e-9) for camera in cameras]
+    if any(sees(camera, low, high) for camera in touching):
+        far = max(_depths(camera, low, high)[1] for camera in touching)
+        text = (
+            f"camera.intrinsics.near: must be nearer than what objects can reach, {far:.3g} m (got {cameras[0].near:g})"
+        )
+        return Finding("sight", False, text, "lower it")
+    text = f"camera: no view shows any place that objects can reach ({len(cameras)} looked at)"
+    return Finding("sight", False, text, "turn camera to region: `mitsplat preview` shows where it looks")
+
+
+def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:
+    """Cameras of some of the frames."""
+    return [plan.camera for plan in _plans(scene, frames)]
+
+
+def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
+    """Plans of some of the frames."""
+    chosen = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
+    return [plan_frame(scene, frames[position]) for position in sorted(chosen)]
+
+
+def _light_inside(scene: Scene, light: LocalLight) -> str:
+    """Name of a visible shape that a light is in and the region is not, or empty."""
+    return solid_around(scene, np.array(light.position))
+
+
+def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
+    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+        if shape.collider:
+            yield shape.name, mesh
+    if scene.spec.environment_collides:
+        yield from ((around.name, around.mesh) for around in scene.environments if around.mesh is not None)
+
+
+def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
+    """Corners of a box [m] that no point of any object leaves before its layout is drawn again."""
+    region = scene.spec.region
+    colliders = list(_colliders(scene))
+    boxes = [np.asarray(mesh.bounds) for _, mesh in colliders] or [np.array([region.min, region.max])]
+    walls = [
+        position
+        for position, (shape, _) in enumerate(
+            pair for pair in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if pair[0].collider
+        )
+        if not (shape.visible or shape.proxy)
+    ]
+    names = [name for name, _ in colliders]
+    lows, highs = [], []
+    for number, (place, arrangement) in enumerate(scene.spec.all_regions):
+        low, high = enclosed_bounds(place, boxes, walls_beside(scene.spec, number, names, walls))
+        high[2] += PILE_HEIGHT if arrangement == "pile" else 0.0
+        lows.append(low)
+        highs.append(high)
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    beyond = max(
+        (float(np.linalg.norm(asset.mesh.extents)) for asset in scene.assets if asset.mesh is not None), default=0.0
+    )
+    return low - beyond, high + beyond
+
+
+def _depths(camera: Camera, low: Float64Array, high: Float64Array) -> tuple[float, float]:
+    """Least and largest depth of a box that a camera shows [m]."""
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
+    depth = (corners - camera.centre) @ camera.world_from_camera[:3, 2]
+    return max(camera.near, float(depth.min())), max(camera.near, float(depth.max()))
+
+
+def _most_pixels(camera: Camera, size: float, depth: float) -> float:
+    """Most pixels that an object of a size [m] covers from a depth on [m], towards the corners of the image too.
+
+    The disc of a small ball is stretched by 1 / cos^3 of its angle to the axis; distortion may stretch it further.
+    """
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=np.float64)
+    steepest = float(np.linalg.norm(camera.ray_slopes(corners), axis=1).max())
+    stretch = (1 + steepest**2) ** 1.5 * (4.0 if camera.distortion else 1.0)
+    return float(stretch * np.pi / 4 * camera.fx * camera.fy * (size / depth) ** 2)

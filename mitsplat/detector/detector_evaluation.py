@@ -1,0 +1,263 @@
+"""A trained detector judged on labelled images: what it finds in them, how well that is, and a page to look at it by.
+
+The folder of an evaluation::
+
+    results.json      average precision of boxes and masks, by class, and what each kind of error costs; the confusion
+                      matrix; what they were made of
+    detections.json   everything that was found, in COCO's results format
+    truth.json        what is labelled, as a COCO dataset with the ids of detections.json
+    report.html       the page
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsplat.detector.detector_report import make_report
+from mitsplat.detector.libraries import (
+    check_device,
+    check_torchvision,
+    check_weights,
+    load_libraries,
+    torch_device,
+    under_another_name,
+    versions,
+)
+from mitsplat.detector.losses import gains
+from mitsplat.detector.pictures import read_picture
+from mitsplat.detector.scores import (
+    CONFIDENCE,
+    IOU,
+    MOST_DETECTIONS,
+    AveragePrecision,
+    Detection,
+    DetectionMatches,
+    confuse,
+)
+from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_set
+from mitsplat.detector.training import check_folder, open_run
+from mitsplat.errors import InputError
+from mitsplat.images.masks import encode_mask
+from mitsplat.pages.html import REPORT_FILE
+from mitsplat.progress import Progress
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.files import storage_errors, write_text
+
+LEAST_SCORE, NMS_IOU = 0.001, 0.7
+"""Detections that are kept, and the overlap of boxes of a class beyond which the lower score is dropped."""
+
+_OWN = frozenset(("truth.json", "detections.json", "results.json", REPORT_FILE))
+"""Files of an evaluation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What was found out about a detector.
+
+    Attributes:
+        path: Folder of the evaluation.
+        results: What ``results.json`` says.
+    """
+
+    path: Path
+    results: dict[str, Any]
+
+    @property
+    def page(self) -> Path:
+        """The page to look at."""
+        return self.path / REPORT_FILE
+
+
+def evaluate_detector(
+    run: str | Path,
+    data: str | Path,
+    out: str | Path | None = None,
+    *,
+    split: Split = "val",
+    size: int | None = None,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Predict on labelled images with the weights of a run, and write how well that went.
+
+    Args:
+        run: Folder of a finished training.
+        data: A dataset of mitsplat, a YOLO folder or a COCO folder.
+        out: Folder to write; ``evaluation/<name of data>-<split>`` in the run by default. An evaluation that is there
+            is replaced.
+        split: Which of the images.
+        size: Longer side that images are scaled to [px], that of the training by default.
+        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, as PyTorch counts GPUs.
+        progress: Told of each image.
+
+    Raises:
+        InputError: If the run is not finished, or images are not as :func:`mitsplat.detector.read_set` wants them, have
+            other classes, or boxes alone where the detector predicts masks; or the folder holds them or something else.
+        MissingResourceError: If Ultralytics or the GPU is missing.
+    """
+    trained, root = open_run(run), Path(data)
+    check_device(device)
+    size = int(trained.record["settings"]["size"]) if size is None else size
+    if size < 32 or size % 32:
+        raise InputError(f"--size must be a multiple of 32 px (got {size})")
+    found = in_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
+    if trained.has_masks:
+        check_masks(found)
+    name = f"{root.resolve().name}-{split}"
+    out = trained.path / "evaluation" / name if out is None else Path(out)
+    if root.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"{out}: must not hold the images that are judged, {root}: give another folder")
+    check_folder(out, "an evaluation", _OWN)
+    load_libraries()
+    check_torchvision()
+    network = str(trained.record["settings"]["model"])
+    check_weights(trained.weights, network, masks=trained.has_masks, classes=len(trained.class_names))
+    number, device_name = torch_device(device)
+    started = time.perf_counter()
+    detections = detect(
+        trained.weights, found.samples, masks=trained.has_masks, size=size, device=number, progress=progress
+    )
+    about = {
+        "run": str(trained.path),
+        "weights": file_hash(trained.weights),
+        "size": size,
+        "device": device_name,
+        "versions": versions(),
+        "seconds": round(time.perf_counter() - started, 1),
+    }
+    return write_evaluation(found, detections, out, masks=trained.has_masks, about=about)
+
+
+def detect(
+    weights: Path,
+    samples: Sequence[Sample],
+    *,
+    masks: bool,
+    size: int,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> list[Detection]:
+    """What weights of Ultralytics find in images, in COCO's results format; ids of images count from 1.
+
+    One image at a time, so that none depends on which others there are. Masks are as large as the image.
+    """
+    from ultralytics import YOLO  # optional
+
+    with under_another_name(weights) as name:
+        model, found = YOLO(name, task="segment" if masks else "detect"), []
+    for number, sample in enumerate(samples, start=1):
+        (result,) = model.predict(
+            read_picture(sample.path),
+            conf=LEAST_SCORE,
+            iou=NMS_IOU,
+            max_det=MOST_DETECTIONS,
+            imgsz=size,
+            device=device,
+            rect=False,
+            retina_masks=True,
+            verbose=False,
+        )
+        boxes = result.boxes.xyxy.cpu().numpy().astype(np.float64)
+        scores, kinds = result.boxes.conf.cpu().numpy(), result.boxes.cls.cpu().numpy()
+        for i, (x0, y0, x1, y1) in enumerate(boxes.tolist()):
+            detection: Detection = {
+                "image_id": number,
+                "category_id": int(kinds[i]) + 1,
+                "bbox": [round(value, 3) for value in (x0, y0, x1 - x0, y1 - y0)],
+                "score": round(float(scores[i]), 6),
+            }
+            if masks:
+                left, top = max(math.floor(x0), 0), max(math.floor(y0), 0)
+                right, bottom = min(math.ceil(x1) + 1, sample.width), min(math.ceil(y1) + 1, sample.height)
+                mask = result.masks.data[i, top:bottom, left:right].cpu().numpy() > 0
+                counts = encode_mask(mask, (left, top, right, bottom), (sample.width, sample.height))
+                detection["segmentation"] = {"size": [sample.height, sample.width], "counts": counts}
+            found.append(detection)
+        if progress is not None:
+            progress(number, len(samples), "predicting")
+    return found
+
+
+def truth_of(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
+    """What is labelled, as a COCO dataset; ids of images, annotations and categories count from 1."""
+    annotations: list[dict[str, Any]] = []
+    for number, sample in enumerate(found.samples, start=1):
+        for instance in sample.instances:
+            x0, y0, x1, y1 = instance.box
+            annotation = {
+                "id": len(annotations) + 1,
+                "image_id": number,
+                "category_id": instance.class_index + 1,
+                "bbox": [round(value, 3) for value in (x0, y0, x1 - x0, y1 - y0)],
+                "area": round((x1 - x0) * (y1 - y0), 3),
+                "iscrowd": int(instance.crowd),
+            }
+            if masks:
+                annotation["segmentation"] = instance.encoded(sample.width, sample.height)
+            annotations.append(annotation)
+    return {
+        "images": [
+            {"id": number, "file_name": sample.name, "width": sample.width, "height": sample.height}
+            for number, sample in enumerate(found.samples, start=1)
+        ],
+        "annotations": annotations,
+        "categories": [{"id": i, "name": name} for i, name in enumerate(found.class_names, start=1)],
+    }
+
+
+def write_evaluation(
+    found: LabelledSet, detections: Sequence[Detection], out: str | Path, *, masks: bool, about: dict[str, Any]
+) -> Evaluation:
+    """Judge detections, and write the folder of the evaluation; nothing of it needs Ultralytics.
+
+    Args:
+        found: The labelled images.
+        detections: What was found in them, in COCO's results format, their ids counted as by :func:`truth_of`.
+        out: The folder.
+        masks: Whether masks are judged too, or boxes alone.
+        about: What else ``results.json`` is to say: how the detections came to be.
+    """
+    out, truth = Path(out), truth_of(found, masks=masks)
+    scores = {"box": DetectionMatches(truth, detections, "bbox").average_precision()}
+    if masks:
+        scores["mask"] = DetectionMatches(truth, detections, "segm").average_precision()
+    confusion = confuse(truth, detections)
+    results = {
+        **about,
+        "data": found.described(),
+        "rules": {
+            "least_score": LEAST_SCORE,
+            "nms_iou": NMS_IOU,
+            "most_detections": MOST_DETECTIONS,
+            "confusion": {"least_score": CONFIDENCE, "iou": IOU},
+        },
+        **{kind: _described(score) for kind, score in scores.items()},
+        "gains": {kind: round(gain, 5) for kind, gain in gains(truth, detections, scores["box"]).items()},
+        "confusion": {"classes": [*found.class_names, "nothing"], "matrix": confusion.matrix.tolist()},
+    }
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+        write_text(out / "truth.json", json.dumps(truth))
+        write_text(out / "detections.json", json.dumps(list(detections)))
+        write_text(out / REPORT_FILE, make_report(found, truth, detections, scores, confusion, results))
+        write_text(out / "results.json", json.dumps(results, indent=2) + "\n")
+    return Evaluation(out, results)
+
+
+def _described(score: AveragePrecision) -> dict[str, Any]:
+    return {
+        "map50_95": round(score.map50_95, 5) if score.classes else None,
+        "map50": round(score.map50, 5) if score.classes else None,
+        "classes": {
+            name: {"ap50_95": round(mean, 5), "ap50": round(at_half, 5)}
+            for name, (mean, at_half) in score.classes.items()
+        },
+    }

@@ -1,0 +1,192 @@
+"""The page of an evaluation: average precision, where it is lost, and the images that went worst."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.detector.losses import KINDS
+from mitsplat.detector.pictures import read_picture
+from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePrecision, Confusion, Detection
+from mitsplat.detector.sets import LabelledSet, Sample
+from mitsplat.images.masks import Silhouette, decode_rle
+from mitsplat.labels.overlay import class_colour
+from mitsplat.pages.html import inline_image, make_page, mask_path
+from mitsplat.pages.svg_charts import bars, curves
+
+WORST = 8
+"""Images that are shown, those with the least share of things that were found right."""
+_THUMBNAIL = 560
+_WORDS = {"box": "boxes", "mask": "masks"}
+
+
+def make_report(
+    found: LabelledSet,
+    truth: Mapping[str, Any],
+    detections: Sequence[Detection],
+    scores: Mapping[str, AveragePrecision],
+    confusion: Confusion,
+    results: Mapping[str, Any],
+) -> str:
+    """The page, one HTML file that needs no network."""
+    title = f"{found.root.resolve().name}, {found.split}: evaluation of a detector"
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        _summary(found, scores, confusion, results),
+        _classes(scores, results),
+        _charts(scores),
+        _gains(results["gains"]),
+        _confusion(confusion, found.class_names),
+        _worst(found, truth, detections, confusion),
+    ]
+    return make_page(title, "\n".join(parts))
+
+
+def _section(key: str, heading: str, body: str) -> str:
+    return f'<section aria-labelledby="{key}"><h2 id="{key}">{heading}</h2>{body}</section>'
+
+
+def _summary(
+    found: LabelledSet, scores: Mapping[str, AveragePrecision], confusion: Confusion, results: Mapping[str, Any]
+) -> str:
+    right, missed, confused, extra = (sum(values) for values in zip(*confusion.errors.values(), strict=True))
+    rows = {f"mAP50-95 of {_WORDS[kind]}": f"{score.map50_95:.3f}" for kind, score in scores.items()}
+    rows |= {f"mAP50 of {_WORDS[kind]}": f"{score.map50:.3f}" for kind, score in scores.items()}
+    rows |= {
+        f"At a score of {CONFIDENCE} and an IoU of {IOU}": f"{right} found as what they are, {confused} as another "
+        f"class, {missed} missed; {extra} found where is nothing",
+        "Images": f"{len(found.samples)} of {found.root} ({found.split})",
+        "Run": str(results.get("run", "unknown")),
+        "Images scaled to": f"{results['size']} px" if "size" in results else "unknown",
+        "Device": str(results.get("device", "unknown")),
+        "Versions": ", ".join(f"{name} {version}" for name, version in results.get("versions", {}).items())
+        or "unknown",
+    }
+    lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
+    rules = results["rules"]
+    note = (
+        "Average precision by COCO's rules: mean over 101 recalls and IoU thresholds 0.5 to 0.95, at most "
+        f"{MOST_DETECTIONS} detections an image with scores of {rules['least_score']} or more, overlaps "
+        f"beyond {rules['nms_iou']} suppressed."
+    )
+    return _section("summary", "Summary", f"<table>{lines}</table><p>{note}</p>")
+
+
+def _classes(scores: Mapping[str, AveragePrecision], results: Mapping[str, Any]) -> str:
+    heads = [f"{name} of {_WORDS[kind]}" for kind in scores for name in ("AP50-95", "AP50")]
+    rows = []
+    for name, count in results["data"]["instances"].items():
+        values = [value for score in scores.values() for value in score.classes.get(name, (None, None))]
+        cells = "".join(f"<td>{'not labelled here' if value is None else f'{value:.3f}'}</td>" for value in values)
+        rows.append(f'<tr><th scope="row">{html.escape(name)}</th><td>{count}</td>{cells}</tr>')
+    head = "".join(f'<th scope="col">{text}</th>' for text in ("Class", "Labelled", *heads))
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return _section("classes", "Classes", table)
+
+
+def _charts(scores: Mapping[str, AveragePrecision]) -> str:
+    recalls = np.linspace(0, 1, 101)
+    charts, means = [], []
+    for kind, score in scores.items():
+        lines = {"mean of the classes": np.mean(list(score.curves.values()), axis=0)} if score.curves else {}
+        lines |= score.curves
+        charts.append(
+            curves(
+                f"Precision over recall of {_WORDS[kind]}, IoU 0.5",
+                {name: np.stack([recalls, precision], axis=1) for name, precision in lines.items()},
+                ("recall", "precision"),
+                {f"{name}, at recall 0.5 and 0.9": f"{line[50]:.3f}, {line[90]:.3f}" for name, line in lines.items()},
+            )
+        )
+        means.append(bars(f"AP50-95 of {_WORDS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()}))
+    return _section("charts", "Charts", f'<div class="charts">{"".join(charts + means)}</div>')
+
+
+def _gains(found: Mapping[str, float]) -> str:
+    text = "How much mAP50-95 of boxes would rise if one kind of error were mended; gains do not add up."
+    chart = bars(text, {KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=170)
+    return _section("gains", "What errors cost", f'<div class="charts">{chart}</div>')
+
+
+def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
+    names = [html.escape(name) for name in (*class_names, "nothing")]
+    head = "".join(f'<th scope="col">{name}</th>' for name in ("labelled \\ found", *names))
+    rows = []
+    for i, (name, row) in enumerate(zip(names, confusion.matrix, strict=True)):
+        total = max(int(row.sum()), 1)
+        cells = []
+        for j, count in enumerate(row.tolist()):
+            colour = "var(--bar)" if i == j else "var(--bad)"
+            shade = f' style="background: color-mix(in srgb, {colour} {60 * count / total:.0f}%, transparent)"'
+            cells.append(f"<td{shade if count else ''}>{count or ''}</td>")
+        rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
+    text = (
+        f"What was taken for what, at a score of {CONFIDENCE} or more where boxes overlap by an IoU of {IOU} or more."
+    )
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return _section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
+
+
+def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[Detection], confusion: Confusion) -> str:
+    order = worst_images(confusion)[:WORST]
+    labelled: dict[int, list[dict[str, Any]]] = {image: [] for image in order}
+    predicted: dict[int, list[dict[str, Any]]] = {image: [] for image in order}
+    for annotation in truth["annotations"]:
+        if annotation["image_id"] in labelled:
+            labelled[annotation["image_id"]].append(annotation)
+    for detection in detections:
+        if detection["image_id"] in predicted and detection["score"] >= CONFIDENCE:
+            predicted[detection["image_id"]].append(detection)
+    figures = []
+    for image in order:
+        sample = found.samples[image - 1]
+        right, missed, confused, extra = confusion.errors[image]
+        told = f"{right} right, {missed} missed, {confused} of another class, {extra} of nothing"
+        figures.append(
+            f'<figure><div class="pair">{_picture(sample, labelled[image], found.class_names, "labelled")}'
+            f"{_picture(sample, predicted[image], found.class_names, 'found')}</div>"
+            f"<figcaption>{html.escape(sample.name)}: {told}</figcaption></figure>"
+        )
+    text = f"Labelled on the left, found with a score of {CONFIDENCE} or more on the right."
+    body = "".join(figures) if figures else "<p>Everything was found as what it is.</p>"
+    return _section("worst", "Worst images", f'<p>{text}</p><div class="show-mask show-box show-name">{body}</div>')
+
+
+def worst_images(confusion: Confusion) -> list[int]:
+    """Ids of images with an error, those with the least share of things found right first."""
+    shares = {
+        image: (right / (right + sum(wrong)), -sum(wrong), image)
+        for image, (right, *wrong) in confusion.errors.items()
+        if sum(wrong)
+    }
+    return sorted(shares, key=lambda image: shares[image])
+
+
+def _picture(sample: Sample, shown: Sequence[Mapping[str, Any]], class_names: Sequence[str], what: str) -> str:
+    image = read_picture(sample.path)
+    scale = min(1.0, _THUMBNAIL / sample.width)
+    size = max(1, round(sample.width * scale)), max(1, round(sample.height * scale))
+    unit, marks, names = sample.width / _THUMBNAIL, [], []
+    for entry in shown:
+        index = entry["category_id"] - 1
+        colour = "rgb({},{},{})".format(*class_colour(index))
+        x, y, width, height = entry["bbox"]
+        name = class_names[index] + (f" {entry['score']:.2f}" if "score" in entry else "")
+        if "segmentation" in entry and (mask := decode_rle(entry["segmentation"])).any():
+            path = mask_path(Silhouette.cropped(mask.astype(bool), 0, 0))
+            marks.append(f'<path class="mask" d="{path}" fill="{colour}" stroke="{colour}"/>')
+        marks.append(f'<rect class="box" x="{x}" y="{y}" width="{width}" height="{height}" stroke="{colour}"/>')
+        names.append(
+            f'<text class="name" x="{x}" y="{max(y - 3 * unit, 11 * unit):.0f}" font-size="{11 * unit:.1f}">'
+            f"{html.escape(name)}</text>"
+        )
+    text = html.escape(f"{sample.name}, {what}: {len(shown)}", quote=True)
+    source = inline_image(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    return (
+        f'<div class="picture"><img alt="{text}" src="{source}"><svg aria-hidden="true" '
+        f'viewBox="0 0 {sample.width} {sample.height}">{"".join(marks + names)}</svg></div>'
+    )

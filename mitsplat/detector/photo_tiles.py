@@ -1,0 +1,89 @@
+"""Photographs cut to tiles, in which things are as large at the size of a training as where they will be sought.
+
+A photograph that is scaled to the size of a training shows things smaller than one that is searched at a larger size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mitsplat.arrays import BoolArray
+from mitsplat.detector.pictures import SMALLEST, read_picture
+from mitsplat.detector.sets import Instance, LabelledSet
+from mitsplat.errors import InputError
+from mitsplat.images.masks import Silhouette, decode_rle
+from mitsplat.labels.polygons import outline
+
+LEAST_SEEN = 0.15
+"""Share of what a photograph shows of an object from which it is labelled in a tile."""
+_OVERLAP = 1 / 3
+"""Least overlap of tiles, as a share of their sides: a thing of this size is whole in one of them."""
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+"""As good as what a camera stores: noise is to stay."""
+
+
+def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder: Path) -> LabelledSet:
+    """Overlapping tiles that at ``size`` show things as large as whole photographs at ``real_size``.
+
+    Args:
+        photographs: Labelled photographs.
+        real_size: Longer side of a whole photograph [px], more than ``size``.
+        size: Longer side that a tile is scaled to [px].
+        folder: Where tiles are written, as JPEG files.
+
+    Raises:
+        InputError: If a photograph cannot be read, or its tiles are too small.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    samples = []
+    for number, sample in enumerate(photographs.samples):
+        picture = read_picture(sample.path)
+        width, height = (max(round(side * size / real_size), 1) for side in (sample.width, sample.height))
+        if min(width, height) < SMALLEST:
+            raise InputError(
+                f"{sample.path}: a tile of it must have sides of {SMALLEST} px or more (got {width} x {height}): give "
+                f"a --real-size nearer to --size, {size}"
+            )
+        masks = [
+            np.asarray(decode_rle(one.encoded(sample.width, sample.height)), dtype=bool) if one.has_mask else None
+            for one in sample.instances
+        ]
+        for top in _starts(sample.height, height):
+            for left in _starts(sample.width, width):
+                path = folder / f"{number:05d}_{top}_{left}.jpg"
+                cv2.imwrite(str(path), picture[top : top + height, left : left + width], _JPEG)
+                found = (
+                    _within(instance, mask, left, top, width, height)
+                    for instance, mask in zip(sample.instances, masks, strict=True)
+                )
+                instances = tuple(instance for instance in found if instance is not None)
+                samples.append(replace(sample, path=path, width=width, height=height, instances=instances))
+    return replace(photographs, samples=tuple(samples))
+
+
+def _starts(side: int, tile: int) -> list[int]:
+    """Where tiles begin along a side, the first and the last at its ends."""
+    step = (1 - _OVERLAP) * tile
+    return [round(start) for start in np.linspace(0, side - tile, int(np.ceil((side - tile) / step)) + 1)]
+
+
+def _within(
+    instance: Instance, mask: BoolArray | None, left: int, top: int, width: int, height: int
+) -> Instance | None:
+    """What a tile shows of an object, which has a mask or a box in the photograph; None if that is too little."""
+    if mask is not None:
+        seen = mask[top : top + height, left : left + width]
+        if seen.sum() < max(LEAST_SEEN * mask.sum(), 1):
+            return None
+        box = Silhouette.cropped(seen, 0, 0).box
+        return Instance(instance.class_index, box, outline(seen), crowd=instance.crowd)
+    low, high = np.reshape(instance.box, (2, 2))
+    inside = np.clip([low, high], (left, top), (left + width, top + height))
+    if (inside[1] - inside[0]).prod() < LEAST_SEEN * (high - low).prod():
+        return None
+    (x0, y0), (x1, y1) = (inside - (left, top)).tolist()
+    return Instance(instance.class_index, (x0, y0, x1, y1), crowd=instance.crowd)

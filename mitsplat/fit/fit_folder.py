@@ -1,0 +1,216 @@
+"""The folder of a fit, which never holds parts of two.
+
+``fit.json`` (:class:`FitResult` and the settings) is written last and removed first: where it is, ``splats.ply`` and,
+for every held-out photo, ``held_out/NAME.png`` (photo | render | difference) belong to it. ``checkpoint.npz`` is what
+an unfinished fit goes on from. Both hold the hash of what they were made of.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.errors import InputError
+from mitsplat.fit.training_view import HeldOut
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.storage.files import write_file, write_text
+from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
+
+FIT_FILE = "fit.json"
+_UNFINISHED = ".unfinished"
+"""A file that is there while a fit is, and after it if it was interrupted."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What a fit came to.
+
+    Attributes:
+        splats: The Gaussians, in the capture's frame and units.
+        iterations: Steps made.
+        seconds: Time that they took, over all runs.
+        held_out: Photos that took no part in the fit, nor in when it ended.
+        inputs: SHA-256 of photos, masks, depth maps, cameras, points, settings and version.
+        warnings: What was given and is of no use, a sentence each.
+        validation: Photos that were not fitted, and whose PSNR decided when the fit ended; none without a target.
+    """
+
+    splats: Splats
+    iterations: int
+    seconds: float
+    held_out: tuple[HeldOut, ...]
+    inputs: str
+    warnings: tuple[str, ...] = ()
+    validation: tuple[HeldOut, ...] = ()
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR of the held-out photos [dB]."""
+        return _mean_psnr(self.held_out)
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM of the held-out photos."""
+        return float(np.mean([h.ssim for h in self.held_out]))
+
+    @property
+    def validation_psnr(self) -> float | None:
+        """Mean PSNR of the photos that the target is for [dB]."""
+        return _mean_psnr(self.validation) if self.validation else None
+
+
+def _mean_psnr(photos: Sequence[HeldOut]) -> float:
+    return float(np.mean([photo.psnr for photo in photos]))
+
+
+def read_record(path: Path) -> Any:
+    """What ``fit.json`` says, of a version that is known; its keys are still to be checked.
+
+    Raises:
+        InputError: If it is missing, no JSON, or of a newer version.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file: has the fit finished?") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not the record of a fit ({error})") from error
+    check_format_version(record, FORMAT_VERSIONS[FIT_FILE], path)
+    return record
+
+
+@dataclass(frozen=True)
+class FitFolder:
+    """Where a fit of some inputs is kept.
+
+    Attributes:
+        path: The folder.
+        inputs: Hash of what decides the fit.
+    """
+
+    path: Path
+    inputs: str
+
+    @property
+    def held_out(self) -> Path:
+        """Where the held-out photos are compared."""
+        return self.path / "held_out"
+
+    def finished(self, *, overwrite: bool) -> FitResult | None:
+        """The fit of these inputs, if it is finished.
+
+        Args:
+            overwrite: Whether a fit of other inputs, or a damaged one, counts as none.
+
+        Raises:
+            InputError: If the folder holds such a fit otherwise.
+        """
+        path = self.path / FIT_FILE
+        if not path.exists():
+            return None
+        try:
+            result = self._read(path)
+        except InputError as error:
+            if overwrite:
+                return None
+            raise InputError(f"{error}; --overwrite replaces it") from error
+        for name in ("checkpoint.npz", _UNFINISHED):  # of a run that was interrupted after its last step
+            (self.path / name).unlink(missing_ok=True)
+        return result
+
+    def _read(self, path: Path) -> FitResult:
+        record = read_record(path)
+        try:
+            held_out, validation = (
+                tuple(HeldOut(**photo) for photo in record[name]) for name in ("held_out", "validation")
+            )
+            found, iterations, seconds = record["inputs"], int(record["iterations"]), float(record["seconds"])
+            warnings = tuple(record["warnings"])
+        except KeyError as error:
+            raise InputError(f"{path}: not the record of a fit by this version (it lacks {error})") from error
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{path}: not the record of a fit ({error})") from error
+        if found != self.inputs:
+            raise InputError(f"{path}: belongs to a fit of other photos or settings, or by another version")
+        splats = Splats.load(self.path / "splats.ply")
+        return FitResult(splats, iterations, seconds, held_out, self.inputs, warnings, validation)
+
+    def checkpoint(self, *, overwrite: bool) -> dict[str, npt.NDArray[Any]] | None:
+        """What an unfinished fit of these inputs left to go on from, if any.
+
+        Args:
+            overwrite: Whether a checkpoint of other inputs, or a damaged one, counts as none.
+
+        Raises:
+            InputError: If the folder holds such a checkpoint otherwise.
+        """
+        path = self.path / "checkpoint.npz"
+        if not path.exists():
+            return None
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                state = dict(stored)
+            found = str(state.pop("inputs"))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            if overwrite:
+                return None
+            raise InputError(f"{path}: not a checkpoint of a fit ({error}); --overwrite replaces it") from error
+        if found == self.inputs:
+            return state
+        if overwrite:
+            return None
+        raise InputError(
+            f"{path}: belongs to a fit of other photos or settings, or by another version; --overwrite replaces it"
+        )
+
+    def refuse_others(self) -> None:
+        """Refuse a folder that holds what a fit would replace, and no fit.
+
+        Raises:
+            InputError: Which names it.
+        """
+        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz", _UNFINISHED)):
+            return
+        for there in (self.path / "splats.ply", self.held_out):
+            if there.exists():
+                raise InputError(f"{there}: is there already, and not of a fit; --overwrite replaces it")
+
+    def begin(self, *, goes_on: bool) -> None:
+        """Remove what another fit left, its record first; the checkpoint stays if the fit goes on from it."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        (self.path / _UNFINISHED).touch()
+        (self.path / FIT_FILE).unlink(missing_ok=True)
+        if not goes_on:
+            (self.path / "checkpoint.npz").unlink(missing_ok=True)
+        (self.path / "splats.ply").unlink(missing_ok=True)
+        shutil.rmtree(self.held_out, ignore_errors=True)
+        for part in self.path.glob(".*.part"):  # of a run that was killed while it wrote
+            part.unlink()
+
+    def save_checkpoint(self, state: Mapping[str, Any]) -> None:
+        """Write what the fit can go on from."""
+
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as file:
+                np.savez(file, inputs=self.inputs, **state)
+
+        write_file(self.path / "checkpoint.npz", write)
+
+    def save(self, result: FitResult, known: Mapping[str, Any]) -> None:
+        """Write the finished fit, and beside its own figures in the record what else is ``known`` of it."""
+        result.splats.save(self.path / "splats.ply")
+        names = ("inputs", "iterations", "seconds", "psnr", "ssim", "validation_psnr", "warnings")
+        record = {FORMAT_VERSION: FORMAT_VERSIONS[FIT_FILE]} | {name: getattr(result, name) for name in names}
+        record |= {"gaussians": len(result.splats)} | dict(known)
+        record |= {name: [asdict(p) for p in getattr(result, name)] for name in ("held_out", "validation")}
+        write_text(self.path / FIT_FILE, json.dumps(record, indent=1) + "\n")
+        for name in ("checkpoint.npz", _UNFINISHED):
+            (self.path / name).unlink(missing_ok=True)

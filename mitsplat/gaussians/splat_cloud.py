@@ -1,0 +1,191 @@
+"""Gaussian splats in memory: the one statement of mitsplat's conventions.
+
+* World: right-handed, z up, metres, kilograms, seconds.
+* Cameras: OpenCV (x right, y down, z forward); pixel centres at +0.5.
+* ``a_from_b`` names a transform that takes b-coordinates to a-coordinates.
+* Quaternions: xyzw in memory (as Mitsuba, Warp and SciPy), wxyz in 3DGS files.
+* ``Splats`` holds activated values (scales in metres, opacities in [0, 1]); files hold logarithms and logits.
+* Colours of splats are display-encoded: they are blended encoded and linearised afterwards.
+* Spherical harmonics: real, with the Condon-Shortley phase, ordered ``(l, m) = (0, 0), (1, -1), (1, 0), (1, 1), ...``
+  as in 3DGS, evaluated for the direction from the camera to the Gaussian.
+* Instance ids: 0 is the environment, objects count from 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.errors import InputError
+from mitsplat.gaussians.spherical_harmonics import sh_rotation
+from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """A set of N anisotropic 3D Gaussians with view-dependent colour (Kerbl et al. 2023, 3DGS).
+
+    Arrays are copied to contiguous float32 and frozen; quaternions are normalised.
+
+    Attributes:
+        means: Gaussian centres [m], shape (N, 3).
+        quats: Orientations, xyzw unit quaternions, shape (N, 4).
+        scales: Standard deviations along the local axes [m], shape (N, 3), > 0.
+        opacities: Peak opacity in [0, 1], shape (N,).
+        sh: Spherical-harmonic coefficients of the display-encoded colour in 3DGS order, shape (N, K, 3) with
+            K = 1, 4, 9 or 16: colour = max(0, 0.5 + sum_k sh[k] Y_k(direction)), direction from camera to Gaussian.
+
+    Raises:
+        ValueError: If a shape is wrong or a value breaks its rule; the sentence names field, rule, value and row.
+    """
+
+    means: Float32Array
+    quats: Float32Array
+    scales: Float32Array
+    opacities: Float32Array
+    sh: Float32Array
+
+    def __post_init__(self) -> None:
+        with np.errstate(over="ignore"):  # beyond float32 becomes inf, which the rules below refuse
+            arrays = {f.name: np.array(getattr(self, f.name), dtype=np.float32, order="C") for f in fields(self)}
+        count = len(arrays["means"]) if arrays["means"].ndim else 0
+        for name, row in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ())):
+            if arrays[name].shape != (count, *row):
+                raise InputError(f"{name} must have shape {(count, *row)} (got {arrays[name].shape})")
+        if arrays["sh"].shape not in [(count, k, 3) for k in (1, 4, 9, 16)]:
+            raise InputError(f"sh must have shape ({count}, 1, 4, 9 or 16, 3) (got {arrays['sh'].shape})")
+        quats, scales, opacities = arrays["quats"], arrays["scales"], arrays["opacities"]
+        for name in ("means", "quats", "sh"):
+            _require(np.isfinite(arrays[name]), name, "finite", arrays[name])
+        _require(np.isfinite(scales) & (scales > 0), "scales", "finite and > 0", scales)
+        _require((opacities >= 0) & (opacities <= 1), "opacities", "in [0, 1]", opacities)
+        norms = np.linalg.norm(quats.astype(np.float64), axis=1)
+        _require(norms > 1e-12, "quats", "of non-zero length", norms)
+        # Unit quaternions keep their bits, so that copying a splat any number of times changes nothing.
+        norms[np.abs(norms - 1.0) < 1e-6] = 1.0
+        arrays["quats"] = (quats / norms[:, None]).astype(np.float32)
+        for name, array in arrays.items():
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return int(np.sqrt(self.sh.shape[1])) - 1
+
+    @property
+    def bounds(self) -> Float32Array:
+        """Lowest and highest coordinates of the centres [m], shape (2, 3).
+
+        Raises:
+            ValueError: If there are no Gaussians.
+        """
+        if not len(self):
+            raise ValueError("bounds need at least one Gaussian (got 0)")
+        return np.stack([self.means.min(axis=0), self.means.max(axis=0)])
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], *, units: float = 1.0) -> Splats:
+        """Read a file; :mod:`mitsplat.gaussians.splat_files` says which formats there are and what each one keeps.
+
+        Args:
+            path: A ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or ``.sog`` file.
+            units: Metres per unit of the file.
+
+        Raises:
+            InputError: If the file is missing, of another kind, damaged, or holds a value that breaks a rule.
+        """
+        arrays = read_splats(Path(path))
+        try:
+            splats = cls(**arrays._asdict())
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
+        return splats if units == 1.0 else splats.transformed(np.diag([units, units, units, 1.0]))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a 3DGS ``.ply`` (lossless to float32 rounding), a ``.splat`` or an ``.spz`` (both quantised).
+
+        Raises:
+            InputError: If the suffix is another one, the format cannot hold these splats, or the file cannot be
+                written; no partial file is left.
+        """
+        write_splats(SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh), Path(path))
+
+    def select(self, index: Any) -> Splats:
+        """The Gaussians that a Boolean mask (N,), an integer array or a slice picks, in its order."""
+        rows = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
+        return Splats(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def transformed(self, matrix: npt.ArrayLike) -> Splats:
+        """These splats after a similarity transform; colours turn with the object.
+
+        Args:
+            matrix: ``new_from_old``: rotation, uniform scale and translation [m], shape (4, 4).
+
+        Raises:
+            ValueError: If the matrix shears, mirrors, or scales unevenly, all of which would leave the set of
+                Gaussians with orthonormal axes or of band-limited colours.
+        """
+        rotation, scale, translation = split_similarity(matrix)
+        turn = Rotation.from_matrix(rotation)
+        return Splats(
+            means=(self.means.astype(np.float64) @ (scale * rotation).T + translation).astype(np.float32),
+            quats=(turn * Rotation.from_quat(self.quats)).as_quat() if len(self) else self.quats,
+            scales=(self.scales.astype(np.float64) * scale).astype(np.float32),
+            opacities=self.opacities,
+            sh=sh_rotation(rotation, self.sh_degree).astype(np.float32) @ self.sh,
+        )
+
+    @staticmethod
+    def concatenate(parts: Sequence[Splats]) -> Splats:
+        """All Gaussians of ``parts`` in order; lower SH degrees are padded with zeros to the highest.
+
+        Raises:
+            ValueError: If ``parts`` is empty.
+        """
+        if not parts:
+            raise ValueError("concatenate needs at least one Splats (got none)")
+        width = max(part.sh.shape[1] for part in parts)
+        padded = [np.pad(part.sh, ((0, 0), (0, width - part.sh.shape[1]), (0, 0))) for part in parts]
+        joined = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Splats) if f.name != "sh"}
+        return Splats(**joined, sh=np.concatenate(padded))
+
+
+def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float64Array]:
+    """Rotation (3, 3), uniform scale and translation (3,) of a similarity transform (4, 4).
+
+    Raises:
+        ValueError: If the matrix is not finite, or not a rotation with a uniform scale and a translation.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise ValueError("a transform must be a finite 4x4 matrix whose last row is 0 0 0 1")
+    linear = matrix[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    if determinant <= 0:
+        raise ValueError(f"a transform must neither mirror nor flatten (got determinant {determinant:.6g})")
+    scale = float(np.cbrt(determinant))
+    rotation = linear / scale
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > 1e-4:
+        raise ValueError(f"a transform must scale uniformly and not shear (R R^T differs from 1 by {error:.3g})")
+    u, _, vt = np.linalg.svd(rotation)  # nearest rotation: inputs are often float32
+    return u @ vt, scale, matrix[:3, 3]
+
+
+def _require(valid: BoolArray, name: str, rule: str, values: npt.NDArray[Any]) -> None:
+    """Raise InputError that names the first row of ``values`` (N, ...) where ``valid`` (N, ...) does not hold."""
+    if not valid.all():
+        place = np.unravel_index(int(np.argmin(valid)), valid.shape)
+        raise InputError(f"{name} must be {rule} (got {values[place]:.6g} at row {place[0]})")

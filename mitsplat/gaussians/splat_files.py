@@ -1,0 +1,398 @@
+"""Files of Gaussian splats, to and from the conventions of :mod:`mitsplat.gaussians.splat_cloud`.
+
+======================  ====  =====  ==========================================================================
+suffix                  read  write  what the format keeps
+======================  ====  =====  ==========================================================================
+``.ply``                yes   yes    3DGS: everything, as float32 logarithms (scales) and logits (opacities)
+``.compressed.ply``     yes   no     PlayCanvas: 11-bit positions in chunks of 256, SH to 1/32
+``.splat``              yes   yes    float32 positions and scales; 8-bit colours, opacities, quaternions; no SH
+``.ksplat``             yes   no     GaussianSplats3D: as its compression level says
+``.spz``                yes   yes    Niantic: 24-bit positions, log scales in steps of 1/16 from 4.5e-5 to 370
+                                     file units, 8-bit colours and opacities, SH in [-1, 1] to 4 or 5 bits
+``.sog``                yes   no     PlayCanvas: 16-bit log positions, 8-bit codebooks; the order changes
+======================  ====  =====  ==========================================================================
+
+No format names its axes or its unit, and none is turned or scaled here: ``x, y, z`` are what the file says.
+``.ply``, ``.splat`` and version 3 of ``.spz``, which assets are stored in, are decoded here, and nothing is allocated
+that the size of the file does not warrant. The others are decoded by gaussforge, which trusts its input: it runs in a
+process of its own, with bounded memory, and takes a tenth of a second to start.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import expit, logit
+
+from mitsplat.arrays import Float32Array
+from mitsplat.errors import InputError
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_converter import convert_splats
+from mitsplat.runtime.child_process import run_bounded
+from mitsplat.storage.files import storage_errors, write_file
+
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+
+_CONVERTED = (".ksplat", ".spz", ".sog")
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8"},
+}
+_PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_MAX_HEADER = 1 << 16
+_MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
+_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
+_MAX_SWELL = 100
+"""Real files grow by a factor of 1.1 to 3 when they are unpacked."""
+_MAX_ENTRIES = 64
+_LOGIT_LIMIT = 110.0
+"""sigmoid(+-110) is exactly 1 and 0 in float32, so that both survive a file without infinities."""
+
+_SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+_SPZ_HEADER = struct.Struct("<4s2I4B")
+"""Magic, version, number of Gaussians, degree of SH, fractional bits of positions, flags, reserved."""
+_SPZ_FRACTIONAL_BITS = 12
+_SPZ_FRACTIONAL_BITS_OFFSET = 13
+_SPZ_POSITION_BITS = 23
+
+
+class SplatArrays(NamedTuple):
+    """Activated, unchecked arrays of N Gaussians, as :class:`~mitsplat.gaussians.splat_cloud.Splats` takes them."""
+
+    means: Float32Array
+    quats: Float32Array
+    scales: Float32Array
+    opacities: Float32Array
+    sh: Float32Array
+
+
+def usual_up(path: Path) -> Axis:
+    """Axis that points up in most files of a format: y in ``.spz``, -y in others, as structure from motion has it."""
+    return "y" if path.suffix.lower() == ".spz" else "-y"
+
+
+def read_splats(path: Path) -> SplatArrays:
+    """Read a splat file in its own units and axes.
+
+    Raises:
+        InputError: If the file is missing, of an unknown suffix, damaged, or holds a value that breaks a rule.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".ply", ".splat", *_CONVERTED):
+        raise InputError(
+            f"{path}: splats must be .ply, .compressed.ply, .splat, .ksplat, .spz or .sog (got suffix {suffix!r})"
+        )
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: must be a file")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    try:
+        if not data:
+            raise InputError("the file is empty")
+        if suffix == ".splat":
+            return _decode_splat(data)
+        if suffix == ".spz":
+            return _decode_spz(data)
+        return _decode_ply(data if suffix == ".ply" else _convert(data, suffix[1:], "ply"))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write_splats(splats: SplatArrays, path: Path) -> None:
+    """Write ``splats`` as the suffix of ``path`` says, replacing the file in one step.
+
+    Raises:
+        InputError: If the suffix is not ``.ply``, ``.splat`` or ``.spz``, the format cannot hold the splats, or the
+            file cannot be written.
+        MissingResourceError: If there is no room.
+    """
+    encoders = {".ply": _encode_ply, ".splat": _encode_splat, ".spz": _encode_spz}
+    suffix = path.suffix.lower()
+    if suffix not in encoders or path.name.lower().endswith(".compressed.ply"):
+        raise InputError(f"{path}: splats are written as .ply, .splat or .spz (got {path.name!r})")
+    if not len(splats.means) and suffix != ".ply":
+        raise InputError(f"{path}: a {suffix} file must hold at least one Gaussian (got 0)")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: cannot be written (there is no such folder)")
+    data = encoders[suffix](splats)
+    with storage_errors(path):
+        write_file(path, lambda partial: partial.write_bytes(data))
+
+
+def _decode_ply(data: bytes) -> SplatArrays:
+    form, elements, start = _parse_ply_header(data)
+    if "vertex" not in elements:
+        raise InputError("a PLY file of splats must have a vertex element")
+    names = elements["vertex"][1].names or ()
+    if "packed_position" in names:
+        return _decode_ply(_convert(data, "compressed.ply", "ply"))
+    missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *_SCALES, *_QUATS) if n not in names]
+    if missing:
+        raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing)")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    rest_names = [f"f_rest_{i}" for i in range(rest)]
+    if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
+        raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
+    rows = _vertex_rows(data, form, elements, start)
+    # Files are channel-major: all coefficients of red, then green, then blue.
+    higher = _columns(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
+    return SplatArrays(
+        means=_columns(rows, _MEANS),
+        quats=_columns(rows, _QUATS),
+        scales=_exp(_columns(rows, _SCALES)),
+        opacities=_sigmoid(rows["opacity"]),
+        sh=np.concatenate([_columns(rows, _COLOUR)[:, None], higher], axis=1),
+    )
+
+
+def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:
+    """Format, elements (name to count and row type; lists have the type "object") and the offset of the rows.
+
+    The PLY format is Turk's (1994); only what a header may say is accepted.
+    """
+    end = re.search(rb"\nend_header[ \t]*\r?\n", data[:_MAX_HEADER])
+    if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
+        raise InputError(f"a PLY file must have a header from 'ply' to 'end_header' within {_MAX_HEADER} bytes")
+    lines = data[: end.start()].decode("ascii", "replace").splitlines()
+    form = ""
+    counts: dict[str, int] = {}
+    types: dict[str, list[tuple[str, str]]] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", order, "1.0"] if order in _PLY_ORDERS and not form:
+                form = order
+            case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and form and name not in counts:
+                counts[name], types[name] = int(count), []
+            case ["property", "list", _, _, name] if counts:
+                types[next(reversed(types))].append((name, "O"))
+            case ["property", kind, name] if kind in _PLY_TYPES and counts:
+                types[next(reversed(types))].append((name, _PLY_ORDERS[form] + _PLY_TYPES[kind]))
+            case _:
+                raise InputError(f"line {number} of the PLY header is not understood (got {line[:80]!r})")
+    return form, {name: (counts[name], np.dtype(types[name])) for name in counts}, end.end()
+
+
+def _vertex_rows(
+    data: bytes, form: str, elements: dict[str, tuple[int, np.dtype[Any]]], start: int
+) -> npt.NDArray[np.void]:
+    """The vertices as a structured array; the promised count is checked against the file before any allocation."""
+    before = [elements[name] for name in list(elements)[: list(elements).index("vertex")]]
+    count, row = elements["vertex"]
+    if row.hasobject or any(kind.hasobject for _, kind in before) or (before and form == "ascii"):
+        raise InputError("a PLY file of splats must not have list properties in or before its vertices")
+    start += sum(number * kind.itemsize for number, kind in before)
+    # In text, a number takes at least a digit and a separator.
+    smallest = count * (row.itemsize if form != "ascii" else 2 * len(row.names or ()))
+    present = max(0, len(data) - start + (form == "ascii"))
+    if smallest > present:
+        raise InputError(f"the header promises {count} Gaussians in at least {smallest} bytes (got {present} bytes)")
+    if form != "ascii":
+        return np.frombuffer(data, row, count, start) if count else np.empty(0, row)
+    width = len(row.names or ())
+    words = data[start:].split(maxsplit=count * width)[: count * width]
+    if len(words) < count * width:
+        raise InputError(f"the header promises {count} Gaussians of {width} numbers (got {len(words)} numbers)")
+    numbers = np.array(words, dtype=np.bytes_).astype(np.float64)
+    return numbers.view([(name, np.float64) for name in row.names or ()])
+
+
+def _exp(logarithms: npt.NDArray[Any]) -> Float32Array:
+    with np.errstate(over="ignore"):  # overflow becomes inf, which Splats refuses by name and row
+        return np.exp(logarithms.astype(np.float64)).astype(np.float32)
+
+
+def _sigmoid(logits: npt.NDArray[Any]) -> Float32Array:
+    return np.asarray(expit(logits.astype(np.float64)), dtype=np.float32)
+
+
+def _columns(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> Float32Array:
+    """The named properties side by side, shape (N, len(names))."""
+    table = np.empty((len(rows), len(names)), np.float32)
+    with np.errstate(over="ignore"):
+        for column, name in enumerate(names):
+            table[:, column] = rows[name]
+    return table
+
+
+def _encode_ply(splats: SplatArrays) -> bytes:
+    """The layout of 3DGS's own files, empty normals included, which some loaders insist on."""
+    with np.errstate(divide="ignore"):
+        opacity = np.clip(logit(splats.opacities.astype(np.float64)), -_LOGIT_LIMIT, _LOGIT_LIMIT)
+    count, coefficients = splats.sh.shape[:2]
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
+    rest_names = [f"f_rest_{i}" for i in range(rest.shape[1])]
+    names = [*_MEANS, "nx", "ny", "nz", *_COLOUR, *rest_names, "opacity", *_SCALES, "rot_0", "rot_1", "rot_2", "rot_3"]
+    rows = np.hstack(
+        [
+            splats.means,
+            np.zeros((count, 3)),
+            splats.sh[:, 0],
+            rest,
+            opacity[:, None],
+            np.log(splats.scales.astype(np.float64)),
+            splats.quats[:, [3, 0, 1, 2]],
+        ]
+    ).astype("<f4")
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
+    return header.encode() + rows.tobytes()
+
+
+def _decode_splat(data: bytes) -> SplatArrays:
+    """32 bytes a Gaussian (antimatter15's viewer): position, scale, RGBA, quaternion wxyz as (b - 128) / 128."""
+    if len(data) % _SPLAT_ROW.itemsize:
+        raise InputError(f"a .splat file must hold {_SPLAT_ROW.itemsize} bytes per Gaussian (got {len(data)} bytes)")
+    rows = np.frombuffer(data, _SPLAT_ROW)
+    rgba = rows["rgba"].astype(np.float32) / 255.0
+    return SplatArrays(
+        means=rows["mean"],
+        quats=rows["quat"][:, [1, 2, 3, 0]].astype(np.float32) - 128.0,  # normalised by Splats
+        scales=rows["scale"],
+        opacities=rgba[:, 3],
+        sh=(rgba[:, None, :3] - 0.5) / SH_C0,
+    )
+
+
+def _encode_splat(splats: SplatArrays) -> bytes:
+    rows = np.empty(len(splats.means), _SPLAT_ROW)
+    rgba = np.column_stack([0.5 + SH_C0 * splats.sh[:, 0], splats.opacities])
+    rows["mean"], rows["scale"] = splats.means, splats.scales
+    rows["rgba"] = np.rint(255.0 * np.clip(rgba, 0.0, 1.0))
+    rows["quat"] = np.clip(np.rint(128.0 * splats.quats[:, [3, 0, 1, 2]] + 128.0), 0.0, 255.0)
+    return rows.tobytes()
+
+
+def _decode_spz(data: bytes) -> SplatArrays:
+    """SPZ version 3 (Niantic's ``load-spz.cc``): one array of small integers after the other, in gzip.
+
+    To the bit what gaussforge makes of it, without its process. Other versions, and what is not as long as its header
+    says, are left to gaussforge, which reads or refuses them.
+    """
+    raw = _gunzipped(data)
+    magic, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))
+    widths = (9, 1, 3, 3, 4, 3 * (degree + 1) ** 2 - 3)
+    known = (magic, version) == (b"NGSP", 3) and count > 0 and degree <= 3 and bits <= _SPZ_POSITION_BITS
+    if not known or len(raw) != _SPZ_HEADER.size + count * sum(widths):
+        return _decode_ply(_convert(data, "spz", "ply"))
+    ends = _SPZ_HEADER.size + count * np.cumsum(widths)
+    arrays = np.split(np.frombuffer(raw, np.uint8, ends[-1]), [_SPZ_HEADER.size, *ends[:-1]])[1:]
+    positions, alphas, colours, scales, turns, rest = (a.reshape(count, -1).astype(np.int32) for a in arrays)
+    low, middle, high = np.moveaxis(positions.reshape(count, 3, 3), 2, 0)
+    alpha, base = alphas[:, 0].astype(np.float32) / 255, (colours.astype(np.float32) / 255 - 0.5) / np.float32(0.15)
+    with np.errstate(divide="ignore"):
+        logits = np.log((alpha / (1 - alpha)).astype(np.float64)).astype(np.float32)
+    return SplatArrays(
+        means=((high << 24 | middle << 16 | low << 8) >> 8).astype(np.float32) / np.float32(1 << bits),
+        quats=_smallest_three(turns.astype(np.uint8).view("<u4")[:, 0].copy()),
+        scales=_exp(scales / 16 - 10),
+        opacities=_sigmoid(logits),
+        sh=np.concatenate([base[:, None], rest.reshape(count, -1, 3).astype(np.float32) / 128 - 1], axis=1),
+    )
+
+
+def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:
+    """Unit quaternions xyzw (N, 4): the largest component's index, and the others in ten bits each, the sign first."""
+    largest = packed >> 30
+    quats, squares = np.zeros((len(packed), 4), np.float32), np.zeros(len(packed), np.float32)
+    for axis in range(3, -1, -1):
+        rows = np.flatnonzero(largest != axis)
+        value = np.float32(np.sqrt(0.5)) * (packed[rows] & 511).astype(np.float32) / np.float32(511)
+        quats[rows, axis] = np.where(packed[rows] & 512, -value, value)
+        squares[rows] += value * value
+        packed[rows] >>= 10
+    quats[np.arange(len(packed)), largest] = np.sqrt(np.maximum(0, 1 - squares))
+    return quats
+
+
+def _encode_spz(splats: SplatArrays) -> bytes:
+    """SPZ version 3 with as many fractional bits of position as the extent of the splats leaves free.
+
+    The encoder's own 12 bits are steps of 0.24 mm. Positions are handed to it times a power of two, which is exact,
+    and the header's number of fractional bits raised by that power.
+    """
+    extent = max(float(np.abs(splats.means).max()), 2.0**-60)
+    bits = int(np.clip(np.floor(_SPZ_POSITION_BITS - np.log2(extent * (1.0 + 2.0**-20))), 0, _SPZ_POSITION_BITS))
+    means = splats.means * np.float32(2.0 ** (bits - _SPZ_FRACTIONAL_BITS))
+    magnified = SplatArrays(means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    packed = bytearray(gzip.decompress(_convert(_encode_ply(magnified), "ply", "spz")))
+    packed[_SPZ_FRACTIONAL_BITS_OFFSET] = bits
+    return gzip.compress(bytes(packed), compresslevel=6, mtime=0)
+
+
+def _convert(data: bytes, source: str, target: str) -> bytes:
+    """Convert between formats with gaussforge in a process of its own.
+
+    Its decoders do not check every count against the size of the input, so a damaged file can crash the process.
+    """
+    if source == "sog":
+        _check_zip(data)
+    ended = run_bounded(
+        convert_splats,
+        source,
+        target,
+        data=data,
+        imports=["gaussforge"],
+        memory=(4 << 30) + 64 * len(data),
+        seconds=60 + len(data) / 1e6,
+    )
+    if ended.status == 0:
+        return ended.output
+    reason = ended.reason if (ended.status or 0) > 0 else f"its decoder {ended.reason}"
+    raise InputError(f"not a valid {source} file ({reason})")
+
+
+def _gunzipped(data: bytes) -> bytes:
+    """What a gzip file holds; what swells beyond what splats can is refused, and what ends too early is cut there."""
+    limit, raw, rest = _swollen(len(data)), bytearray(), data
+    decoder = zlib.decompressobj(wbits=31)
+    try:
+        while rest and not decoder.eof:
+            raw += decoder.decompress(rest, 1 << 20)
+            rest = decoder.unconsumed_tail
+            if len(raw) > limit:
+                raise InputError(f"{len(data)} bytes must not hold more than {limit} (got more)")
+    except zlib.error as error:
+        raise InputError(f"not a valid spz file ({error})") from None
+    return bytes(raw)
+
+
+def _check_zip(data: bytes) -> None:
+    """Refuse an archive whose entries lie outside of it, swell beyond what splats can, or miss their checksums."""
+    limit = _swollen(len(data))
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+            for entry in entries:
+                if entry.filename.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", entry.filename):
+                    raise InputError(f"an archive must not hold files outside of it (got {entry.filename!r})")
+            size = sum(entry.file_size for entry in entries)
+            if size > limit or len(entries) > _MAX_ENTRIES:
+                within = f"{limit} in {_MAX_ENTRIES} files (got {size} in {len(entries)})"
+                raise InputError(f"{len(data)} bytes must not hold more than {within}")
+            damaged = archive.testzip()  # reads no more of an entry than it states
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, struct.error, zlib.error) as error:
+        raise InputError(f"not a valid sog file ({error})") from None
+    if damaged is not None:
+        raise InputError(f"not a valid sog file ({damaged} in it is damaged)")
+
+
+def _swollen(size: int) -> int:
+    """Most bytes that compressed splats of ``size`` bytes may become."""
+    return _MAX_SWELL * size + (16 << 20)

@@ -1,0 +1,432 @@
+"""Flat Gaussians on a surface: blue-noise placement, spacing that follows detail, and shapes that stop at edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.mesh_normals import CREASE_ANGLE
+
+_OPACITY = 0.98
+_PACKING = 0.62
+"""Points per area r^2 of the sets that :func:`poisson_subset` keeps, measured on a plane (0.70 at saturation)."""
+_CANDIDATES = 5.0
+"""Candidates per area r^2 that make the set nearly maximal."""
+_NORMAL_WEIGHT = 0.6
+"""Distance, in units of r, that two opposite normals add to: keeps the two sides of thin sheets apart."""
+_PROBES = 4
+"""Points per Gaussian at which the surface is tested for gaps."""
+_LEAK = 0.02
+"""Largest share of light that may pass between Gaussians at a probe."""
+_CLOSING_ROUNDS = 14
+_ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
+"""Rows of surfels along creases: their distance from the crease and from each other, in units of the local spacing."""
+_CREASE_NEIGHBOURS = 16
+_EDGE_SIGMAS = 1.5
+"""Standard deviations of a disc between its centre and the nearest crease."""
+_THINNEST = 0.27
+"""Least standard deviation along the surface in units of the local spacing, however near a crease is."""
+_THICKNESS = 0.035
+"""Standard deviation along the normal in units of the local spacing."""
+_REFINEMENT = 0.55
+"""Spacing at creases and tight bends relative to the spacing elsewhere."""
+_BEND = 0.5
+"""Angle [rad] by which a surface may bend from one surfel to the next before they move closer together."""
+_OVERHANG = 0.15
+"""How far tips of discs may stand off a bent surface, in standard deviations of an unhindered disc."""
+_SHARES = (2.0, 1.6, 1.25, 1.0, 0.8, 0.63, 0.5)
+"""Sizes of discs that are tried against the overhang, relative to an unhindered one."""
+_COUNT_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Points of a surface with frames and extents.
+
+    Attributes:
+        points: Positions on the surface [m], shape (N, 3).
+        frames: Rotations whose columns are two tangents and the outward normal, shape (N, 3, 3).
+        scales: Standard deviations along the columns of ``frames`` [m], shape (N, 3).
+        faces: Face that each point lies on, shape (N,).
+        barycentric: Coordinates in that face, shape (N, 3).
+    """
+
+    points: Float64Array
+    frames: Float64Array
+    scales: Float64Array
+    faces: Int64Array
+    barycentric: Float64Array
+
+    @property
+    def centres(self) -> Float64Array:
+        """Where to put Gaussians so that their outer sides lie on the surface [m], shape (N, 3)."""
+        return self.points - 1.5 * self.scales[:, 2:] * self.normals
+
+    def splats(self, sh: Float64Array) -> Splats:
+        """Gaussians of these shapes, all but opaque, with coefficients of SH (N, K, 3)."""
+        return Splats(
+            means=self.centres.astype(np.float32),
+            quats=self.quats.astype(np.float32),
+            scales=self.scales.astype(np.float32),
+            opacities=np.full(len(self), _OPACITY, dtype=np.float32),
+            sh=sh.astype(np.float32),
+        )
+
+    @property
+    def normals(self) -> Float64Array:
+        """Outward unit normals, shape (N, 3)."""
+        return self.frames[:, :, 2]
+
+    @property
+    def quats(self) -> Float64Array:
+        """Orientations, xyzw, shape (N, 4)."""
+        return np.asarray(Rotation.from_matrix(self.frames).as_quat())
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def subset(self, keep: BoolArray) -> Surfels:
+        """Those points where ``keep`` (N,) is true."""
+        return Surfels(
+            self.points[keep], self.frames[keep], self.scales[keep], self.faces[keep], self.barycentric[keep]
+        )
+
+
+def place_surfels(
+    mesh: trimesh.Trimesh, density: npt.ArrayLike, count: int, rng: np.random.Generator, *, spread: float = 0.72
+) -> Surfels:
+    """About ``count`` surfels on ``mesh``.
+
+    Args:
+        mesh: Surface; vertices at one position should be merged, so that creases are known.
+        density: Relative density of points on every face, shape (F,), > 0.
+        count: How many points to aim for.
+        rng: Source of randomness.
+        spread: Standard deviation along the surface in units of the local spacing.
+    """
+    area = mesh.area_faces
+    density = np.broadcast_to(np.asarray(density, dtype=np.float64), area.shape)
+    spacing = np.sqrt(_PACKING * (area * density).sum() / count / density)
+    creases = _CreaseIndex.build(mesh, spacing / 2.0)
+    for _ in range(_COUNT_ROUNDS):
+        pool = _Pool.draw(mesh, spacing, creases, rng)
+        rows = creases.rows(pool, _ROW_OFFSET)
+        kept = poisson_subset(pool.points, pool.normals, pool.radius, rng, first=rows)
+        if abs(len(kept) / count - 1.0) < 0.08:
+            break
+        spacing = spacing * np.sqrt(len(kept) / count)
+    radius = pool.radius[kept, None]
+    frames, room = _frames(pool.normals[kept], pool.points[kept], pool.radius[kept], creases)
+    widest = np.clip(room / _EDGE_SIGMAS, _THINNEST * radius, _SHARES[0] * spread * radius)
+    bent = pool.uneven[kept]
+    widest[bent] = np.minimum(
+        widest[bent], _overhang_limit(pool, pool.points[kept][bent], frames[bent], radius[bent] * spread)
+    )
+    scales = np.concatenate([np.minimum(widest, spread * radius), _THICKNESS * radius], axis=1)
+    probe = rng.choice(len(pool.points), size=min(len(pool.points), _PROBES * len(kept)), replace=False)
+    probe = probe[pool.crease_distance[probe] > 0.15 * pool.radius[probe]]
+    scales = _closed(pool.points[kept], frames, scales, widest, pool.points[probe], pool.normals[probe])
+    return Surfels(pool.points[kept], frames, scales, pool.faces[kept], pool.barycentric[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pool:
+    """Candidates, several per surfel, dense where surfels shall be dense.
+
+    Attributes:
+        points: Positions [m], shape (P, 3).
+        normals: Unit normals of their faces, shape (P, 3).
+        faces: Shape (P,).
+        barycentric: Shape (P, 3).
+        radius: Distance to keep from other surfels [m], shape (P,).
+        crease_distance: Distance to the nearest crease [m], infinite where it is far, shape (P,).
+        uneven: Whether a crease or a bend may be near, shape (P,).
+    """
+
+    points: Float64Array
+    normals: Float64Array
+    faces: Int64Array
+    barycentric: Float64Array
+    radius: Float64Array
+    crease_distance: Float64Array
+    uneven: BoolArray
+
+    @classmethod
+    def draw(
+        cls, mesh: trimesh.Trimesh, spacing: Float64Array, creases: _CreaseIndex, rng: np.random.Generator
+    ) -> _Pool:
+        """Candidates for surfels ``spacing`` (F,) apart, closer together near creases and where the surface bends."""
+        expected = mesh.area_faces / spacing**2
+        points, faces, barycentric = _draw(mesh, expected, _CANDIDATES, rng)
+        distance, bend = np.full(len(points), np.inf), np.zeros(len(points))
+        # The middle of flat regions, often most of a surface, needs no closer look.
+        uneven = _uneven_faces(mesh, spacing, creases)
+        reach = float(spacing[uneven].max(initial=0.0))
+        look = uneven[faces]
+        distance[look] = creases.distance(points[look], reach)
+        extra = _draw(mesh, expected * uneven, _CANDIDATES * (_REFINEMENT**-2 - 1.0), rng)
+        extra_distance, extra_bend = creases.distance(extra[0], reach), np.zeros(len(extra[0]))
+        if look.any():
+            tree = KDTree(points[look])
+            bend[look] = _bend(tree, mesh.face_normals[faces[look]], spacing[faces[look]])
+            extra_bend = bend[look][_query(tree, extra[0])[1]]
+        near = (extra_distance < spacing[extra[1]]) | (extra_bend > _BEND)
+        points = np.concatenate([points, extra[0][near]])
+        faces = np.concatenate([faces, extra[1][near]])
+        barycentric = np.concatenate([barycentric, extra[2][near]])
+        distance = np.concatenate([distance, extra_distance[near]])
+        bend = np.concatenate([bend, extra_bend[near]])
+        relative = np.minimum(distance / spacing[faces], _BEND / np.maximum(bend, 1e-9))
+        radius = spacing[faces] * np.clip(relative, _REFINEMENT, 1.0)
+        return cls(points, mesh.face_normals[faces], faces, barycentric, radius, distance, uneven[faces])
+
+
+def _uneven_faces(mesh: trimesh.Trimesh, spacing: Float64Array, creases: _CreaseIndex) -> BoolArray:
+    """Faces (F,) within about a ``spacing`` (F,) of a crease or a bend."""
+    uneven = np.zeros(len(mesh.faces), dtype=bool)
+    uneven[mesh.face_adjacency[mesh.face_adjacency_angles > 1e-3]] = True
+    size = np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max(axis=1)
+    reach = size + 1.5 * spacing
+    uneven |= creases.distance(mesh.triangles_center, float(reach.max())) < reach
+    for _ in range(2):
+        uneven[mesh.face_adjacency[uneven[mesh.face_adjacency].any(axis=1)]] = True
+    return uneven
+
+
+def _bend(tree: KDTree, normals: Float64Array, reach: Float64Array) -> Float64Array:
+    """Angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of every point of ``tree``."""
+    distance, index = _query(tree, tree.data, k=range(1, 1 + min(10, tree.n)))
+    cosine = np.einsum("pkd,pd->pk", normals[index], normals)
+    return np.asarray(np.arccos(np.clip(np.where(distance < reach[:, None], cosine, 1.0).min(axis=1), -1.0, 1.0)))
+
+
+def _overhang_limit(pool: _Pool, points: Float64Array, frames: Float64Array, sigma: Float64Array) -> Float64Array:
+    """Largest standard deviations (N, 2) along the tangents with which discs stay close to the surface.
+
+    Tips at two standard deviations may rise above the nearest bit of surface by a fraction of ``sigma`` (N, 1).
+    """
+    tree = KDTree(pool.points)
+    limit = np.empty((len(points), 2))
+    for axis in range(2):
+        share, undecided = np.full(len(points), _SHARES[-1]), np.arange(len(points))
+        for candidate in _SHARES[:-1]:
+            reach = 2.0 * candidate * sigma[undecided] * frames[undecided, :, axis]
+            rise = np.zeros(len(undecided))
+            for tips in (points[undecided] + reach, points[undecided] - reach):
+                _, nearest = _query(tree, tips)
+                above = np.einsum("nd,nd->n", tips - pool.points[nearest], pool.normals[nearest])
+                rise = np.maximum(rise, above)
+            close = rise < _OVERHANG * sigma[undecided, 0]
+            share[undecided[close]] = candidate
+            undecided = undecided[~close]
+        limit[:, axis] = share * sigma[:, 0]
+    return limit
+
+
+def poisson_subset(
+    points: Float64Array,
+    normals: Float64Array,
+    radius: Float64Array,
+    rng: np.random.Generator,
+    first: Int64Array | None = None,
+) -> Int64Array:
+    """Indices of a Poisson-disk subset of ``points`` (N, 3): kept points are at least their ``radius`` (N,) apart.
+
+    The parallel form of dart throwing (maximal independent set by random priorities, Luby 1986), from fine radii to
+    coarse ones. Opposite ``normals`` (N, 3) count as distance. Points ``first`` (M,) are chosen before all others and
+    may be a little closer together.
+    """
+    if first is not None and len(first):
+        seeds = first[poisson_subset(points[first], normals[first], _ROW_SPACING * radius[first], rng)]
+        chosen = np.zeros(len(points), dtype=bool)
+        chosen[seeds] = True
+        rest = np.flatnonzero(~chosen)
+        gap, nearest = _query(KDTree(points[seeds]), points[rest], distance_upper_bound=float(radius.max()))
+        nearest = seeds[np.minimum(nearest, len(seeds) - 1)]
+        facing = np.einsum("nd,nd->n", normals[rest], normals[nearest]) > 0.7
+        rest = rest[(gap > 0.8 * np.minimum(radius[rest], radius[nearest])) | ~facing]
+        return np.sort(np.concatenate([seeds, rest[poisson_subset(points[rest], normals[rest], radius[rest], rng)]]))
+    level = np.ceil(2.0 * np.log2(radius / radius.min()) - 1e-9).astype(int)
+    kept: list[Int64Array] = []
+    for current in np.unique(level):
+        index = np.flatnonzero(level == current)
+        reach = float(radius[index].max())
+        lifted = np.concatenate([points, _NORMAL_WEIGHT * reach * normals], axis=1)
+        if kept:
+            finer = KDTree(lifted[np.concatenate(kept)])
+            gap, _ = _query(finer, lifted[index], distance_upper_bound=0.85 * reach)
+            index = index[np.isinf(gap)]
+        pairs = KDTree(lifted[index]).query_pairs(reach, output_type="ndarray")
+        kept.append(index[_independent_set(len(index), pairs, rng)])
+    return np.sort(np.concatenate(kept))
+
+
+def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) -> BoolArray:
+    """Maximal independent set of a graph of ``count`` nodes with edges ``pairs`` (P, 2)."""
+    priority = rng.permutation(count)
+    alive, chosen = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+    while alive.any():
+        beaten = np.zeros(count, dtype=bool)
+        beaten[np.where(priority[pairs[:, 0]] > priority[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
+        winners = alive & ~beaten
+        chosen |= winners
+        alive &= ~winners
+        alive[pairs[winners[pairs[:, 0]], 1]] = False
+        alive[pairs[winners[pairs[:, 1]], 0]] = False
+        pairs = pairs[alive[pairs].all(axis=1)]
+    return chosen
+
+
+def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Distances and indices of nearest neighbours, by all processors: no point's answer depends on another's."""
+    found: tuple[npt.NDArray[Any], npt.NDArray[Any]] = tree.query(points, workers=-1, **options)
+    return found
+
+
+def _draw(
+    mesh: trimesh.Trimesh, expected: Float64Array, factor: float, rng: np.random.Generator
+) -> tuple[Float64Array, Int64Array, Float64Array]:
+    """``factor`` times ``expected`` (F,) points per face: positions, faces, barycentric coordinates."""
+    total = expected.sum()
+    count = int(np.ceil(factor * total))
+    faces = np.sort(rng.choice(len(expected), size=count, p=expected / total if total > 0 else None))
+    u, v = rng.random((2, len(faces)))
+    root = np.sqrt(u)
+    barycentric = np.stack([1.0 - root, root * (1.0 - v), root * v], axis=1)
+    return np.einsum("nk,nkd->nd", barycentric, mesh.triangles[faces]), faces, barycentric
+
+
+def _frames(
+    normals: Float64Array, points: Float64Array, radius: Float64Array, creases: _CreaseIndex
+) -> tuple[Float64Array, Float64Array]:
+    """Frames (N, 3, 3), first axis towards the nearest crease, and distances (N, 2) [m] to creases along the axes."""
+    towards, beside = creases.offsets(points, _CREASE_NEIGHBOURS)
+    in_plane = towards - np.einsum("nkd,nd->nk", towards, normals)[..., None] * normals[:, None]
+    distance = np.linalg.norm(in_plane, axis=2)
+    # What lies far above or below belongs to another surface.
+    distance[distance < 0.5 * np.linalg.norm(towards, axis=2)] = np.inf
+    nearest = np.argmin(distance, axis=1)[:, None]
+    bounded = np.take_along_axis(distance, nearest, axis=1) < 4.0 * radius[:, None]
+    helper = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.where(bounded, np.take_along_axis(in_plane, nearest[..., None], axis=1)[:, 0], np.cross(normals, helper))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    frames = np.stack([first, np.cross(normals, first), normals], axis=2)
+    across = np.abs(np.einsum("nkd,ndi->nki", in_plane, frames[:, :, :2]))
+    ahead = (beside & np.isfinite(distance))[..., None] & (across > 0.7 * np.minimum(distance, 1e6)[..., None])
+    return frames, np.where(ahead, across, np.inf).min(axis=1)
+
+
+def _closed(
+    centres: Float64Array,
+    frames: Float64Array,
+    scales: Float64Array,
+    widest: Float64Array,
+    probes: Float64Array,
+    normals: Float64Array,
+) -> Float64Array:
+    """``scales`` (N, 3), grown up to ``widest`` (N, 2) until little light passes between discs at ``probes`` (P, 3)."""
+    _, index = _query(KDTree(centres), probes, k=range(1, 1 + min(12, len(centres))))
+    own = frames[index]
+    local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], own[..., :2])
+    facing = np.einsum("pkj,pj->pk", own[..., 2], normals) > 0.7
+    scales = scales.copy()
+    for _ in range(_CLOSING_ROUNDS):
+        across, along = ((local[..., axis] / scales[index, axis]) ** 2 for axis in range(2))
+        response = np.exp(-0.5 * (across + along)) * facing
+        leaking = np.prod(1.0 - response, axis=1) > _LEAK
+        if not leaking.any():
+            break
+        # A gap that is closed stays closed, since discs only grow.
+        index, local, facing, response = index[leaking], local[leaking], facing[leaking], response[leaking]
+        grown = np.unique(np.take_along_axis(index, np.argpartition(-response, 1, axis=1)[:, :2], axis=1))
+        scales[grown, :2] = np.minimum(1.08 * scales[grown, :2], widest[grown])
+    return scales
+
+
+@dataclass(frozen=True, eq=False)
+class _CreaseIndex:
+    """Creases and boundaries of a mesh as a dense set of points on them.
+
+    Attributes:
+        tree: The points, or None without creases.
+        starts, units, lengths: Edges, one for each face beside them: start [m], direction, length [m].
+        owner: Edge that each point lies on.
+        inward: Directions across the edge into its face and out of the face, shape (E, 2, 3).
+    """
+
+    tree: KDTree | None
+    starts: Float64Array
+    units: Float64Array
+    lengths: Float64Array
+    owner: Int64Array
+    inward: Float64Array
+
+    @classmethod
+    def build(cls, mesh: trimesh.Trimesh, spacing: Float64Array) -> _CreaseIndex:
+        """Points on the creases as far apart as ``spacing`` (F,) [m] says for the faces beside them."""
+        is_sharp = mesh.face_adjacency_angles > CREASE_ANGLE
+        sharp, beside = mesh.face_adjacency_edges[is_sharp], mesh.face_adjacency[is_sharp]
+        open_rows = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+        # A crease counts once for each of its faces.
+        edges = np.concatenate([sharp, sharp, mesh.edges_sorted[open_rows]]).astype(int)
+        face = np.concatenate([beside[:, 0], beside[:, 1], mesh.edges_face[open_rows]]).astype(int)
+        start, along = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]]
+        length = np.linalg.norm(along, axis=1)
+        steps = np.maximum(1, np.ceil(length / spacing[face]).astype(int))
+        owner = np.repeat(np.arange(len(edges)), steps)
+        fraction = (np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[owner]
+        tree = KDTree(start[owner] + fraction[:, None] * along[owner]) if len(edges) else None
+        unit = along / np.maximum(length, 1e-12)[:, None]
+        inward = np.cross(mesh.face_normals[face], unit)
+        inward *= np.sign(np.einsum("nd,nd->n", mesh.triangles_center[face] - start, inward))[:, None]
+        return cls(tree, start, unit, length, owner, np.stack([inward, mesh.face_normals[face]], axis=1))
+
+    def rows(self, pool: _Pool, offset: float) -> Int64Array:
+        """Those candidates (M,) that come nearest to rows along the creases, ``offset`` local spacings inside."""
+        if self.tree is None:
+            return np.empty(0, dtype=np.int64)
+        near = np.flatnonzero(np.isfinite(pool.crease_distance))
+        if not len(near):
+            return near
+        local = KDTree(pool.points[near])
+        inward, normal = self.inward[self.owner, 0], self.inward[self.owner, 1]
+        spacing = pool.radius[near][_query(local, self.tree.data)[1]]
+        distance, index = _query(local, self.tree.data + offset * spacing[:, None] * inward, k=np.arange(1, 5))
+        index = near[np.minimum(index, len(near) - 1)]
+        alike = np.einsum("nkd,nd->nk", pool.normals[index], normal) > 0.9
+        alike &= distance < 0.4 * spacing[:, None]
+        first = np.argmax(alike, axis=1)
+        return np.unique(index[np.arange(len(index)), first][alike.any(axis=1)])
+
+    @property
+    def length(self) -> float:
+        """Length of all creases [m]."""
+        return float(self.lengths.sum())
+
+    def distance(self, points: Float64Array, reach: float) -> Float64Array:
+        """Distances (N,) [m] to the nearest crease; infinite beyond ``reach`` [m] or without creases."""
+        if self.tree is None:
+            return np.full(len(points), np.inf)
+        return np.asarray(_query(self.tree, points, distance_upper_bound=reach)[0])
+
+    def offsets(self, points: Float64Array, count: int) -> tuple[Float64Array, BoolArray]:
+        """Vectors (N, ``count``, 3) to the nearest points of the nearest creases, far away without creases.
+
+        And whether those points (N, ``count``) are inside their edges: ends say nothing about the distance across.
+        """
+        if self.tree is None:
+            return np.full((len(points), count, 3), 1e6), np.zeros((len(points), count), dtype=bool)
+        _, index = _query(self.tree, points, k=np.arange(1, count + 1))
+        segment = self.owner[np.minimum(index, len(self.owner) - 1)]
+        from_start = points[:, None] - self.starts[segment]
+        position = np.einsum("nkd,nkd->nk", from_start, self.units[segment])
+        inside = np.clip(position, 0.0, self.lengths[segment])
+        return inside[..., None] * self.units[segment] - from_start, inside == position

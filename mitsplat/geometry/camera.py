@@ -1,0 +1,334 @@
+"""Cameras in OpenCV convention, pinhole, distorted or fisheye, and paths between key cameras.
+
+Conventions are those of :mod:`mitsplat.gaussians.splat_cloud`: x right, y down, z forward in the camera; pixel centres
+at +0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from mitsplat.arrays import Float64Array
+
+Lens = Literal["opencv", "fisheye"]
+"""OpenCV's camera models: rational with tangential distortion, or fisheye."""
+
+FISHEYE_MAX = float(np.radians(85.0))
+"""Widest angle to the optical axis that a fisheye may show [rad]: rays are held as slopes, which grow beyond bounds."""
+
+
+MOST_PIXELS = 16384
+"""Longest side of an image [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """OpenCV camera: intrinsics [px], lens distortion and pose.
+
+    Attributes:
+        width, height: Image size [px].
+        fx, fy: Focal lengths [px].
+        cx, cy: Principal point [px], pixel centres at +0.5 (the middle of an image is ``width / 2``).
+        world_from_camera: Rigid transform of camera coordinates to world coordinates [m], shape (4, 4).
+        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole; of a fisheye
+            ``k1, k2, k3, k4``.
+        near: Nearest depth at which anything is seen [m].
+        lens: ``opencv``, or ``fisheye`` for OpenCV's fisheye model (Kannala and Brandt 2006).
+        aperture_radius: Of a thin lens [m]; 0 for a pinhole, which sees everything sharp.
+        focus_distance: Depth along z that a thin lens sees sharp [m].
+
+    Raises:
+        ValueError: If a size is below 1, a focal length is not positive, the pose is not rigid, or the number of
+            distortion coefficients is not 0, 4, 5 or 8 (of a fisheye 4), or if a fisheye shows more than 85 degrees to
+            any side of its axis, or if the aperture is negative or the focus not beyond ``near``.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: Float64Array
+    distortion: tuple[float, ...] = ()
+    near: float = 0.01
+    lens: Lens = "opencv"
+    aperture_radius: float = 0.0
+    focus_distance: float = 1.0
+
+    def __post_init__(self) -> None:
+        sides = self.width, self.height
+        if not all(isinstance(side, int | np.integer) and 1 <= side <= MOST_PIXELS for side in sides):
+            raise ValueError(f"camera size must be whole numbers of 1 to {MOST_PIXELS} px (got {sides[0]}x{sides[1]})")
+        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+            raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
+        if not self.near > 0:
+            raise ValueError(f"near must be > 0 (got {self.near})")
+        if not 0 <= self.aperture_radius < np.inf:
+            raise ValueError(f"aperture_radius must be finite and >= 0 (got {self.aperture_radius})")
+        if self.aperture_radius > 0 and not self.near < self.focus_distance < np.inf:
+            raise ValueError(f"focus_distance must be finite and > near, {self.near} (got {self.focus_distance})")
+        if self.lens == "fisheye":
+            self._check_fisheye()
+        elif len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError(f"distortion takes 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
+        pose = np.array(self.world_from_camera, dtype=np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError("world_from_camera must be a finite 4x4 matrix")
+        rotation = pose[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5 or np.linalg.det(rotation) < 0:
+            raise ValueError("world_from_camera must be a rotation and a translation, without scale or mirror")
+        pose.flags.writeable = False
+        object.__setattr__(self, "world_from_camera", pose)
+
+    def _check_fisheye(self) -> None:
+        if len(self.distortion) != 4:
+            raise ValueError(f"the distortion of a fisheye takes 4 coefficients (got {len(self.distortion)})")
+        x, y = np.meshgrid([0, self.width], [0, self.height])
+        farthest = float(np.hypot((x - self.cx) / self.fx, (y - self.cy) / self.fy).max())
+        angle = np.linspace(0, FISHEYE_MAX, 200)
+        shown = fisheye_radius(angle, self.distortion)
+        if np.any(np.diff(shown) <= 0) or farthest > shown[-1]:
+            raise ValueError(
+                f"a fisheye must show at most 85 degrees to each side, in growing distance from the principal point "
+                f"(got a corner at {farthest:.3g} focal lengths, where 85 degrees are at {shown[-1]:.3g})"
+            )
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: npt.ArrayLike,
+        target: npt.ArrayLike,
+        *,
+        up: npt.ArrayLike = (0.0, 0.0, 1.0),
+        width: int,
+        height: int,
+        fov_x: float,
+        distortion: Sequence[float] = (),
+        near: float = 0.01,
+    ) -> Camera:
+        """Camera at ``eye`` [m] that looks at ``target`` [m] with a horizontal field of view ``fov_x`` [degrees].
+
+        Raises:
+            ValueError: If ``eye`` equals ``target`` or ``fov_x`` is not between 0 and 180.
+        """
+        if not 0.0 < fov_x < 180.0:
+            raise ValueError(f"fov_x must be between 0 and 180 degrees (got {fov_x})")
+        focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x))
+        return cls(
+            width=width,
+            height=height,
+            fx=float(focal),
+            fy=float(focal),
+            cx=0.5 * width,
+            cy=0.5 * height,
+            world_from_camera=look_at_pose(eye, target, up),
+            distortion=tuple(float(c) for c in distortion),
+            near=near,
+        )
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Camera:
+        """The camera that :meth:`to_json` described.
+
+        Raises:
+            ValueError: If it is none that could be.
+        """
+        ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
+        same = ("width", "height", "world_from_camera", "near", "lens", "aperture_radius", "focus_distance")
+        known = {key: stored[key] for key in same}
+        return cls(fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(stored["distortion"]), **known)
+
+    def to_json(self) -> dict[str, Any]:
+        """The camera as JSON values, as datasets state it; floats survive the round trip exactly."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "intrinsics": self.intrinsics.tolist(),
+            "distortion": list(self.distortion),
+            "lens": self.lens,
+            "aperture_radius": self.aperture_radius,
+            "focus_distance": self.focus_distance,
+            "near": self.near,
+            "world_from_camera": self.world_from_camera.tolist(),
+        }
+
+    @property
+    def intrinsics(self) -> Float64Array:
+        """Intrinsic matrix K for pixel centres at +0.5, shape (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def camera_from_world(self) -> Float64Array:
+        """Extrinsics: rigid inverse of ``world_from_camera``, shape (4, 4)."""
+        rotation, centre = self.world_from_camera[:3, :3], self.world_from_camera[:3, 3]
+        inverse = np.eye(4)
+        inverse[:3, :3] = rotation.T
+        inverse[:3, 3] = -rotation.T @ centre
+        return inverse
+
+    @property
+    def centre(self) -> Float64Array:
+        """Centre of projection in the world [m], shape (3,)."""
+        return self.world_from_camera[:3, 3]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera sampled on another pixel grid that covers the same image."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def transformed(self, matrix: npt.ArrayLike) -> Camera:
+        """The camera after a similarity transform (4, 4), its near distance scaled."""
+        matrix = np.asarray(matrix, dtype=np.float64)
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        pose = matrix @ self.world_from_camera
+        pose[:3, :3] /= scale
+        return replace(self, world_from_camera=pose, near=self.near * scale)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of a part of the image, which begins at a pixel and may reach beyond the border."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
+    def project(self, points: npt.ArrayLike) -> tuple[Float64Array, Float64Array]:
+        """Pixel positions (N, 2), lens distortion included, and depths along z [m] (N,) of world points (N, 3).
+
+        A point at or behind the camera plane has pixel position NaN.
+        """
+        pose = self.camera_from_world
+        local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
+        depth = local[:, 2]
+        front = depth > 0
+        if not self.distortion:
+            depths = np.where(front, depth, np.nan)
+            return local[:, :2] / depths[:, None] * (self.fx, self.fy) + (self.cx, self.cy), depth
+        pixels = np.full((len(local), 2), np.nan)
+        if self.lens == "fisheye":
+            slopes = local[front, :2] / depth[front, None]
+            slope = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
+            shown = slopes * fisheye_radius(np.arctan(slope), self.distortion) / slope
+            pixels[front] = shown * (self.fx, self.fy) + (self.cx, self.cy)
+        elif front.any():
+            projected, _ = cv2.projectPoints(
+                local[front], np.zeros(3), np.zeros(3), self.intrinsics, np.array(self.distortion)
+            )
+            pixels[front] = projected.reshape(-1, 2)
+        return pixels, depth
+
+    def undistorted(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], Camera]:
+        """An image of this camera as a pinhole sees it that sees nothing beyond its border, and that pinhole.
+
+        Args:
+            image: Shape (H, W, C).
+        """
+        half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
+        lens, size = (self.intrinsics - half, np.array(self.distortion)), (self.width, self.height)
+        pinhole = np.asarray(cv2.getOptimalNewCameraMatrix(*lens, size, 0)[0])
+        x, y = cv2.initUndistortRectifyMap(*lens, np.eye(3), pinhole, size, cv2.CV_32FC1)
+        pixels = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        (fx, _, cx), (_, fy, cy), _ = (pinhole + half).tolist()
+        return np.asarray(pixels, dtype=np.uint8), replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=())
+
+    def ray_slopes(self, pixels: npt.ArrayLike) -> Float64Array:
+        """Undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
+        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.distortion or not len(slopes):
+            return slopes
+        if self.lens == "fisheye":
+            radius = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
+            angle = radius.copy()
+            for _ in range(20):
+                angle -= (fisheye_radius(angle, self.distortion) - radius) / fisheye_rate(angle, self.distortion)
+            return np.asarray(slopes * np.tan(np.clip(angle, 0, FISHEYE_MAX)) / radius, dtype=np.float64)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+        undistorted = cv2.undistortPoints(
+            slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria
+        )
+        return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+
+
+def fisheye_radius(angle: Any, k: Sequence[Any]) -> Any:
+    """Distance from the principal point in focal lengths, of rays at an angle to the axis [rad], on host or device."""
+    square = angle * angle
+    return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+
+
+def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
+    """Derivative of :func:`fisheye_radius`."""
+    square = angle * angle
+    return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
+
+
+def direction(azimuth: float, sine: float) -> Float64Array:
+    """Unit vector (3,) at an azimuth [rad], 0 along +x and counter-clockwise from above, and a sine of the elevation.
+
+    Azimuths and sines that are uniform give directions that are uniform by area on the sphere (Archimedes).
+    """
+    cosine = np.sqrt(1.0 - sine * sine)
+    return np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
+
+
+def spiral(sines: Float64Array, turn: float = 0.0) -> Float64Array:
+    """Unit vectors (N, 3) of sines of the elevation (N,), each the golden angle further around, from ``turn`` [rad] on.
+
+    Sines that are evenly spaced give directions that are even over the sphere (Fibonacci lattice).
+    """
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(sines)) + turn
+    cosine = np.sqrt(1.0 - sines**2)
+    return np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sines], axis=1)
+
+
+def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Float64Array:
+    """``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that looks at ``target`` [m].
+
+    When the view is along ``up`` the image's upper edge points along +y of the world.
+    """
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    forward = target - eye
+    distance = np.linalg.norm(forward)
+    if not np.isfinite(distance):
+        raise ValueError(f"a camera must have finite places (got {eye.tolist()} and {target.tolist()})")
+    if not distance > 0:
+        raise ValueError(f"a camera must look at a point other than its own position (got {eye.tolist()} twice)")
+    forward = forward / distance
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(up))):
+        right = np.cross(forward, (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = eye
+    return pose
+
+
+def interpolate_poses(key_poses: Sequence[npt.ArrayLike], times: npt.ArrayLike) -> Float64Array:
+    """Poses (M, 4, 4) along a smooth path through ``key_poses`` (K, 4, 4) at ``times`` (M,) in [0, 1].
+
+    Positions follow a natural cubic spline and orientations a rotation spline (SciPy), keys evenly spaced in time.
+    """
+    keys = np.asarray(key_poses, dtype=np.float64).reshape(-1, 4, 4)
+    times = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, 1.0)
+    poses = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
+    if len(keys) == 1:
+        poses[:] = keys[0]
+        return poses
+    knots = np.linspace(0.0, 1.0, len(keys))
+    poses[:, :3, 3] = CubicSpline(knots, keys[:, :3, 3], bc_type="natural")(times)
+    poses[:, :3, :3] = RotationSpline(knots, Rotation.from_matrix(keys[:, :3, :3]))(times).as_matrix()
+    return poses

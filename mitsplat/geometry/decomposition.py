@@ -1,0 +1,337 @@
+"""Convex pieces of solids for physics: few of them, close to the surface, in seconds."""
+
+from __future__ import annotations
+
+import logging
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import coacd
+import manifold3d
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+
+from mitsplat.arrays import Float64Array
+from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
+from mitsplat.geometry.mesh_distance import Surface, farthest_outside
+from mitsplat.storage.cache import cache_folder, keep_file
+from mitsplat.storage.content_hash import ContentHash
+
+_logger = logging.getLogger(__name__)
+
+MOST_PIECES = 32
+# Gaps between pieces and the mesh that layouts bear [m], or as a share of the size where that is more.
+_WIDEST_GAP, _GAP_SHARE = 1e-3, 0.005
+_THRESHOLD = 0.02
+# A solid that fills this share of its hull is its hull: what it leaves out is thinner than physics resolves.
+_CONVEX = 0.9995
+# More parts than this are a scan's debris, which is decomposed as a whole.
+_MOST_PARTS = 64
+# A mesh of more faces is a scan, whose noise is taken off before it is split: by this share of its size, and no more
+# than this [m], a third of what objects may sink into a table, unless it needs more to have few faces.
+_SCAN_FACES, _DEVIATION, _MOST_DEVIATION = 3000, 5e-4, 1e-4
+_FEW_FACES, _WORST_ERROR = 5000, 0.003
+# A surface of which sharp valleys are more than this share of all edges, by length, is ragged: no shape, but what is
+# left of a bad fit, and comes apart into more pieces than it has faces. Parts and scans have 0.15 at most.
+_RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
+# Of CoACD's search for every cut; a scan has more cuts than it has concavities, and any of them will do.
+_ITERATIONS, _SCAN_ITERATIONS = 150, 20
+# Places where a piece may be cut, along each direction.
+_PLACES = 15
+# Pieces into which a solid is cut before some are joined again, for each that may be left; pairs tried at once.
+_OVERSHOOT, _LIKELY = 2, 32
+# Share of a limit that is aimed for, as gaps are measured at points, and at most how many of them on faces.
+_MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
+
+
+def widest_gap(size: float) -> float:
+    """How far an object of a longest extent [m] may be from what it rests on, and its pieces from its mesh [m]."""
+    return max(_WIDEST_GAP, _GAP_SHARE * size)
+
+
+def convex_pieces(
+    mesh: trimesh.Trimesh, *, threshold: float = _THRESHOLD, most: int = MOST_PIECES
+) -> tuple[trimesh.Trimesh, ...]:
+    """Split a solid into convex pieces whose union follows its surface.
+
+    Parts that are convex stay whole. Parts of few faces are split by CoACD (Wei et al., *Approximate Convex
+    Decomposition for 3D Meshes with Collision-Aware Concavity and Tree Search*, 2022), whose search takes minutes for
+    scans: these are cut where that takes most empty space out of their hulls, until the pieces stand off the surface by
+    no more than layouts bear, or are as many as they may be; :func:`mitsplat.geometry.mesh_distance.standoff` tells how
+    far they do. The result is kept in memory and in ``$XDG_CACHE_HOME/mitsplat/pieces`` (``~/.cache`` by default), by
+    the hash of the mesh.
+
+    Args:
+        mesh: Surface of one object [m].
+        threshold: Concavity at which a piece counts as convex, relative to half of the part's size; of a scan what
+            stands off by that share of what layouts bear at the default.
+        most: Pieces of a scan that is closed.
+    """
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    return _cached_pieces(vertices.tobytes(), faces.tobytes(), threshold, most)
+
+
+@lru_cache(maxsize=256)
+def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, most: int) -> tuple[trimesh.Trimesh, ...]:
+    digest = ContentHash("pieces 4", f"{version('coacd')} {threshold!r} {most}", vertices, faces)
+    path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
+    pieces = _read_pieces(path)
+    if pieces is None:
+        mesh = trimesh.Trimesh(
+            np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, dtype=np.int64).reshape(-1, 3), process=False
+        )
+        pieces = tuple(piece for part in _parts(mesh) for piece in _split(part, threshold, most))
+        _write_pieces(path, pieces)
+    return pieces
+
+
+def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Closed solids that a mesh is made of; the mesh itself where it is open. Cavities are left out."""
+    if not mesh.is_watertight:
+        mesh.fill_holes()  # a triangle or two that scans lack
+    if not mesh.is_watertight:
+        return [mesh]
+    parts = [part for part in mesh.split(only_watertight=False) if part.volume > 0]
+    return parts if 0 < len(parts) <= _MOST_PARTS else [mesh]
+
+
+def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.Trimesh]:
+    hull = part.convex_hull
+    if part.is_watertight and part.volume >= _CONVEX * hull.volume:
+        return [hull]
+    scan = len(part.faces) > _SCAN_FACES
+    if scan and part.is_volume:
+        limit = widest_gap(float(part.extents.max())) * threshold / _THRESHOLD
+        return _Cutter(part, limit).pieces(most)
+    ragged = _valleys(part) > _RAGGED
+    if ragged:
+        threshold = max(threshold, _RAGGED_THRESHOLD)
+        _logger.warning(
+            "a mesh of %d faces is ragged: physics follows it to %g of its size", len(part.faces), threshold
+        )
+    coacd.set_log_level("error")
+    found = coacd.run_coacd(
+        coacd.Mesh(part.vertices, part.faces),
+        threshold=threshold,
+        mcts_iterations=_SCAN_ITERATIONS if scan or ragged else _ITERATIONS,
+        seed=0,
+    )
+    pieces = [trimesh.Trimesh(vertices, faces, process=False).convex_hull for vertices, faces in found]
+    # Slivers carry no contact that their neighbours lack, and have no hull in single precision.
+    return [piece for piece in pieces if piece.volume > 1e-6 * hull.volume]
+
+
+def _valleys(mesh: trimesh.Trimesh) -> float:
+    """Share of the edges, by length, at which the surface folds inwards by more than :data:`SHARP`."""
+    ends = mesh.vertices[mesh.face_adjacency_edges]
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    sharp = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
+    return float(lengths[sharp].sum() / max(lengths.sum(), 1e-300))
+
+
+def thin_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed surface without its noise, of 5000 faces or as few as keep it within 0.3 % of the size (diagonal)."""
+    tolerance = min(_DEVIATION * solid.scale, _MOST_DEVIATION)
+    thin = simplify_solid(solid, tolerance)
+    while len(thin.faces) > _FEW_FACES:
+        tolerance *= 1.2
+        thinner = simplify_solid(solid, tolerance)
+        if _largest_distance(solid, thinner) > _WORST_ERROR * solid.scale:
+            break
+        thin = thinner
+    return thin
+
+
+def _largest_distance(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:
+    """Of either surface's vertices and some points of its faces from the other [m]."""
+    points = [np.concatenate([mesh.vertices, mesh.sample(_SAMPLES, seed=0)]) for mesh in (first, second)]
+    surfaces = Surface(first), Surface(second)
+    return max(float(surface.nearest(other)[2].max()) for surface, other in zip(surfaces, points[::-1], strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """What is left of a solid in one cell, its convex hull, and how far that stands off the solid [m]."""
+
+    body: manifold3d.Manifold
+    hull: manifold3d.Manifold
+    gap: float
+
+
+class _Cutter:
+    """Cuts a solid by planes: always the piece that stands off most, and where most empty space leaves the hulls.
+
+    That is weighted with the hull's volume: a rim is worth cutting off a can although its own hull is as empty.
+
+    Args:
+        part: The solid.
+        limit: How far pieces may stand off it [m].
+    """
+
+    def __init__(self, part: trimesh.Trimesh, limit: float) -> None:
+        self._solid = _manifold(thin_solid(part))
+        self._surface, self._limit = Surface(part), _MARGIN * limit
+        self._least = 1e-6 * self._solid.hull().volume()  # slivers carry no contact that their neighbours lack
+        self._points = _mesh(self._solid).vertices
+        self._touching = 1e-4 * part.scale
+
+    def pieces(self, most: int) -> list[trimesh.Trimesh]:
+        """Convex pieces, at most so many: some more that are joined where that costs least."""
+        pieces = [self._piece(self._solid)]
+        done: list[_Piece] = []
+        while pieces and len(pieces) + len(done) < _OVERSHOOT * most:
+            worst = max(range(len(pieces)), key=lambda i: pieces[i].gap)
+            if pieces[worst].gap <= self._limit:
+                break
+            piece = pieces.pop(worst)
+            cut = [self._piece(body) for body in _best_cut(piece.body, self._limit) if body.volume() > self._least]
+            if len(cut) > 1:
+                pieces += cut
+            else:
+                done.append(piece)
+        return [_mesh(hull).convex_hull for hull in self._joined(pieces + done, most)]
+
+    def _piece(self, body: manifold3d.Manifold) -> _Piece:
+        hull = body.hull()
+        return _Piece(body, hull, self._gap(hull))
+
+    def _gap(self, hull: manifold3d.Manifold) -> float:
+        """How far a hull stands off the solid [m], or 0 if that is less than the limit."""
+        mesh = _mesh(hull)
+        low, high = mesh.bounds
+        inside = self._points[((self._points > low) & (self._points < high)).all(axis=1)]
+        normals, offsets = np.split(ConvexHull(mesh.vertices).equations, [3], axis=1)
+        depths = -(inside @ normals.T + offsets.T)
+        face = depths.argmin(axis=1)
+        depth = depths[np.arange(len(inside)), face][:, None]
+        above = (inside + depth * normals[face])[depth[:, 0] > self._limit]
+        samples = min(_SAMPLES, round(float(mesh.area) / (3 * self._limit) ** 2))
+        points = np.concatenate([above, contact_points(mesh), mesh.sample(samples, seed=0)])
+        return farthest_outside(self._surface, points, least=self._limit, batch=_BATCH)
+
+    def _joined(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
+        """Hulls of one or more pieces: joined where that stands off no more than it may, or if there are too many."""
+        hulls: dict[int, manifold3d.Manifold] = {}
+        joints: dict[tuple[int, int], tuple[float, manifold3d.Manifold]] = {}
+        gaps: dict[tuple[int, int], float] = {}
+
+        def add(new: int, hull: manifold3d.Manifold) -> None:
+            low, high = np.reshape(hull.bounding_box(), (2, 3)) + self._touching * np.array([[-1.0], [1.0]])
+            for old, other in hulls.items():
+                corners = np.reshape(other.bounding_box(), (2, 3))
+                if (low <= corners[1]).all() and (corners[0] <= high).all():
+                    joint = manifold3d.Manifold.batch_hull([other, hull])
+                    joints[old, new] = joint.volume() - other.volume() - hull.volume(), joint
+            hulls[new] = hull
+
+        numbers = count()
+        for piece in pieces:
+            add(next(numbers), piece.hull)
+        while joints:
+            # Gaps take long to measure: only of those that add least empty space.
+            likely = sorted(joints, key=lambda pair: (joints[pair][0], pair))[:_LIKELY]
+            gaps |= {pair: self._gap(joints[pair][1]) for pair in likely if pair not in gaps}
+            pair = min(likely, key=lambda pair: (gaps[pair], pair))
+            if gaps[pair] > self._limit and len(hulls) <= most:
+                break
+            joint = joints[pair][1]
+            joints = {other: found for other, found in joints.items() if not {*pair} & {*other}}
+            for number in pair:
+                del hulls[number]
+            add(next(numbers), joint)
+        return list(hulls.values())
+
+
+def _best_cut(body: manifold3d.Manifold, thinnest: float) -> list[manifold3d.Manifold]:
+    """Connected parts of a body, on both sides of the plane that leaves least in hulls; itself where none helps.
+
+    Args:
+        body: What to cut.
+        thinnest: Distance of the plane from where the body ends [m].
+    """
+    mesh = _mesh(body)
+    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
+    best, plane = np.inf, (np.zeros(3), 0.0)
+
+    def look(normal: Float64Array, low: float, high: float) -> None:
+        nonlocal best, plane
+        heights = mesh.vertices @ normal
+        low, high = max(low, float(heights.min()) + thinnest), min(high, float(heights.max()) - thinnest)
+        for offset in np.linspace(low, high, _PLACES) if low < high else ():
+            emptiness = _emptiness(mesh, heights - offset, offset * normal)
+            if emptiness < best:
+                best, plane = emptiness, (normal, float(offset))
+
+    for normal in (*np.eye(3), *principal.T):
+        look(normal, -np.inf, np.inf)
+    if best == np.inf:
+        return [body]
+    normal, offset = plane
+    step = float(np.ptp(mesh.vertices @ normal)) / _PLACES
+    look(normal, offset - step, offset + step)
+    return [part for side in body.split_by_plane(*plane) for part in side.decompose()]
+
+
+def _emptiness(mesh: trimesh.Trimesh, heights: Float64Array, origin: Float64Array) -> float:
+    """Of the hulls of what is above and below a plane through ``origin``: each one's empty volume times its volume."""
+    above = heights > 0
+    if above.all() or not above.any():
+        return np.inf
+    ends = mesh.edges_unique[above[mesh.edges_unique].sum(axis=1) == 1]
+    share = heights[ends[:, 0]] / (heights[ends[:, 0]] - heights[ends[:, 1]])
+    rim = mesh.vertices[ends[:, 0]] + share[:, None] * (mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]])
+    # Volumes from tetrahedra with their tips in the plane, so that the cut's own face adds nothing. If the plane cuts
+    # one corner off a triangle, that part's is in proportion to the shares of both edges that are cut.
+    volumes = np.linalg.det(mesh.triangles - origin) / 6
+    corners = heights[mesh.faces]
+    high = (corners > 0).sum(axis=1)
+    upper = volumes[high == 3].sum()
+    for one_above in (True, False):
+        cut = high == (1 if one_above else 2)
+        tip, *others = np.sort(corners[cut] if one_above else -corners[cut], axis=1).T[::-1]
+        corner = volumes[cut] * tip**2 / ((tip - others[0]) * (tip - others[1]))
+        upper += corner.sum() if one_above else (volumes[cut] - corner).sum()
+    total = 0.0
+    for side, volume in ((above, upper), (~above, volumes.sum() - upper)):
+        hull = manifold3d.Manifold.hull_points(np.concatenate([mesh.vertices[side], rim])).volume()
+        total += hull * max(0.0, hull - volume)
+    return float(total)
+
+
+def _manifold(solid: trimesh.Trimesh) -> manifold3d.Manifold:
+    return manifold3d.Manifold(
+        manifold3d.Mesh64(np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.uint64))
+    )
+
+
+def _mesh(solid: manifold3d.Manifold) -> trimesh.Trimesh:
+    mesh = solid.to_mesh64()
+    return trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
+
+
+def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...] | None:
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            count = len(stored.files) // 2
+            return tuple(
+                trimesh.Trimesh(stored[f"vertices_{i}"], stored[f"faces_{i}"], process=False) for i in range(count)
+            )
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        _logger.warning("%s: unreadable convex pieces are made anew (%s)", path, error)
+        return None
+
+
+def _write_pieces(path: Path, pieces: Sequence[trimesh.Trimesh]) -> None:
+    arrays: dict[str, Any] = {f"vertices_{i}": piece.vertices for i, piece in enumerate(pieces)}
+    arrays |= {f"faces_{i}": piece.faces for i, piece in enumerate(pieces)}
+    keep_file(path, lambda file: np.savez(file, **arrays))

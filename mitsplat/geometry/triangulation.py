@@ -1,0 +1,52 @@
+"""Points where rays of several cameras meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from mitsplat.arrays import Float64Array
+from mitsplat.geometry.camera import Camera
+
+MAX_ERROR = 3.0
+"""Reprojection error from which an observation is an outlier [px]."""
+
+
+def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64Array | None:
+    """The point (3,) that cameras see at pixels (2,), or None where fewer than three agree on one.
+
+    The point nearest to all rays starts a search for the least robust reprojection error; observations off by more
+    than :data:`MAX_ERROR` are then left out.
+    """
+    observations = list(observations)
+    while len(observations) >= 3:
+        cameras = [camera for camera, _ in observations]
+        slopes = np.array([np.append(c.ray_slopes([p])[0], 1.0) for c, p in observations])
+        rays = np.array([c.world_from_camera[:3, :3] @ slope for c, slope in zip(cameras, slopes, strict=True)])
+        centres = np.array([camera.centre for camera in cameras])
+        start = meeting_point(centres, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        poses = np.array([camera.camera_from_world for camera in cameras])
+        focal = np.array([(camera.fx, camera.fy) for camera in cameras])
+
+        def residuals(point: Float64Array, poses: Float64Array = poses, focal: Float64Array = focal) -> Float64Array:
+            local = poses[:, :3, :3] @ point + poses[:, :3, 3]
+            depth = np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:])
+            return np.asarray(((local[:, :2] / depth - slopes[:, :2]) * focal).ravel())  # noqa: B023 - used at once
+
+        point = least_squares(residuals, start, loss="soft_l1").x
+        errors = np.linalg.norm(residuals(point).reshape(-1, 2), axis=1)
+        if errors.max() <= MAX_ERROR:
+            return np.asarray(point)
+        del observations[int(errors.argmax())]
+    return None
+
+
+def meeting_point(origins: Float64Array, directions: Float64Array) -> Float64Array:
+    """The point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    # A grain of the identity: lines that are all parallel have no such point.
+    whole = across.sum(axis=0) + 1e-9 * np.eye(3)
+    right = np.einsum("nij,nj->i", across, origins) + 1e-9 * origins.mean(axis=0)
+    return np.asarray(np.linalg.solve(whole, right))

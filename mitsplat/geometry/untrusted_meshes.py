@@ -1,0 +1,87 @@
+"""Reading of mesh files of others: tried in a process with bounded memory and time before it is done in this one."""
+
+from __future__ import annotations
+
+import re
+import struct
+from functools import lru_cache
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import trimesh
+
+from mitsplat.errors import InputError
+from mitsplat.runtime.child_process import run_bounded
+from mitsplat.storage.files import MESH_ERRORS
+
+ARCHIVES = (".zip", ".bz2", ".gz", ".tar")
+"""Suffixes of archives, which are unpacked by who has looked into them."""
+
+_SECONDS = 120
+_MEMORY = 1 << 30
+_SWELLS = 100
+"""Memory that a reader may take for a byte of a file."""
+_HEADER = 4096
+_PLAIN_PLY = re.compile(
+    rb"ply\r?\nformat binary_little_endian 1\.0\r?\n(?:comment [^\n]*\n)*element vertex (\d{1,12})\r?\n"
+    rb"((?:property (?:float|double|uchar|uint8|float32|float64) \w+\r?\n)+)element face (\d{1,12})\r?\n"
+    rb"property list (?:uchar|uint8) (?:int|uint|int32|uint32) vertex_ind(?:ex|ices)\r?\nend_header\r?\n"
+)
+_WIDTHS = {b"float": 4, b"float32": 4, b"double": 8, b"float64": 8, b"uchar": 1, b"uint8": 1}
+
+
+def check_mesh(path: Path) -> None:
+    """Refuse a mesh file whose reader takes more memory or time than the file warrants, or crashes.
+
+    Binary triangles (.stl, .ply) that fill their file as its header says are not tried: their reader takes a few times
+    their size. What else a reader refuses is left for it to say.
+
+    Raises:
+        InputError: Also for an archive.
+    """
+    if path.suffix.lower() in ARCHIVES:
+        raise InputError(f"{path}: must be a mesh file, not an archive: unpack it")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        status = path.stat()
+        plain = _is_plain(path, status.st_size)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if not plain and (reason := _try_mesh(path.resolve(), status.st_mtime_ns, status.st_size)):
+        raise InputError(f"{path}: not a mesh file that can be read ({reason})")
+
+
+def _is_plain(path: Path, size: int) -> bool:
+    """Whether a file holds what its header says, as binary triangles of one kind."""
+    with path.open("rb") as file:
+        head = file.read(_HEADER)
+    if path.suffix.lower() == ".stl":
+        return len(head) >= 84 and size == 84 + 50 * int(struct.unpack_from("<I", head, 80)[0])
+    if path.suffix.lower() != ".ply" or not (found := _PLAIN_PLY.match(head)):
+        return False
+    kinds = [line.split()[1] for line in found[2].splitlines()]
+    return size == found.end() + int(found[1]) * sum(_WIDTHS[kind] for kind in kinds) + int(found[3]) * 13
+
+
+@lru_cache(maxsize=256)
+def _try_mesh(path: Path, _modified: int, size: int) -> str:
+    """Why a file cannot be read within its limits; empty if it can, or if its reader says what is wrong with it."""
+    memory = _MEMORY + _SWELLS * size
+    ended = run_bounded(_read_mesh, path, imports=["trimesh"], memory=memory, seconds=_SECONDS)
+    if ended.status == 0:
+        return ""
+    return ended.reason if (ended.status or 0) > 0 else f"its reader {ended.reason}"
+
+
+def _read_mesh(output: BinaryIO, _: bytes, path: str) -> None:
+    """Read a file and forget it; anything but lack of memory is for the reader in the other process to say again."""
+    try:
+        with np.errstate(all="ignore"):
+            trimesh.load_scene(path).to_mesh()
+    except MemoryError:
+        raise InputError("it takes more memory than a file of its size may") from None
+    except (OSError, *MESH_ERRORS):
+        pass
+    output.write(b"\n")

@@ -1,0 +1,302 @@
+"""How good an asset is that was made of photographs, in figures and in plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.ndimage import binary_erosion
+
+from mitsplat.arrays import BoolArray, Float32Array
+from mitsplat.capture.capture import Capture, Photo, known_where
+from mitsplat.fit.image_metrics import psnr_of
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
+from mitsplat.reconstruct.registration import measure_offset, surface_points
+from mitsplat.reconstruct.segment_splats import Isolation
+from mitsplat.reconstruct.silhouette_refinement import RefinedMesh
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+
+VERDICT_FILE = "verdict.json"
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Figures from which an asset is good enough for a training set.
+
+    Attributes:
+        registered: Least share of the photos that found their camera.
+        psnr: Least PSNR of held-out photos [dB].
+        splat_iou: Least mean IoU of the splats' alpha with the masks of held-out photos.
+        mesh_iou: The same of the mesh's silhouette.
+        offset: Largest shift between mesh and splats, as a share of the diagonal.
+        scale_error: Largest relative error of the metric scale, where it is known.
+        lost: Largest share of the object that isolation removed with its surroundings.
+    """
+
+    registered: float = 0.75
+    psnr: float = 24.0
+    splat_iou: float = 0.95
+    mesh_iou: float = 0.94
+    offset: float = 0.005
+    scale_error: float = 0.01
+    lost: float = 0.05
+
+
+_ADVICE = {
+    "registered": "take photos with more overlap, 10 to 15 degrees apart, and put texture such as newsprint under it",
+    "psnr": "use even light, fixed exposure and sharp photos, and fit longer",
+    "splat_iou": "check the masks in the report, and give better ones",
+    "mesh_iou": "check the masks in the report, and photograph the object from more heights",
+    "watertight": "photograph the object from all sides, or import a closed mesh",
+    "offset": "fit longer, or check the frame and scale of an imported mesh",
+    "scale_error": "measure a longer distance, or put a board beside the object that more photos see",
+    "surface": "check masks and splats in the report, give better masks, or fit longer",
+    "lost": "check whether masks leave parts of the object out",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class AssetView:
+    """What an asset shows of its splats and its mesh.
+
+    Attributes:
+        camera: At the size of these pictures.
+        render: Splats, display-encoded and multiplied by alpha, (H, W, 3).
+        alpha: Of the splats, (H, W).
+        mesh: Whether the mesh covers the pixel's middle, (H, W).
+        normal: Unit normals of the mesh in the world, (H, W, 3).
+    """
+
+    camera: Camera
+    render: Float32Array
+    alpha: Float32Array
+    mesh: BoolArray
+    normal: Float32Array
+
+    @property
+    def picture(self) -> Float32Array:
+        """The splats over grey, display-encoded, (H, W, 3)."""
+        return np.asarray(self.render + 0.5 * (1 - self.alpha[..., None]), dtype=np.float32)
+
+    def shaded(self, behind: Float32Array | float, share: float = 1.0) -> Float32Array:
+        """The mesh, lit from the camera, over ``behind``, of which it hides a share."""
+        towards = -self.camera.world_from_camera[:3, 2]
+        light = 0.25 + 0.75 * np.clip(self.normal @ towards, 0, 1)
+        grey = np.repeat(light[..., None], 3, axis=2) * (1.0, 0.75, 0.45)
+        cover = share * self.mesh[..., None]
+        return np.asarray(cover * grey + (1 - cover) * behind, dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutView(AssetView):
+    """What a photo that nothing was fitted to shows, and what the asset shows from there.
+
+    Attributes:
+        name: Of the photo.
+        photo: Display-encoded, (H, W, 3).
+        mask: Share of the pixel that is object, (H, W), or None.
+        known: Where nothing that may hide the object stands before it, (H, W).
+    """
+
+    name: str
+    photo: Float32Array
+    mask: Float32Array | None
+    known: BoolArray
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Figures of an asset; None where they are not known or make no sense.
+
+    Attributes:
+        photos: Number of photos that found their camera.
+        rejected: Number that did not, or were refused.
+        psnr: Of held-out photos, as the fit reports it [dB].
+        psnr_object: Of the object's pixels in held-out photos, after isolation, without those of its outline [dB].
+        splat_iou: Mean IoU of the splats' alpha with held-out masks.
+        mesh_iou: The same of the mesh's silhouette.
+        offset: Shift between mesh and the splats' surface, as a share of the mesh's diagonal.
+        spread: Median distance between the two, in the same units.
+        lost: Share of the object that isolation removed.
+        scale_error: Estimated relative error of the metric scale.
+        units: Whether the asset is in metres.
+        gaussians: Number of Gaussians.
+        faces: Number of faces of the mesh.
+        watertight: Whether the mesh encloses a volume.
+        solid: Whether it must, as that of an object.
+        refinement: What came of refining the mesh, as one clause, or None where that was not asked for.
+        causes: What was measured of the photos, one clause each, by the threshold that it makes an asset miss.
+        surface: What the mesh of an object was reconstructed from, or None where it was not.
+        surface_faults: Why finer surfaces were not kept, one clause each.
+        rows: Further figures in words, by what they are of.
+        findings: What else is missed, a sentence each with advice.
+    """
+
+    photos: int
+    rejected: int
+    psnr: float | None
+    psnr_object: float | None
+    splat_iou: float | None
+    mesh_iou: float | None
+    offset: float | None
+    spread: float | None
+    lost: float | None
+    scale_error: float | None
+    units: str
+    gaussians: int
+    faces: int
+    watertight: bool
+    solid: bool
+    refinement: str | None = None
+    causes: Mapping[str, str] = field(default_factory=dict)
+    surface: str | None = None
+    surface_faults: tuple[str, ...] = ()
+    rows: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("surface_faults", "findings"):  # files have lists
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    @property
+    def registered(self) -> float:
+        """Share of the photos that found their camera."""
+        return self.photos / max(1, self.photos + self.rejected)
+
+    def misses(self, thresholds: Thresholds = Thresholds()) -> tuple[str, ...]:
+        """A sentence for each threshold that is missed, with advice."""
+        least = {
+            "registered": f"only {self.photos} of {self.photos + self.rejected} photos found their camera",
+            "psnr": f"held-out photos are met at only {self.psnr or 0:.1f} dB",
+            "splat_iou": f"the splats meet held-out masks with an IoU of only {self.splat_iou or 0:.3f}",
+            "mesh_iou": f"the mesh meets held-out masks with an IoU of only {self.mesh_iou or 0:.3f}",
+        }
+        most = {
+            "offset": f"mesh and splats are {self.offset or 0:.2%} of the diagonal apart",
+            "scale_error": f"the scale is known to {self.scale_error or 0:.1%} only",
+            "lost": f"isolation removed {self.lost or 0:.1%} of the object",
+        }
+        found = []
+        for names, sign in ((least, 1.0), (most, -1.0)):
+            for name, sentence in names.items():
+                value, limit = getattr(self, name), getattr(thresholds, name)
+                if value is not None and sign * value < sign * limit:
+                    rule = "at least" if sign > 0 else "at most"
+                    wanted = f"{100 * limit:g}%" if "%" in sentence else f"{limit:g}"
+                    found.append(f"{sentence} ({rule} {wanted} is wanted): {self._advice(name)}")
+        if self.surface_faults:
+            found.append(
+                f"the mesh is only the {self.surface}, because {', and '.join(self.surface_faults)}: "
+                f"{self._advice('surface')}"
+            )
+        if self.solid and not self.watertight:
+            found.append(f"the mesh is open (a closed one is wanted): {self._advice('watertight')}")
+        return (*found, *self.findings)
+
+    def _advice(self, name: str) -> str:
+        """What would help, behind what was measured."""
+        return "; ".join(filter(None, [self.causes.get(name), _ADVICE[name]]))
+
+
+def show_held_out(
+    splats: Splats, mesh: trimesh.Trimesh | None, photos: Sequence[Photo], size: int
+) -> list[HeldOutView]:
+    """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
+    sized = [sized_photo(photo, size) for photo in photos]
+    shown = show_asset(splats, mesh, [camera for camera, *_ in sized])
+    return [
+        HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask, known=known_where(hidden, camera))
+        for photo, (camera, rgb, mask, hidden), view in zip(photos, sized, shown, strict=True)
+    ]
+
+
+def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[Camera]) -> list[AssetView]:
+    """Splats and mesh as cameras see them."""
+    integrator = make_integrator(shadow="none")
+    scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1, proxy=mesh)})
+    views = []
+    for camera in cameras:
+        layers = render_layers(integrator, scene, camera)
+        alpha = np.maximum(layers.alpha, 1e-6)[..., None]
+        views.append(
+            AssetView(
+                camera=camera,
+                render=(encode_srgb(layers.captured / alpha) * layers.alpha[..., None]).astype(np.float32),
+                alpha=layers.alpha,
+                mesh=layers.proxy_instance > 0,
+                normal=layers.normal,
+            )
+        )
+    return views
+
+
+def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None, Float32Array | None]:
+    """Camera, colours, mask, and where that is hidden, of a photo whose longest edge is at most ``size`` px."""
+    rgb, mask, hidden = photo.read(min(1.0, size / max(photo.camera.width, photo.camera.height)))
+    return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask, hidden
+
+
+def judge(
+    capture: Capture,
+    splats: Splats,
+    mesh: trimesh.Trimesh | None,
+    views: Sequence[HeldOutView],
+    *,
+    isolation: Isolation | None,
+    psnr: float | None,
+    refinement: RefinedMesh | None = None,
+    causes: Mapping[str, str] | None = None,
+) -> Verdict:
+    """Figures from held-out views of splats and mesh."""
+    masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
+    errors = [float(((view.render - view.photo)[_inside(mask)] ** 2).mean()) for view, mask in masked]
+    offset = None
+    if mesh is not None and views:
+        offset = measure_offset(mesh, surface_points(splats, [view.camera for view in views]))
+    return Verdict(
+        photos=len(capture.photos),
+        rejected=len(capture.rejected),
+        psnr=psnr,
+        psnr_object=_mean([psnr_of(error) for error in errors]),
+        splat_iou=_mean([iou((view.alpha >= 0.5) & view.known, mask) for view, mask in masked]),
+        mesh_iou=None if mesh is None else _mean([iou(view.mesh & view.known, mask) for view, mask in masked]),
+        offset=None if offset is None else offset.shift,
+        spread=None if offset is None else offset.spread,
+        lost=None if isolation is None else isolation.lost,
+        scale_error=capture.scale_error,
+        units=capture.units,
+        gaussians=len(splats),
+        faces=0 if mesh is None else len(mesh.faces),
+        watertight=mesh is not None and is_closed(mesh),
+        solid=isolation is not None,
+        refinement=None if refinement is None else str(refinement),
+        causes=causes or {},
+    )
+
+
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh is watertight also where readers weld vertices that lie on each other."""
+    welded = mesh.copy()
+    welded.merge_vertices(merge_tex=True, merge_norm=True)
+    return bool(welded.is_watertight)
+
+
+def iou(one: BoolArray, other: BoolArray) -> float:
+    """Intersection over union; 1 where both are empty."""
+    union = int((one | other).sum())
+    return int((one & other).sum()) / union if union else 1.0
+
+
+def _inside(mask: BoolArray) -> BoolArray:
+    """A mask without the pixels of its outline, which show what is behind as well; the mask if that is all of it."""
+    inner = np.asarray(binary_erosion(mask))
+    return inner if inner.any() else mask
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None

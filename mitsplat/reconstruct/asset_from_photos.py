@@ -1,0 +1,328 @@
+"""From photographs to an asset folder: capture, fit, isolation, mesh and verdict, each kept until its inputs change.
+
+The work folders ``capture/`` and ``fit/`` inside the asset's folder keep what those stages made; they look after their
+own inputs. The last stage is kept by a hash of everything that decides it, in ``verdict.json`` beside the figures.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mitsplat.asset import ASSET_FILE, read_spec
+from mitsplat.capture.capture import Capture
+from mitsplat.capture.capture_photos import CaptureSettings, capture_photos
+from mitsplat.errors import InputError
+from mitsplat.fit.fit_folder import FIT_FILE, read_record
+from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.pages.html import REPORT_FILE
+from mitsplat.progress import Progress
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, Verdict
+from mitsplat.reconstruct.asset_report import write_asset_report
+from mitsplat.reconstruct.delight import LightFile, delight
+from mitsplat.reconstruct.reconstruct import (
+    ImportedMesh,
+    Reconstruction,
+    ReconstructSettings,
+    check_refinable,
+    reconstruct_asset,
+)
+from mitsplat.storage.content_hash import ContentHash, file_hash
+from mitsplat.storage.files import write_text
+from mitsplat.version import __version__
+
+
+@dataclass(frozen=True, eq=False)
+class AssetJob:
+    """What an asset of photographs is to be.
+
+    Attributes:
+        name: Of the asset.
+        class_name: Class that detectors learn; the name if None.
+        kind: Objects are isolated and can be dropped; environments stay whole.
+        settings: How the asset is made of the splats.
+        imported: A mesh to take instead of a reconstructed one.
+        remove: Things that are taken out of an environment, PHOTO:X,Y in pixels of the capture's photos.
+        delight: File of the lights that an object was photographed in, which its colours are freed of.
+
+    Raises:
+        InputError: If an object's mesh cannot be refined, things are to be removed from an object or an imported mesh,
+            or an environment is to be freed of light.
+    """
+
+    name: str
+    class_name: str | None = None
+    kind: Literal["object", "environment"] = "object"
+    settings: ReconstructSettings = field(default_factory=ReconstructSettings)
+    imported: ImportedMesh | None = None
+    remove: tuple[str, ...] = ()
+    delight: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_refinable(self.settings, self.kind, self.imported)
+        if self.remove and self.kind != "environment":
+            raise InputError("things are removed from an environment only: give --kind environment, or leave it out")
+        if self.remove and self.imported is not None:
+            raise InputError("things cannot be removed from an imported mesh: leave out either")
+        if self.delight is not None and self.kind != "object":
+            raise InputError("colours of objects only are freed of light: an environment is rendered in its own")
+
+
+@dataclass(frozen=True)
+class AssetResult:
+    """An asset on disk.
+
+    Attributes:
+        folder: Of the asset.
+        verdict: Its figures.
+        kept: Whether an earlier run had made it of the same inputs.
+        warnings: What there is to say about its photographs, one sentence each.
+        scene: File of a scene that has it, if one was written.
+    """
+
+    folder: Path
+    verdict: Verdict
+    kept: bool
+    warnings: tuple[str, ...] = ()
+    scene: Path | None = None
+
+    @property
+    def shortcoming(self) -> str | None:
+        """The thresholds that were missed and what would help, as one sentence, or None."""
+        return "; ".join(self.verdict.misses()) or None
+
+
+Maker = Callable[[Capture, Splats, AssetJob, float | None, str | None, Progress | None], Reconstruction]
+"""Makes an asset of a capture and splats: given the job, the fit's held-out PSNR [dB] and what the scale is by."""
+
+
+def reconstruct_job(
+    capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
+) -> Reconstruction:
+    """A :data:`Maker`: :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset` as a job says.
+
+    Raises:
+        InputError: As that, or if lights are given and are none, or nothing says where up is.
+    """
+    light = None if job.delight is None else LightFile.load(job.delight)
+    if light is not None and capture.up != "z":
+        raise InputError(f"{light.path}: lights are in a frame whose z is up, which the capture does not know")
+    made = reconstruct_asset(
+        capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
+        imported=job.imported, psnr=psnr, progress=progress,
+    )  # fmt: skip
+    return made if light is None else delighted(made, light, capture.table, progress)
+
+
+def delighted(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
+    """The asset with its colours freed of light, and how that went in the verdict."""
+    if progress is not None:
+        progress(0, 1, "freeing colours of light")
+    if made.asset.mesh is None:
+        return made
+    turn = np.eye(4)  # from the asset to how its capture lies, as the lights do
+    turn[:3, :3] = made.asset_from_capture[:3, :3].T / np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3]))
+    mesh = made.asset.mesh.copy().apply_transform(turn)
+    done = delight(made.asset.splats.transformed(turn), mesh, light, table=table)
+    splats = done.splats.transformed(np.linalg.inv(turn)) if done.kept else made.asset.splats
+    return replace(
+        made,
+        asset=replace(made.asset, splats=splats),
+        verdict=replace(made.verdict, rows={**made.verdict.rows, "Light": done.told}),
+        record={**made.record, "light": {name: getattr(done, name) for name in _LIGHT}},
+    )
+
+
+def read_fit(path: Path) -> tuple[Path, float | None]:
+    """Splat file and held-out PSNR [dB] of a fit's folder, or a splat file itself.
+
+    Raises:
+        InputError: If the folder holds no finished fit.
+    """
+    if not path.is_dir():
+        return path, None
+    record = path / FIT_FILE
+    stored = read_record(record)
+    try:
+        psnr = stored["psnr"]
+        known = None if psnr is None else float(psnr)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{record}: not the record of a fit ({error})") from error
+    if known is not None and not math.isfinite(known):
+        raise InputError(f"{record}: psnr must be finite (got {known})")
+    return path / "splats.ply", known
+
+
+def make_photo_asset(
+    photos: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    capture: CaptureSettings,
+    fit: FitSettings,
+    make: Maker = reconstruct_job,
+    progress: Progress | None = None,
+) -> AssetResult:
+    """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
+
+    Args:
+        photos: Folder of photographs of one object or place.
+        out: Folder of the asset; ``capture/`` and ``fit/`` in it are the work folders.
+        job: What to make.
+        capture: How cameras, scale and masks are found.
+        fit: How splats are fitted.
+        make: The last stage.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: If the photographs do not suffice.
+        MissingResourceError: If a program or model that is needed is missing.
+    """
+    taken = capture_photos(photos, out / "capture", capture, progress=progress)
+    found = taken.capture
+
+    def fitting(now: FitProgress) -> None:
+        if progress is not None:
+            done = int(now.fraction * fit.iterations)
+            progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
+
+    fit_capture(found, out / "fit", fit, overwrite=True, progress=fitting)
+    done = make_asset(out / "capture", out / "fit", out, job, make=make, source=taken.source, progress=progress)
+    return replace(done, warnings=(*taken.warnings, *done.warnings))
+
+
+def make_asset(
+    capture_folder: Path,
+    fit: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    make: Maker = reconstruct_job,
+    source: str | None = None,
+    progress: Progress | None = None,
+) -> AssetResult:
+    """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
+
+    Args:
+        capture_folder: As ``mitsplat capture`` writes it.
+        fit: Folder that ``mitsplat fit`` wrote, or a splat file in the capture's frame.
+        out: Folder of the asset.
+        job: What to make.
+        make: How.
+        source: What the capture's scale and gravity are by, a clause.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: If a file is missing or damaged, or an object has no masks.
+    """
+    capture = Capture.load(capture_folder)
+    splat_file, psnr = read_fit(fit)
+    inputs = _digest(capture_folder, capture, splat_file, job)
+    done = _finished(out, inputs)
+    if done is not None:
+        return done
+    refuse_to_replace(out, splat_file)
+    edited = _edited(out)
+    result = make(capture, Splats.load(splat_file), job, psnr, source, progress)
+    (out / VERDICT_FILE).unlink(missing_ok=True)
+    if edited is not None:
+        (out / ASSET_FILE).replace(edited)
+    result.asset.save(out)
+    write_asset_report(out, capture, result)
+    # Last, so that an interrupted run is not mistaken for a finished one.
+    _save_verdict(out, result, inputs)
+    warnings = () if edited is None else (f"{ASSET_FILE} had been edited: as it was, it is {edited.name} now",)
+    return AssetResult(out, result.verdict, kept=False, warnings=warnings)
+
+
+def refuse_to_replace(out: Path, splats: Path) -> None:
+    """Refuse a folder in which an asset would replace the splats that it is made of, or files of no asset.
+
+    Raises:
+        InputError: Which names the file.
+    """
+    known = any((out / name).exists() for name in (ASSET_FILE, REPORT_FILE))
+    for name in ("splats.ply", "mesh.ply", "pieces.ply"):
+        if (out / name).resolve() == splats.resolve() or ((out / name).exists() and not known):
+            raise InputError(f"{out / name}: would be replaced: choose another folder for the asset")
+
+
+def _edited(out: Path) -> Path | None:
+    """What to call the ``asset.yaml`` of an earlier run from now on, if it has been edited since."""
+    described = out / ASSET_FILE
+    try:
+        if json.loads((out / VERDICT_FILE).read_text())[ASSET_FILE] == file_hash(described):
+            return None
+    except (OSError, ValueError, KeyError, TypeError):  # by another version, or by hand
+        if not described.exists():
+            return None
+    names = (out / f"asset.edited{number if number > 1 else ''}.yaml" for number in itertools.count(1))
+    return next(path for path in names if not path.exists())
+
+
+def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
+    record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict), **result.record}
+    record[ASSET_FILE] = file_hash(out / ASSET_FILE)
+    record["asset_from_capture"] = result.asset_from_capture.tolist()
+    if result.isolation is not None:
+        record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}
+    if result.alignment is not None:
+        record["alignment"] = {
+            "scale": result.alignment.scale,
+            "residual": result.alignment.residual,
+            "splats_from_mesh": result.alignment.splats_from_mesh.tolist(),
+        }
+    write_text(out / VERDICT_FILE, json.dumps(record, indent=1) + "\n")
+
+
+_LIGHT = ("kept", "uneven", "slope", "borne_out")
+_REMOVED = ("outside", "unseen", "needles", "floaters")
+
+
+def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
+    """Hash of everything that decides the asset."""
+    imported = None
+    if job.imported is not None:
+        matrix = job.imported.capture_from_mesh
+        imported = [
+            ContentHash(job.imported.mesh.vertices.tobytes(), job.imported.mesh.faces.tobytes()).hexdigest(),
+            None if matrix is None else matrix.tolist(),
+            job.imported.metres_per_unit,
+        ]
+    decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove]
+    digest = ContentHash()
+    digest.add_json(decisive)
+    lights = [] if job.delight is None else LightFile.load(job.delight).files
+    for path in (*_files(folder, capture), splats, *lights):
+        digest.add_file(path)
+    return digest.hexdigest()
+
+
+def _files(folder: Path, capture: Capture) -> list[Path]:
+    """Everything that a capture is on disk."""
+    pictures = [path for photo in capture.photos for path in (photo.file, photo.mask) if path is not None]
+    return [folder / "capture.json", folder / "points.npz", *pictures]
+
+
+def _finished(out: Path, inputs: str) -> AssetResult | None:
+    """What an earlier run of the same inputs left, if it is whole."""
+    if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, ASSET_FILE)):
+        return None
+    try:
+        spec = read_spec(out)
+        if not all((out / file).is_file() for file in (spec.splats, spec.mesh, spec.pieces) if file is not None):
+            return None
+        record = json.loads((out / VERDICT_FILE).read_text())
+        if record.pop("inputs") != inputs:
+            return None
+        return AssetResult(out, Verdict(**{name: record[name] for name in Verdict.__dataclass_fields__}), kept=True)
+    except (ValueError, KeyError, TypeError, OSError):
+        return None

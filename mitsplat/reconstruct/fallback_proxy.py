@@ -1,0 +1,129 @@
+"""The finest surface of an object that its masks and splats bear out; a coarser one where they contradict it.
+
+Depth that disagrees between views, splats that float, or masks that contradict each other can make a closed mesh of any
+shape. So each surface is compared, before it is kept, with the silhouettes that the masks show and with the surface
+that the splats show. A surface from depth lies inside the hull of the masks and the bulk of the splats by its making
+(:mod:`.surface`); after it come the hull of the masks alone, and the convex hull of the splats, which always is sound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from mitsplat.asset import opaque_core
+from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.progress import Progress
+from mitsplat.reconstruct.asset_evaluation import iou, is_closed, show_asset
+from mitsplat.reconstruct.registration import measure_offset, surface_points
+from mitsplat.reconstruct.segment_splats import MaskedView
+from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
+
+LEAST_OVERLAP = 0.85
+"""Mean IoU of a surface's silhouettes with the masks from which it is kept."""
+MOST_SPREAD = 0.02
+"""Median distance between a surface and that of the splats up to which it is kept, as a share of its diagonal."""
+_FLAT = 1e-4
+"""Thinnest extent of a volume, as a share of the longest."""
+_VIEWS = 8
+"""Views in which surfaces are compared."""
+
+FINEST = "depth of the splats inside the hull of the masks"
+HULL = "hull of the masks"
+CONVEX = "convex hull of the splats"
+
+
+@dataclass(frozen=True, eq=False)
+class SoundSurface:
+    """A closed mesh and what it is.
+
+    Attributes:
+        mesh: In the splats' frame.
+        source: What it was made of: :data:`FINEST`, :data:`HULL` or :data:`CONVEX`.
+        faults: Why finer surfaces were not kept, one clause each.
+    """
+
+    mesh: trimesh.Trimesh
+    source: str
+    faults: tuple[str, ...]
+
+
+def find_sound_surface(
+    splats: Splats,
+    views: Sequence[MaskedView],
+    settings: SurfaceSettings,
+    *,
+    floor: float | None = None,
+    progress: Progress | None = None,
+) -> SoundSurface:
+    """The finest surface that masks and splats bear out; if none is, that whose silhouettes are nearest to the masks.
+
+    Args:
+        splats: One object, isolated.
+        views: Its masks from all around.
+        settings: Resolution and size.
+        floor: Height z of what the object stands on, if that is known.
+        progress: Told after every view how many of how many are done.
+
+    Raises:
+        InputError: If the splats span no volume.
+    """
+    cameras, masks = [view.camera for view in views], [view.possible for view in views]
+
+    def fused(depth: bool) -> trimesh.Trimesh:
+        return reconstruct_surface(splats, cameras, masks, settings, floor=floor, depth=depth, progress=progress)
+
+    makers: dict[str, Callable[[], trimesh.Trimesh]] = {
+        FINEST: lambda: fused(depth=True),
+        HULL: lambda: fused(depth=False),
+        CONVEX: lambda: _convex_hull(splats, floor),
+    }
+    seen = [views[number] for number in np.unique(np.linspace(0, len(views) - 1, _VIEWS).round().astype(int))]
+    faults: list[str] = []
+    found: list[tuple[float, str, trimesh.Trimesh]] = []
+    for source, make in makers.items():
+        try:
+            mesh = make()
+        except InputError as error:
+            if source == CONVEX and not found:
+                raise
+            faults.append(f"the {source} is none: {error}")
+            continue
+        overlap, fault = _compare(mesh, splats, seen)
+        if fault is None:
+            return SoundSurface(mesh, source, tuple(faults))
+        faults.append(f"the {source} {fault}")
+        found.append((overlap, source, mesh))
+    _, source, mesh = max(found, key=lambda one: one[0])
+    return SoundSurface(mesh, source, tuple(faults))
+
+
+def _compare(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView]) -> tuple[float, str | None]:
+    """Mean IoU of a mesh's silhouettes with masks, and what speaks against the mesh."""
+    if not (is_closed(mesh) and mesh.volume > 0):
+        return 0.0, "is open"
+    shown = show_asset(splats, mesh, [view.camera for view in views])
+    overlap = float(
+        np.mean([iou(one.mesh & view.known, view.mask >= 0.5) for one, view in zip(shown, views, strict=True)])
+    )
+    if overlap < LEAST_OVERLAP:
+        return overlap, f"meets the masks with an IoU of only {overlap:.2f}"
+    spread = measure_offset(mesh, surface_points(splats, [view.camera for view in views])).spread
+    if spread > MOST_SPREAD:
+        return overlap, f"is {spread:.1%} of the diagonal from the splats"
+    return overlap, None
+
+
+def _convex_hull(splats: Splats, floor: float | None) -> trimesh.Trimesh:
+    """Of the opaque Gaussians, floaters left out; not below the floor."""
+    points = opaque_core(splats).astype(np.float64)
+    if floor is not None:
+        points[:, 2] = np.maximum(points[:, 2], floor)
+    spans = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
+    if not spans[2] > _FLAT * spans[0]:
+        raise InputError(f"the splats span no volume ({len(points)} opaque Gaussians)")
+    return trimesh.convex.convex_hull(points)

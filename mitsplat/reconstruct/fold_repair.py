@@ -1,0 +1,66 @@
+"""Vertices that moved without breaking their mesh: where faces would turn over or cross, they are held back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from mitsplat.arrays import Float64Array
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.rays.device_arrays import plain_mesh
+
+_THINNEST = 1e-3
+"""Share of a face's area that must be left on its side of the old plane."""
+_ROUNDS = 12
+"""Times that vertices of what broke are taken half of their way back."""
+
+
+def mend_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array | None:
+    """Moved vertices, held back where a face turns over or vanishes, or an edge newly passes through a face.
+
+    Args:
+        mesh: Where they come from.
+        vertices: Where they want to be, (V, 3).
+
+    Returns:
+        Where they may be, (V, 3), or None if no part of their way is right.
+    """
+    share = np.ones((len(vertices), 1))
+    across = _normals(mesh.vertices, mesh.faces)
+    area = (across**2).sum(axis=1)
+    crossed = edges_through_faces(mesh, mesh.vertices)
+    for _ in range(_ROUNDS):
+        found: Float64Array = mesh.vertices + share * (vertices - mesh.vertices)
+        broken = ~((_normals(found, mesh.faces) * across).sum(axis=1) >= _THINNEST * area)
+        crossing = np.setdiff1d(edges_through_faces(mesh, found), crossed)
+        wrong = np.union1d(mesh.faces[broken], mesh.edges_unique[crossing])
+        if not len(wrong):
+            return found
+        share[wrong] /= 2
+    return None
+
+
+def edges_through_faces(mesh: trimesh.Trimesh, vertices: Float64Array) -> npt.NDArray[np.intp]:
+    """Rows of a mesh's ``edges_unique`` that, with the vertices at (V, 3), pass through a face they do not touch.
+
+    An edge is traced as a ray; of what it meets, the first counts.
+    """
+    ensure_variant()
+    edges, faces = mesh.edges_unique, np.asarray(mesh.faces)
+    scene = mi.load_dict({"type": "scene", "mesh": plain_mesh(trimesh.Trimesh(vertices, faces, process=False))})
+    start, end = (np.asarray(vertices, dtype=np.float32)[column].T for column in edges.T)
+    origin, along = (np.ascontiguousarray(v) for v in (start + 1e-3 * (end - start), 0.998 * (end - start)))
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(along), 1.0, 0.0, []))
+    met = np.flatnonzero(np.array(hit.is_valid()))
+    corners = faces[np.array(hit.prim_index)[met]]
+    return np.asarray(met[~(corners[:, :, None] == edges[met][:, None, :]).any(axis=(1, 2))])
+
+
+def _normals(vertices: Float64Array, faces: npt.NDArray[np.integer[Any]]) -> Float64Array:
+    """Normals of faces, of twice their area in length."""
+    a, b, c = np.moveaxis(np.asarray(vertices)[faces], 1, 0)
+    return np.cross(b - a, c - a)

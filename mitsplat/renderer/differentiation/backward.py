@@ -1,0 +1,473 @@
+"""Gradients of the splat renderer: a second march that walks the same lists and scatters per-Gaussian derivatives.
+
+Blending front to back, ``C = sum_i T_i a_i c_i`` with ``T_i = prod_{j<i} (1 - a_j)``. Let S_i be the sum up to and
+with i; what lies behind is ``C - S_i``, so that no list is walked backwards (the remaining-radiance trick):
+
+    dC / da_i = T_i c_i - (C - S_i) / (1 - a_i),     dC / dc_i = T_i a_i,     dA / da_i = T_end / (1 - a_i)
+
+With ``a = exp2(log2 o - q)`` and ``q = N / D`` as in module `gaussian`, the chain rule gives the derivatives of the
+view records; Dr.Jit's own differentiation carries them on through the projection to the Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.quality import KERNELS, Quality
+from mitsplat.renderer.rays.camera_rays import TILE_WIDTH, View
+from mitsplat.renderer.splatting.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
+from mitsplat.renderer.splatting.march import march
+from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
+from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, bin_records
+from mitsplat.renderer.splatting.walk import Lanes, largest
+from mitsplat.runtime.recorded_kernels import Table, recorded
+
+LN_2 = 0.6931471805599453
+
+PAIRS_AT_ONCE = 1 << 20
+"""Pairs of a Gaussian and a tile whose gradients are held at once, 512 bytes each."""
+
+
+def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[list[Any], Any]:
+    """Display-encoded colour (three flat row-major arrays, times alpha) and alpha, with gradients to the cloud.
+
+    Args:
+        cloud: Gaussians from :func:`pack_cloud`, in world space.
+        view: Camera; one sample per pixel.
+        quality: Cut-offs and SH degree; of infinite tolerance.
+
+    Gaussians that reach the camera's plane would have no gradient, and are left out: a fit cannot mend them.
+
+    Raises:
+        ValueError: If the quality asks for a tolerance, several samples or a kernel that limits opacity.
+    """
+    _check(view, quality)
+    lists = bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False, for_gradients=True)
+    # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
+    *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
+    return rgb, alpha
+
+
+def _tinted(records: Any) -> Any:
+    """View records whose red is the depth of the centre."""
+    row = dr.arange(mi.UInt32, dr.width(records) // RECORD) * RECORD
+    tinted = dr.copy(records)
+    depth = dr.gather(mi.Float, records, row + _DEPTH, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(tinted, depth, row + _RED)
+    return tinted
+
+
+_RED, _DEPTH = 6, 9
+"""Places in a view record."""
+
+
+def _check(view: View, quality: Quality) -> None:
+    if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
+        raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
+    if quality.extends:
+        raise ValueError("gradients need rays that do not extend beyond their end (quality.extends)")
+    if quality.amends:
+        raise ValueError("gradients need colours in the order of tiles as it is (quality.amends)")
+    if KERNELS[quality.kernel].alpha_max < 1:
+        raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
+
+
+def _only(cloud: Cloud) -> CloudSet:
+    return CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
+
+
+_PLACE = Placement(0, np.eye(4), 1)
+
+
+class Eye:
+    """A camera as the parts of a training step take it that do not know the number of Gaussians that it sees.
+
+    Attributes:
+        view: The camera.
+        numbers: What cameras of its kind differ in, on the device.
+    """
+
+    def __init__(self, view: View) -> None:
+        nothing = CloudSet((1,), (0,), None, None, None, 0, 0)
+        table, _, _ = placement_table(nothing, [_PLACE], view)
+        self.view, self.numbers = view, view.numbers | {"table": table}
+
+
+def project_cloud(
+    cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality
+) -> tuple[Any, Any, Any, Any]:
+    """View records of all Gaussians of a cloud, least depths, boxes of tiles, and which are seen, not yet evaluated.
+
+    Args:
+        cloud: Gaussians in world space.
+        kind: Of the camera's view.
+        numbers: Those of an :class:`Eye`.
+        quality: Cut-offs and SH degree.
+    """
+    projector = Projector(_only(cloud), numbers["table"], View.of_numbers(kind, numbers), quality, at_camera=False)
+    return projector.every_record(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))[:4]
+
+
+def gather_gradients(
+    cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality, found: Any
+) -> None:
+    """Add to the gradients of what a cloud is made of those that reach it from its view records.
+
+    Those of Gaussians that are not seen are zero, where the chain rule says 0 times infinity.
+
+    Args:
+        cloud: From :func:`pack_cloud`, with gradients.
+        kind: Of the camera's view.
+        numbers: Those of an :class:`Eye`.
+        quality: Cut-offs and SH degree.
+        found: Gradients of the records of :func:`project_cloud`.
+    """
+    packed = cloud.geometry, cloud.scales, cloud.sh
+    leaves = [mi.Float(dr.detach(values)) for values in packed]
+    dr.enable_grad(leaves)
+    apart = replace(cloud, geometry=leaves[0], scales=leaves[1], sh=leaves[2])
+    records, _, _, visible = project_cloud(apart, kind, numbers, quality)
+    _send_back(records, found)
+    for values, leaf, width in zip(packed, leaves, (8, 4, cloud.sh_stride), strict=True):
+        own = dr.gather(mi.Bool, visible, dr.arange(mi.UInt32, width * cloud.count) // width)
+        _send_back(values, dr.select(own, dr.grad(leaf), 0))
+
+
+def _send_back(values: Any, gradient: Any) -> None:
+    """Add to the gradients of all that values were made of."""
+    dr.set_grad(values, gradient)
+    dr.enqueue(dr.ADMode.Backward, values)
+    dr.traverse(dr.ADMode.Backward)
+
+
+class Rendering:
+    """An image of view records, and the way back from its gradients to theirs.
+
+    Args:
+        lists: Records per tile.
+        view: Camera.
+        quality: Cut-offs.
+
+    Attributes:
+        rgb: Display-encoded colour times alpha, three flat row-major arrays.
+        alpha: Opacity.
+    """
+
+    def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
+        self._lists, self._view, self._quality = lists, view, quality
+        tiles = Table(lists.entries), lists.records, lists.start, lists.stop
+        self.rgb, self.alpha, self._slopes = _image(view.kind, view.numbers, quality, *tiles)
+
+    def gradient(self, colour: list[Any], alpha: Any) -> Any:
+        """Gradient of the records, flat as they are, from evaluated ones of colour and alpha."""
+        lists, view, seen = self._lists, self._view, [*self.rgb, self.alpha]
+        gradient = [*colour, alpha]
+        if not 0 < lists.pairs <= PAIRS_AT_ONCE:
+            return march_backward(lists, view, self._quality, seen, gradient, self._slopes)
+        tiles = Table(lists.entries), Table(lists.slots), lists.first, lists.records, lists.start, lists.stop
+        room = _room(lists.pairs)
+        return _way_back(view.kind, view.numbers, self._quality, room, *tiles, seen, gradient, self._slopes)
+
+
+def _room(pairs: int) -> int:
+    """A number of pairs that holds for those of many views, at most a quarter more."""
+    step = max(1024, 1 << max(0, pairs.bit_length() - 3))
+    return -(-pairs // step) * step
+
+
+@recorded
+def _image(
+    kind: tuple[Any, ...], numbers: dict[str, Any], quality: Quality, entries: Any, records: Any, start: Any, stop: Any
+) -> tuple[list[Any], Any, Any]:
+    """Colours and alpha of the rays of a view, and their slopes if its lens distorts them."""
+    view = View.of_numbers(kind, numbers)
+    lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
+    # The way back needs them again, and to undo a lens's distortion takes longer than a march.
+    slopes = Lanes(lists, view).centre_slopes() if view.distortion else None
+    image = march(lists, view, quality, slopes=slopes)
+    return image.rgb, image.alpha, slopes
+
+
+@recorded
+def _way_back(
+    kind: tuple[Any, ...],
+    numbers: dict[str, Any],
+    quality: Quality,
+    room: int,
+    entries: Any,
+    slots: Any,
+    first: Any,
+    records: Any,
+    start: Any,
+    stop: Any,
+    seen: list[Any],
+    gradient: list[Any],
+    slopes: Any,
+) -> Any:
+    """Gradient of the view records from those of colours and alpha, with room for so many pairs."""
+    view = View.of_numbers(kind, numbers)
+    lists = _bare_lists(entries, slots, first, records, start, stop, room)
+    return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
+
+
+def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, stop: Any, pairs: int) -> TileLists:
+    """Tile lists of one instance for the order per tile."""
+    visible = dr.width(records) // RECORD
+    return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACE.instance, None)
+
+
+class DepthRendering(Rendering):
+    """A rendering and the sum ``moment`` of the centres' depths [m] by their weights in alpha."""
+
+    def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
+        super().__init__(lists, view, quality)
+        self._depths = Rendering(replace(lists, records=_tinted(lists.records)), view, quality)
+        self.moment = self._depths.rgb[0]
+
+    def gradient_of_moment(self, moment: Any) -> Any:
+        """Gradient of the records from an evaluated one of the moment."""
+        nothing = dr.zeros(mi.Float, dr.width(moment))
+        tinted = self._depths.gradient([moment, nothing, nothing], nothing)
+        entry = dr.arange(mi.UInt32, dr.width(tinted))
+        place = entry % RECORD
+        red = dr.gather(mi.Float, tinted, entry - (_DEPTH - _RED), place == _DEPTH)
+        return dr.select(place == _DEPTH, red, dr.select(place == _RED, 0, tinted))
+
+
+def render_records(
+    records: Any, least: Any, box: Any, view: View, quality: Quality, *, depth: bool = False
+) -> Rendering:
+    """The image of what :func:`project_cloud` found; a :class:`DepthRendering` if it is to have depth.
+
+    Raises:
+        ValueError: As for :func:`render_differentiable`.
+        CrowdedError: If there are too many pairs of a Gaussian and a tile to hold.
+    """
+    _check(view, quality)
+    lists = bin_records(records, None, least, box, view, quality, _PLACE.instance, for_gradients=True)
+    return (DepthRendering if depth else Rendering)(lists, view, quality)
+
+
+def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, bands: int) -> Cloud:
+    """Differentiable counterpart of :func:`mitsplat.renderer.splatting.gaussian.upload_cloud`.
+
+    Args:
+        means: Flat device array of N x 3 centres.
+        quats: Flat N x 4, xyzw; normalised here.
+        scales: Flat N x 3.
+        opacities: N.
+        sh: Flat N x K x 3.
+        bands: K.
+    """
+    count = dr.width(opacities)
+    i = dr.arange(mi.UInt32, count)
+    own = dr.ReduceMode.NoConflicts
+    mean, sigma = dr.gather(mi.Vector3f, means, i, mode=own), dr.gather(mi.Vector3f, scales, i, mode=own)
+    quat = dr.normalize(mi.Vector4f(*dr.gather(mi.Array4f, quats, i, mode=own)))
+    sigma = dr.maximum(sigma, SCALE_RATIO_MIN * dr.max(dr.detach(sigma)))
+    stride = -(-3 * bands // 4) * 4
+    geometry, padded = dr.zeros(mi.Float, 8 * count), dr.zeros(mi.Float, 4 * count)
+    dr.scatter(geometry, mi.ArrayXf([*mean, opacities, *quat]), i)
+    dr.scatter(padded, mi.Array4f(sigma.x, sigma.y, sigma.z, 0), i)
+    coefficients = sh
+    if stride != 3 * bands:
+        coefficients = dr.zeros(mi.Float, stride * count)
+        j = dr.arange(mi.UInt32, 3 * bands * count)
+        row = j // (3 * bands)
+        dr.scatter(coefficients, sh, row * stride + (j - row * (3 * bands)))
+    return Cloud(count, geometry, padded, coefficients, bands, stride)
+
+
+class _March(dr.CustomOp):
+    """The march as a function of the view records."""
+
+    def eval(self, records: Any, context: Callable[[], tuple[TileLists, View, Quality]]) -> tuple[Any, ...]:
+        lists, view, quality = context()
+        self.rendering = Rendering(replace(lists, records=records), view, quality)
+        return (*self.rendering.rgb, self.rendering.alpha)
+
+    def backward(self) -> None:
+        gradient = [dr.zeros(mi.Float, dr.width(self.rendering.alpha)) + g for g in self.grad_out()]
+        dr.eval(gradient)
+        self.set_grad_in("records", self.rendering.gradient(gradient[:3], gradient[3]))
+
+    def name(self) -> str:
+        return "march"
+
+
+def march_backward(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    seen: list[Any],
+    gradient: list[Any],
+    slopes: tuple[list[Any], list[Any]] | None,
+) -> Any:
+    """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha.
+
+    Args:
+        lists: Records per tile.
+        view: Camera.
+        quality: Cut-offs.
+        seen: Red, green, blue and alpha.
+        gradient: Of these.
+        slopes: Of the rays, where they are known.
+    """
+    if lists.pairs == 0:
+        return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
+    slopes = slopes or Lanes(lists, view).centre_slopes()
+    if lists.pairs <= PAIRS_AT_ONCE:
+        return _gradient(lists, view, quality, seen, gradient, slopes)
+    total = dr.zeros(mi.Float, RECORD * lists.visible)
+    for part, lane in _parts(lists):
+        us, vs = ([dr.gather(mi.Float, values, lane) for values in axis] for axis in slopes)
+        total += _gradient(part, view, quality, seen, gradient, (us, vs))
+        dr.eval(total)
+    return total
+
+
+def _parts(lists: TileLists) -> Iterator[tuple[TileLists, Any]]:
+    """Lists of consecutive tiles with at most :data:`PAIRS_AT_ONCE` pairs, or of one tile; and numbers of their lanes.
+
+    Places by record are counted within each part.
+    """
+    begins = np.append(np.array(lists.start), lists.pairs).astype(np.int64)
+    first = 0
+    while first < len(begins) - 1:
+        last = int(np.searchsorted(begins, begins[first] + PAIRS_AT_ONCE, side="right")) - 1
+        last = min(max(last, first + 1), len(begins) - 1)
+        begin, pairs = int(begins[first]), int(begins[last] - begins[first])
+        if pairs:
+            entry = dr.arange(mi.UInt32, pairs) + dr.opaque(mi.UInt32, begin)
+            mine = dr.zeros(mi.UInt32, lists.pairs + 1)
+            dr.scatter(mine, mi.UInt32(1), dr.gather(mi.UInt32, lists.slots, entry))
+            place = dr.prefix_sum(mine)
+            tile = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
+            part = replace(
+                lists,
+                slots=dr.gather(mi.UInt32, place, lists.slots),
+                first=dr.gather(mi.UInt32, place, lists.first),
+                start=dr.gather(mi.UInt32, lists.start, tile),
+                stop=dr.gather(mi.UInt32, lists.stop, tile),
+                pairs=pairs,
+                tiles=tile,
+            )
+            dr.eval(part.slots, part.first, part.start, part.stop, tile)
+            yield part, dr.arange(mi.UInt32, (last - first) * TILE_WIDTH) + dr.opaque(mi.UInt32, first * TILE_WIDTH)
+        first = last
+
+
+def _gradient(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    seen: list[Any],
+    gradient: list[Any],
+    slopes: tuple[list[Any], list[Any]],
+) -> Any:
+    """The gradient that comes from the tiles of some lists; they may say that there are more pairs than there are."""
+    lanes = Lanes(lists, view)
+    us, vs = slopes
+    column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE_WIDTH
+    shares = dr.zeros(mi.Float, RECORD * TILE_WIDTH * lists.pairs)
+    cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
+    end, near = dr.opaque(mi.Float, quality.transmittance_min), view.near_plane
+
+    def load(values: Any) -> list[Any]:
+        return [dr.gather(mi.Float, values, p, m) for p, m in zip(lanes.pixel, lanes.inside, strict=True)]
+
+    d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
+    whole = list(zip(*(load(c) for c in seen[:3]), strict=True))
+    # What lies behind, weighted with the gradient, less the gradient that reaches alpha through the end of the ray.
+    behind = [
+        sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
+        for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
+    ]
+
+    def body(i: Any, light: list[Any], rest: list[Any]) -> tuple[Any, list[Any], list[Any]]:
+        number = dr.gather(mi.UInt32, lists.entries, i)
+        record = dr.gather(mi.ArrayXf, lists.records, number, shape=(RECORD, dr.width(i)))
+        u0, v0, a, b2, c, log_opacity, red, green, blue, depth, e, f, g, h, k, _ = record
+        sums = [mi.Float(0) for _ in range(RECORD)]
+        new_light, new_rest = [], []
+        for u, v, t, r, ds in zip(us, vs, light, rest, d_colour, strict=True):
+            du, dv = u - u0, v - v0
+            inverse = dr.rcp(1 + du * (e + g * du + h * dv) + dv * (f + k * dv))
+            q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
+            z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
+            hit = (log_opacity - q > cut) & (z > near) & (t > end)
+            # A response that overflows beyond the cut-off, or that rounding lifts over the peak, has no gradient.
+            inverse, q = dr.select(hit & (q > 0), inverse, 0), dr.select(hit & (q > 0), q, 0)
+            alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)
+            weight = t * alpha
+            d_own = red * ds[0] + green * ds[1] + blue * ds[2]
+            r = r - weight * d_own
+            d_alpha = t * d_own - r / dr.maximum(1 - alpha, 1e-5)
+            d_log = d_alpha * alpha * LN_2
+            d_top, d_bottom = -d_log * inverse, d_log * q * inverse
+            d_du = d_top * (2 * a * du + b2 * dv) + d_bottom * (e + 2 * g * du + h * dv)
+            d_dv = d_top * (2 * c * dv + b2 * du) + d_bottom * (f + 2 * k * dv + h * du)
+            parts = [-d_du, -d_dv, d_top * du * du, d_top * du * dv, d_top * dv * dv, d_log]
+            parts += [weight * d for d in ds]
+            parts += [0, d_bottom * du, d_bottom * dv, d_bottom * du * du, d_bottom * du * dv, d_bottom * dv * dv, 0]
+            sums = [total + part for total, part in zip(sums, parts, strict=True)]
+            new_light.append(t - weight)
+            new_rest.append(r)
+        dr.scatter(shares, mi.ArrayXf(sums), dr.gather(mi.UInt32, lists.slots, i) * TILE_WIDTH + column)
+        return i + 1, new_light, new_rest
+
+    def alive(i: Any, light: list[Any], rest: list[Any]) -> Any:
+        return (i < lanes.stop) & (largest(light) > end)
+
+    state = lanes.start, [mi.Float(1) for _ in us], behind
+    dr.while_loop(state, alive, body, label="march backward")
+    dr.eval(shares)
+    return _sum_shares(shares, lists)
+
+
+def _sum_shares(shares: Any, lists: TileLists) -> Any:
+    """Sum of the gradients that each record has from the columns of its tiles.
+
+    They are added in a fixed order, so that every run gives the same bits, which additions by atomics do not. A record
+    that covers many tiles is summed by several lanes, for which the others would have to wait.
+    """
+    record = dr.arange(mi.UInt32, lists.visible)
+    first = dr.gather(mi.UInt32, lists.first, record)
+    pairs = dr.gather(mi.UInt32, lists.first, record + 1) - first
+    runs = dr.maximum((pairs + (_RUN - 1)) // _RUN, 1)
+    begin = dr.prefix_sum(runs)
+    lanes = lists.visible + lists.pairs // _RUN  # no fewer than there are runs; what is left over finds nothing to add
+    marks = dr.zeros(mi.UInt32, lanes)
+    dr.scatter(marks, mi.UInt32(1), begin, begin > 0)
+    owner = dr.cumsum(marks)
+    run = dr.arange(mi.UInt32, lanes) - dr.gather(mi.UInt32, begin, owner)
+    start = dr.gather(mi.UInt32, first, owner) + run * _RUN
+    stop = dr.minimum(start + _RUN, dr.gather(mi.UInt32, lists.first, owner + 1))
+    partial = _sum_rows(shares, start * TILE_WIDTH, stop * TILE_WIDTH)
+    return _sum_rows(partial, begin, begin + runs)
+
+
+_RUN = 32
+"""Tiles whose gradients one lane adds."""
+
+
+def _sum_rows(rows: Any, start: Any, stop: Any) -> Any:
+    """Sums of the rows of :data:`RECORD` floats from ``start`` up to ``stop``, as such rows."""
+    width = dr.width(start)
+
+    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        row = dr.gather(mi.ArrayXf, rows, i, shape=(RECORD, dr.width(i)))
+        return i + 1, [total + own for total, own in zip(sums, row, strict=True)]
+
+    zeros = [mi.Float(0) for _ in range(RECORD)]
+    _, sums = dr.while_loop((start, zeros), lambda i, sums: i < stop, add, label="sum rows")
+    result = dr.empty(mi.Float, RECORD * width)
+    dr.scatter(result, mi.ArrayXf(sums), dr.arange(mi.UInt32, width))
+    dr.eval(result)
+    return result

@@ -1,0 +1,287 @@
+"""Every instance as it would be seen alone, on a canvas that is larger than the image.
+
+A pixel belongs to an instance that is alone where it lets less than half of the light behind it through: the rule of
+the instance image, :class:`mitsplat.renderer.splatting.march.Image`, with what is left of a ray counted as environment.
+Opacity
+does not depend on the order of Gaussians, so lists of tiles are sorted by instance instead of by depth: one packet of
+lanes walks what a tile has of an instance, and stops as soon as all its pixels are decided.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.geometry.camera import Camera, Lens
+from mitsplat.images.masks import Silhouette
+from mitsplat.quality import Quality
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, View
+from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
+from mitsplat.renderer.splatting.gaussian import RECORD
+from mitsplat.renderer.splatting.pairs import CrowdedError
+from mitsplat.renderer.splatting.projection import CloudSet, Placement
+from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS
+from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
+from mitsplat.renderer.splatting.walk import exp2, faintest, largest, respond_along
+
+MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Widths of the canvas around the image that are tried, in images. One image on each side is BOP's; where lens
+distortion cannot be inverted that far out, the widest is taken where it can."""
+
+_ROWS_OF_COLUMN = (np.arange(1 << TILE_HEIGHT)[:, None] >> np.arange(TILE_HEIGHT) & 1).astype(bool)
+"""Which pixels of a column of a tile, from the top, the bits of a number cover."""
+
+_INVERTED = 0.01
+"""How near to itself a pixel must come back through the inverted distortion [px]."""
+
+
+def splat_silhouettes(
+    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality
+) -> dict[int, Silhouette]:
+    """Silhouettes of the instances above 0 by their splats; instances without any pixel are absent."""
+    objects = [placement for placement in placements if placement.instance > 0]
+    if not objects:
+        return {}
+    canvas, left, top = _canvas(view)
+    ids = np.unique([placement.instance for placement in objects])
+    quality = replace(quality, tolerance=math.inf, sh_degree=0)
+    covered = _cover(clouds, objects, canvas.sampled(quality.grid), quality, ids)
+    return _assemble(*covered, ids, canvas, left, top)
+
+
+def _cover(
+    clouds: CloudSet, objects: Sequence[Placement], canvas: View, quality: Quality, ids: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tile, instance (as position in ``ids``) and covered pixels of every run, see :func:`_covered`.
+
+    A canvas that is too crowded for the memory is looked at in parts.
+    """
+    slots = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
+    slots[ids] = np.arange(len(ids), dtype=np.uint32)
+    if len(ids) > 1 << DEPTH_BITS:
+        raise CrowdedError
+    try:
+        lists = bin_gaussians(clouds, objects, canvas, quality, fitted=True, groups=wrapped(mi.UInt32, slots))
+    except CrowdedError:
+        if canvas.tiles_y == 1:
+            raise
+        middle = canvas.tiles_y // 2
+        upper, lower = canvas.rows(0, middle * TILE_HEIGHT), canvas.rows(middle * TILE_HEIGHT, canvas.height)
+        (above, *rest), (below, *more) = (_cover(clouds, objects, part, quality, ids) for part in (upper, lower))
+        tile = np.concatenate([above, below + middle * canvas.tiles_x])
+        slot, bits = (np.concatenate(parts) for parts in zip(rest, more, strict=True))
+        return tile, slot, bits
+    if lists.pairs == 0:
+        return (np.zeros(0, dtype=np.uint32),) * 3
+    runs = _runs(lists)
+    tile = dr.gather(mi.UInt32, lists.tiles, runs.place)
+    return np.array(tile), np.array(runs.slot), np.array(_covered(lists, canvas, quality, runs))
+
+
+def proxy_silhouettes(
+    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: View
+) -> dict[int, Silhouette]:
+    """The same by proxy meshes: (mesh, world_from_mesh) of every part of an instance, by the instance's id."""
+    canvas, left, top = _canvas(view)
+    found = {}
+    for instance, parts in proxies.items():
+        window = _window(canvas, parts)
+        if window is None:
+            continue
+        x0, y0, x1, y1 = window
+        shape = y1 - y0, x1 - x0
+        hit = np.zeros(shape, dtype=bool)
+        for mesh, world_from_mesh in parts:
+            hit |= np.array(_trace_alone(canvas, window, mesh, world_from_mesh)).reshape(shape)
+        if hit.any():
+            found[instance] = Silhouette.cropped(hit, x0 - left, y0 - top)
+    return found
+
+
+def _canvas(view: View) -> tuple[View, int, int]:
+    """The view on a larger canvas, and where on it the image begins."""
+    share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion, view.lens)
+    left, top = int(share * view.width), int(share * view.height)
+    width, height = view.width + 2 * left, view.height + 2 * top
+    return replace(view, width=width, height=height, cx=view.cx + left, cy=view.cy + top), left, top
+
+
+@lru_cache(maxsize=8)
+def _margin(
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    distortion: tuple[float, ...],
+    lens: Lens,
+) -> float:
+    if not distortion:
+        return MARGINS[0]
+    camera = Camera(width, height, fx, fy, cx, cy, np.eye(4), distortion, lens=lens)
+    for share in MARGINS[:-1]:
+        x, y = np.meshgrid(
+            np.linspace(-share * width, (1 + share) * width, 33), np.linspace(-share * height, (1 + share) * height, 33)
+        )
+        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+        slopes = camera.ray_slopes(pixels)
+        back, _ = camera.project(np.column_stack([slopes, np.ones(len(slopes))]))
+        # Farther from the centre must stay farther: past its fold a distortion is inverted to the wrong side.
+        radius = np.linalg.norm(slopes, axis=1).reshape(x.shape)
+        grows = all(
+            (np.diff(line, axis=1) > 0).all()
+            for line in (radius[:, 17:], radius[:, 16::-1], radius[17:].T, radius[16::-1].T)
+        )
+        if grows and np.abs(back - pixels).max() < _INVERTED:
+            return share
+    return MARGINS[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """What tiles have of instances.
+
+    Attributes:
+        place: Of the tile among those that have lists.
+        slot: Of the instance in the ids.
+        start, stop: Range of its entries.
+    """
+
+    place: Any
+    slot: Any
+    start: Any
+    stop: Any
+
+
+def _runs(lists: TileLists) -> _Runs:
+    """Every tile and instance that meet, of lists that are sorted by instance and not empty."""
+    entry, tile = dr.arange(mi.UInt32, lists.pairs), dr.arange(mi.UInt32, dr.width(lists.start))
+    slot, filled = lists.levels, lists.stop > lists.start
+    first = dr.zeros(mi.UInt32, lists.pairs)
+    dr.scatter(first, mi.UInt32(1), lists.start, filled, mode=dr.ReduceMode.Permute)
+    dr.eval(slot, first)
+    begins = (first > 0) | (slot != dr.gather(mi.UInt32, slot, entry - 1, entry > 0))
+    before, start = dr.prefix_sum(dr.select(begins, mi.UInt32(1), 0)), dr.compress(begins)
+    run, runs, end = dr.arange(mi.UInt32, dr.width(start)), dr.width(start), dr.opaque(mi.UInt32, lists.pairs)
+    count, last = dr.opaque(mi.UInt32, runs), run + 1
+    stop = dr.select(last < count, dr.gather(mi.UInt32, start, last, last < count), end)
+    inside, place = lists.stop < end, dr.empty(mi.UInt32, runs)
+    own = dr.gather(mi.UInt32, before, lists.start, filled)
+    after = dr.select(inside, dr.gather(mi.UInt32, before, lists.stop, inside), count)
+
+    def name(k: Any) -> tuple[Any]:
+        dr.scatter(place, tile, k, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
+
+    dr.while_loop((mi.UInt32(own),), lambda k: filled & (k < after), name, label="tiles of runs")
+    slot = dr.gather(mi.UInt32, slot, start)
+    dr.eval(place, slot, start, stop)
+    return _Runs(place, slot, start, stop)
+
+
+def _covered(lists: TileLists, view: View, quality: Quality, runs: _Runs) -> Any:
+    """For every run and each column of its tile, the pixels that the instance covers, as bits from the top."""
+    lane = dr.arange(mi.UInt32, dr.width(runs.place) * TILE_WIDTH)
+    run, column = lane // TILE_WIDTH, lane % TILE_WIDTH
+    tile = dr.gather(mi.UInt32, lists.tiles, dr.gather(mi.UInt32, runs.place, run))
+    row = tile // view.tiles_x
+    x = mi.Float((tile - row * view.tiles_x) * TILE_WIDTH + column)
+    y = mi.Float(row * TILE_HEIGHT)
+    centre = dr.opaque(mi.Float, 0.5)  # as in the instance image, whatever the number of samples
+    slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
+    us, vs = [u for u, _ in slopes], [v for _, v in slopes]
+    start, stop = dr.gather(mi.UInt32, runs.start, run), dr.gather(mi.UInt32, runs.stop, run)
+    cut, near, shared_column = faintest(quality), view.near_plane, not view.distortion
+
+    def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
+        record = dr.gather(
+            mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
+        )
+        responses = respond_along(record, lists, us, vs, shared_column, cap=None)
+        return i + 1, [
+            dr.select((log_alpha > cut) & (z > near), t * (1 - exp2(log_alpha)), t)
+            for t, (log_alpha, z) in zip(through, responses, strict=True)
+        ]
+
+    def undecided(i: Any, through: list[Any]) -> Any:
+        return (i < stop) & (largest(through) >= 0.5)
+
+    ones = [mi.Float(1.0) for _ in range(TILE_HEIGHT)]
+    _, through = dr.while_loop((mi.UInt32(start), ones), undecided, body, label="silhouettes")
+    bits = mi.UInt32(0)
+    for k, t in enumerate(through):
+        bits |= dr.select(t < 0.5, mi.UInt32(1 << k), 0)
+    dr.eval(bits)
+    return bits
+
+
+def _assemble(
+    tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: View, left: int, top: int
+) -> dict[int, Silhouette]:
+    """Masks of whole instances from those of their tiles."""
+    columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)
+    chosen = np.flatnonzero(columns.any(axis=1))
+    chosen = chosen[np.argsort(slot[chosen], kind="stable")]
+    tile, columns = tile[chosen], columns[chosen]
+    blocks = _ROWS_OF_COLUMN[columns].swapaxes(1, 2)  # pair, row, column
+    rows, cols = tile // canvas.tiles_x, tile % canvas.tiles_x
+    found = {}
+    ends = np.searchsorted(slot[chosen], np.arange(len(ids) + 1))
+    for instance, start, stop in zip(ids.tolist(), ends[:-1], ends[1:], strict=True):
+        if start == stop:
+            continue
+        y, x = rows[start:stop], cols[start:stop]
+        y0, x0 = int(y.min()), int(x.min())
+        grid = np.zeros((int(y.max()) - y0 + 1, TILE_HEIGHT, int(x.max()) - x0 + 1, TILE_WIDTH), dtype=bool)
+        grid[y - y0, :, x - x0] = blocks[start:stop]
+        mask = grid.reshape(grid.shape[0] * TILE_HEIGHT, grid.shape[2] * TILE_WIDTH)
+        mask = mask[: canvas.height - y0 * TILE_HEIGHT, : canvas.width - x0 * TILE_WIDTH]
+        if mask.any():
+            found[instance] = Silhouette.cropped(mask, x0 * TILE_WIDTH - left, y0 * TILE_HEIGHT - top)
+    return found
+
+
+def _window(view: View, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
+    """Box of pixels on the canvas that meshes may cover, or None."""
+    camera = view.camera
+    points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
+    pixels, depth = camera.project(points)
+    if (depth <= view.near).any():
+        return (0, 0, view.width, view.height) if (depth > view.near).any() else None
+    low = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, (view.width, view.height)).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, (view.width, view.height)).astype(int)
+    return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (high > low).all() else None
+
+
+def _trace_alone(view: View, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray) -> Any:
+    """Whether the rays of a window of pixels meet a mesh."""
+    x0, y0, x1, y1 = window
+    lane = dr.arange(mi.UInt32, (x1 - x0) * (y1 - y0))
+    width = dr.opaque(mi.UInt32, x1 - x0)
+    row = lane // width
+    u, v = view.slopes(
+        mi.Float(lane - row * width) + dr.opaque(mi.Float, x0 + 0.5), mi.Float(row) + dr.opaque(mi.Float, y0 + 0.5)
+    )
+    mesh_from_camera = np.linalg.inv(pose) @ view.world_from_camera
+    axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in mesh_from_camera[:3].T]
+    right, down, forward, centre = axes
+    direction = mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)])
+    ray = dr.zeros(mi.Ray3f, dr.width(lane))
+    ray.o = mi.Point3f(*centre)
+    ray.d = dr.normalize(direction)
+    ray.maxt = dr.inf
+    return _scene_of(mesh, str(mi.variant())).ray_test(ray)
+
+
+@lru_cache(maxsize=128)
+def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> Any:
+    return ray_scene({"mesh": plain_mesh(mesh)})

@@ -1,0 +1,182 @@
+"""Light that reaches objects from their surroundings: what the surroundings' splats have captured, and visible meshes.
+
+What a ray from an object meets, if it is not another object, shines with the colour that was captured there, which
+holds all earlier bounces. A grid of mean colours is enough, because irradiance blurs it over the hemisphere. A visible
+mesh shines with what its diffuse material reflects of the emitters' light that arrives there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.images.colour import decode_srgb
+from mitsplat.renderer.light.emitter_sampling import Emitters, receiver
+from mitsplat.renderer.light.light_tiles import STRIDE
+from mitsplat.renderer.occluders.proxies import Proxies
+from mitsplat.renderer.rays.device_arrays import wrapped
+
+CELLS = 80
+"""Cells of the grid along its longest side."""
+
+BOUNCE_RAYS = 7
+"""Rays per object pixel, before neighbours are averaged."""
+
+MESH_RAYS = 2
+"""The same per pixel of what is no object, such as a table, at one of four: neighbours on even surfaces count."""
+
+LANES = 1 << 20
+"""Rays that are traced at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class RadianceGrid:
+    """Mean linear colour of splats in the cells of a box; an empty cell has that of the nearest one with splats.
+
+    Attributes:
+        colours: Linear RGB per cell, x fastest, flat.
+        low: Lower corner [m].
+        size: Edge of a cell [m].
+        cells: Cells along x, y and z.
+    """
+
+    colours: Any
+    low: Any
+    size: Any
+    cells: Any
+
+    @classmethod
+    def build(cls, splats: Splats, world_from_splats: np.ndarray) -> RadianceGrid | None:
+        """The grid of the opaque ones among ``splats``; None if there are none."""
+        opaque = splats.opacities > 0.5
+        if not opaque.any():
+            return None
+        points = splats.means[opaque] @ world_from_splats[:3, :3].T + world_from_splats[:3, 3]
+        encoded = np.clip(0.5 + SH_C0 * splats.sh[opaque, 0], 0.0, None)
+        colours = decode_srgb(encoded)
+        area = np.prod(np.sort(splats.scales[opaque], axis=1)[:, 1:], axis=1)
+        low, high = points.min(axis=0), points.max(axis=0)
+        size = float((high - low).max()) / CELLS or 1.0
+        cells = np.maximum(np.ceil((high - low) / size).astype(int), 1)
+        x, y, z = np.clip((points - low) / size, 0, cells - 1).astype(int).T
+        cell = (z * cells[1] + y) * cells[0] + x
+        weight = np.bincount(cell, area, minlength=cells.prod())
+        sums = np.stack([np.bincount(cell, area * c, minlength=cells.prod()) for c in colours.T], axis=1)
+        nearest = distance_transform_edt(
+            (weight == 0).reshape(cells[::-1]), return_distances=False, return_indices=True
+        )
+        source = np.ravel_multi_index(tuple(nearest), tuple(cells[::-1])).ravel()
+        mean = (sums / np.maximum(weight, 1e-30)[:, None])[source]
+        return cls(
+            wrapped(mi.Float, mean.astype(np.float32)),
+            mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in low]),
+            dr.opaque(mi.Float, size),
+            mi.Point3i(*[dr.opaque(mi.Int32, int(v)) for v in cells]),
+        )
+
+    def at(self, point: Any, active: Any) -> Any:
+        """Linear colour (Color3f) at points [m]."""
+        i = dr.clip(mi.Point3i(dr.floor((point - self.low) / self.size)), 0, self.cells - 1)
+        return dr.gather(mi.Color3f, self.colours, mi.UInt32((i.z * self.cells.y + i.y) * self.cells.x + i.x), active)
+
+
+@dataclass(frozen=True, eq=False)
+class Reflectors:
+    """What reflects light onto things.
+
+    Attributes:
+        grid: Captured colours of the static proxies; None if there are none.
+        proxies: What rays meet, and what stands in the light of what they meet.
+        emitters: Light on visible meshes.
+        white: Irradiance (Color3f) of display white.
+    """
+
+    grid: RadianceGrid | None
+    proxies: Proxies
+    emitters: Emitters
+    white: Any
+
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return self.proxies.shows_meshes or (self.grid is not None and self.proxies.static is not None)
+
+    def irradiance(
+        self, origin: Any, normal: Any, start: Any, rays: int, sequence: Callable[[Any], tuple[Any, Any]]
+    ) -> Any:
+        """What they send to points (Color3f) over the irradiance of display white.
+
+        Args:
+            origin: Where rays start [m].
+            normal: Unit normal of the surface.
+            start: Number of the first ray of every point.
+            rays: From every point.
+            sequence: Two points of the unit square for rays by their numbers.
+        """
+        count = dr.width(origin)
+        together = max(1, min(rays, LANES // count))
+        total = mi.Color3f(dr.zeros(mi.Float, count))
+        for first in range(0, rays, together):
+            some = min(together, rays - first)
+            lane = dr.arange(mi.UInt32, count * some)
+            row = lane // dr.opaque(mi.UInt32, some)
+            number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
+            upward, light = sequence(number)
+            frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
+            towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
+            ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
+            dr.eval(ray, number, light)
+            total += mi.Color3f(*[dr.block_sum(c, some) for c in self._colour(ray, number, light)])
+            dr.eval(total)
+        return total / rays
+
+    def _colour(self, ray: Any, key: Any, light: Any) -> Any:
+        """That (Color3f) of what rays meet; each scene is traced by a kernel of its own, see ``Proxies.apart``."""
+        static, dynamic = self.proxies.static, self.proxies.dynamic
+        colour = mi.Color3f(dr.zeros(mi.Float, dr.width(key)))
+        if static is not None:
+            ray.maxt = static.scene.ray_intersect_preliminary(ray).t
+            dr.eval(ray)
+        met, mesh, hit = ray.maxt < dr.inf, None, None
+        if dynamic is not None and self.proxies.shows_meshes:
+            hit = dynamic.scene.ray_intersect_preliminary(ray)
+            mesh = hit.is_valid() & dynamic.is_visible(hit)
+            if self.emitters.sky is not None:  # in a room it stands for what walls reflect
+                mesh &= hit.t < self.emitters.sky_reach
+            met &= ~hit.is_valid()
+            dr.eval(hit, mesh)
+        elif dynamic is not None:
+            met &= ~dynamic.scene.ray_test(ray, active=met)
+        if self.grid is not None:
+            colour = dr.select(met, self.grid.at(ray(dr.select(met, ray.maxt, 0)), met), 0)
+        dr.eval(colour)
+        if mesh is not None:
+            lane = dr.compress(mesh)
+            if dr.width(lane):
+                some = (dr.gather(type(v), v, lane) for v in (ray, hit, key, light))
+                dr.scatter(colour, self._lit_mesh(*some), lane)
+        return colour
+
+    def _lit_mesh(self, ray: Any, hit: Any, key: Any, light: Any) -> Any:
+        """Colour (Color3f) of visible meshes: what they reflect of one ray to an emitter."""
+        si = hit.compute_surface_interaction(ray)
+        normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+        diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
+        reflectance = dr.select(diffuse, si.bsdf().eval_diffuse_reflectance(si, diffuse), 0)
+        beam = self.emitters.sample(receiver(si.p, normal), light, mi.Bool(True))
+        colour, shadow = reflectance * beam.irradiance / self.white, si.spawn_ray(beam.direction)
+        shadow.maxt = beam.reach * (1 - 1e-3)
+        free = dr.max(colour) > 0
+        dr.eval(colour, shadow, key, free)
+        for stopper in self.proxies.stoppers:
+            free = free & ~stopper.stop(shadow, mi.UInt32(0), key, free)
+            dr.eval(free)
+        return dr.select(free, colour, 0)

@@ -1,0 +1,239 @@
+"""Directions towards the light: which emitter, which point of it, and how much irradiance that stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.renderer.light.highlight import Lobe
+from mitsplat.renderer.light.rectangle_lights import Rectangles
+from mitsplat.renderer.light.sky_irradiance import SkyIrradiance
+from mitsplat.renderer.rays.device_arrays import wrapped
+
+SURVEY_LATTICE = (233, 144)
+OPEN_LATTICE = (34, 21)
+LOBE_LATTICE = (21, 13)
+WHOLE_LATTICE = (4181, 2584)
+"""Points and generator of Fibonacci lattices: consecutive Fibonacci numbers give the best two-dimensional ones
+(Niederreiter 1992, section 5.3)."""
+
+LEAST_CHANCE = 0.1
+"""Share of the rays that goes to all emitters alike, however little light they send to the reference point."""
+
+_ENDS = 4
+"""Numbers of emitters are rounded up to multiples of it."""
+
+
+def receiver(position: Any, normal: Any) -> Any:
+    """Surface interaction that light is sampled for."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
+    si.p = position
+    si.n = mi.Normal3f(normal)
+    si.sh_frame = mi.Frame3f(si.n)
+    return si
+
+
+def lattice_point(i: Any, lattice: tuple[int, int]) -> Any:
+    """Point ``i`` of a centred rank-1 lattice in the unit square."""
+    count, generator = lattice
+    return mi.Point2f((mi.Float(i) + 0.5) / count, (mi.Float(i * generator % count) + 0.5) / count)
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """A direction that light may come from.
+
+    Attributes:
+        direction: Unit vector towards the light.
+        reach: How far away what stops the light may be [m]: to the emitter, or as far as a sky can be hidden.
+        irradiance: Estimate (Color3f) of the irradiance, were this the only ray and nothing in its way.
+    """
+
+    direction: Any
+    reach: Any
+    irradiance: Any
+
+
+class Emitters:
+    """The emitters of a scene, sampled in proportion to the light that each sends to a reference point.
+
+    A sky of one colour is sampled by the cosine to the normal, which leaves no noise but that of occlusion. An
+    environment map is sampled half so and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
+    """
+
+    def __init__(self, scene: Any, reference: Sequence[float], sky_reach: float = np.inf) -> None:
+        """The emitters of ``scene``, of which there must be one or more; ``reference`` is a point [m].
+
+        What is farther than ``sky_reach`` [m] from a point does not hide the sky from it.
+        """
+        self.sky_reach = dr.opaque(mi.Float, sky_reach)
+        emitters = scene.emitters()
+        self.pointers = scene.emitters_dr()
+        skies = [i for i, e in enumerate(emitters) if _is_sky(e)]
+        sky = skies[0] if skies else None
+        self.even_sky = sky is not None and emitters[sky].class_name() == "ConstantBackgroundEmitter"
+        # Where it is among several emitters is no part of kernels: it changes with the number of lights.
+        self.sky = None if sky is None else mi.UInt32(0) if len(emitters) == 1 else dr.opaque(mi.UInt32, sky)
+        point = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in reference])
+        fluence = self._survey(len(emitters), point)
+        share = LEAST_CHANCE / len(emitters) + (1 - LEAST_CHANCE) * fluence / max(fluence.sum(), 1e-30)
+        self.choice = _Choice(share)
+        local = np.where(np.arange(len(emitters)) == sky, 0, share)
+        self.local_choice = _Choice(local) if len(emitters) > len(skies) else None
+        self.rectangles = Rectangles.of(emitters, sky)
+        infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
+        self.infinite = mi.UInt32([int(v) for v in infinite])
+        self.sky_colour = None
+        if self.even_sky:
+            pointer = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
+            self.sky_colour = self._sky_radiance(receiver(point, mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0, 1), pointer)
+            dr.make_opaque(self.sky_colour)
+        dr.make_opaque(self.infinite)
+
+    def _survey(self, count: int, point: Any) -> Any:
+        """Mean radiance (count,) from each emitter around a point."""
+        i = dr.arange(mi.UInt32, count * SURVEY_LATTICE[0])
+        emitter = dr.gather(mi.EmitterPtr, self.pointers, i // SURVEY_LATTICE[0])
+        sample = lattice_point(i % SURVEY_LATTICE[0], SURVEY_LATTICE)
+        _, radiance = emitter.sample_direction(receiver(point, mi.Normal3f(0, 0, 1)), sample, True)
+        return np.array(dr.sum(radiance)).reshape(count, -1).mean(axis=1)
+
+    def sample(self, si: Any, point: Any, active: Any) -> Beam:
+        """A random direction from ``si`` for each point of the unit square."""
+        index, x, chance = self.choice.sample(point.x)
+        is_sky = mi.Bool(False) if self.sky is None else index == self.sky
+        emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
+        by_cosine = is_sky if self.even_sky else is_sky & (x < 0.5)
+        if self.sky is not None and not self.even_sky:
+            x = dr.select(is_sky, dr.select(by_cosine, 2 * x, 2 * x - 1), x)
+        direction, distance, radiance = self._towards(si, index, mi.Point2f(x, point.y), active & ~by_cosine)
+        cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
+        irradiance = radiance * cosine
+        if self.sky is not None:
+            upward = si.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, point.y)))
+            direction = dr.select(by_cosine, upward, direction)
+            cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
+            if self.even_sky:
+                sky, density = self.sky_colour, cosine * dr.inv_pi
+            else:
+                sky, density = self._sky_radiance(si, direction, emitter, is_sky & active), cosine * dr.inv_pi
+                towards = dr.zeros(mi.DirectionSample3f, dr.width(direction))
+                towards.d = direction
+                density = 0.5 * (density + emitter.pdf_direction(si, towards, is_sky & active))
+            irradiance = dr.select(is_sky, dr.select(density > 0, sky * (cosine / density), 0), irradiance)
+        # The distance to a light at infinity comes from the extent of visible meshes, which proxies are not part of.
+        infinite = dr.gather(mi.UInt32, self.infinite, index, active) > 0
+        reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, distance))
+        return Beam(direction, reach, irradiance / chance)
+
+    def _towards(self, si: Any, index: Any, point: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Where points of emitters are seen from ``si``: unit vector, distance [m], and radiance over their density."""
+        if self.rectangles is None or not (self.sky is None or self.even_sky):
+            emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
+            sample, radiance = emitter.sample_direction(si, point, active)
+            return mi.Vector3f(sample.d), sample.dist, dr.select(sample.pdf > 0, radiance, 0)
+        return self.rectangles.towards(si.p, index, point)
+
+    @staticmethod
+    def _sky_radiance(si: Any, direction: Any, emitter: Any, active: Any = True) -> Any:
+        outside = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        outside.p = si.p
+        outside.wi = -direction
+        return mi.Color3f(emitter.eval(outside, active))
+
+    def open_light(self, si: Any, lobe: Lobe | None, active: Any) -> tuple[Any, Any]:
+        """Irradiance, and radiance that is mirrored (Color3f), without occluders, from the same directions for all.
+
+        Without a ``lobe``, where nothing is mirrored, this takes less time.
+        """
+        total, shine = mi.Color3f(0), mi.Color3f(0)
+        if self.local_choice is not None:
+            choice = self.local_choice
+
+            def local(point: Any) -> tuple[Any, Any]:
+                index, x, chance = choice.sample(point.x)
+                direction, _, radiance = self._towards(si, index, mi.Point2f(x, point.y), active)
+                light = dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0)
+                return light / chance, 0 if lobe is None else light * (lobe.reflectance(direction) / chance)
+
+            total, shine = self._integrate(si, active, OPEN_LATTICE, local)
+        if self.sky is not None:
+            emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
+            total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)
+            if lobe is not None:
+                sample_lobe = lobe.sample
+
+                def mirrored(point: Any) -> tuple[Any, Any]:
+                    direction, weight = sample_lobe(point)
+                    radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
+                    return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
+
+                shine += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
+        return total, shine
+
+    @staticmethod
+    def _integrate(si: Any, active: Any, lattice: tuple[int, int], light: Any) -> tuple[Any, Any]:
+        rounds = dr.opaque(mi.UInt32, lattice[0])
+
+        def body(i: Any, total: Any, shine: Any) -> tuple[Any, Any, Any]:
+            arriving, mirrored = light(lattice_point(i, lattice))
+            return i + 1, total + arriving, shine + mirrored
+
+        nothing = dr.zeros(mi.Color3f, dr.width(si.p))
+        state = dr.zeros(mi.UInt32, dr.width(si.p)), nothing, mi.Color3f(nothing)
+        _, *sums = dr.while_loop(state, lambda i, *_: active & (i < rounds), body, label="open light")
+        return sums[0] / lattice[0], sums[1] / lattice[0]
+
+
+class _Choice:
+    """One of a few things, with given chances."""
+
+    def __init__(self, share: Any) -> None:
+        """Chances in proportion to ``share`` (N,)."""
+        chance = share / share.sum()
+        # A kernel serves two to four things, five to eight and so on: nothing lies behind the ends at infinity.
+        ends = np.cumsum(chance)[:-1]
+        if len(chance) > 1:
+            ends = np.concatenate([ends, np.full(-len(chance) % _ENDS, np.inf)])
+        self.ends = [dr.opaque(mi.Float, float(end)) for end in ends]
+        self.starts = wrapped(mi.Float, np.concatenate([[0], np.cumsum(chance)[:-1]]).astype(np.float32))
+        self.chances = wrapped(mi.Float, chance.astype(np.float32))
+        dr.make_opaque(self.starts, self.chances)
+
+    def sample(self, x: Any) -> tuple[Any, Any, Any]:
+        """Index for a number in [0, 1), what of the number is left, in [0, 1) too, and the chance of the index."""
+        index = sum((dr.select(x >= end, mi.UInt32(1), mi.UInt32(0)) for end in self.ends), mi.UInt32(0))
+        chance = dr.gather(mi.Float, self.chances, index)
+        left = (x - dr.gather(mi.Float, self.starts, index)) / chance
+        return index, dr.clip(left, 0, 1 - 2.0**-24), chance
+
+
+def _is_sky(emitter: Any) -> bool:
+    flags = emitter.flags()
+    infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
+    return bool(infinite and not mi.has_flag(flags, mi.EmitterFlags.DeltaDirection))
+
+
+def sky_irradiance(emitter: Any) -> SkyIrradiance:
+    """Irradiance of an emitter at infinity on every orientation, from directions in proportion to its radiance."""
+    point = lattice_point(dr.arange(mi.UInt32, WHOLE_LATTICE[0]), WHOLE_LATTICE)
+    sample, radiance = emitter.sample_direction(receiver(mi.Point3f(0), mi.Vector3f(0, 0, 1)), point, True)
+    return SkyIrradiance(sample.d, radiance)
+
+
+def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
+    """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
+
+    Where next to nothing reaches that element, it is the mean over all orientations, a quarter of the fluence.
+    """
+    i = dr.arange(mi.UInt32, WHOLE_LATTICE[0])
+    si = receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))
+    sample, radiance = scene.sample_emitter_direction(si, lattice_point(i, WHOLE_LATTICE), False)
+    irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
+    mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])
+    return dr.maximum(dr.select(irradiance > 1e-3 * mean, irradiance, mean), 1e-12)

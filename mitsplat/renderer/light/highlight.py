@@ -1,0 +1,103 @@
+"""Highlights: what surfaces mirror of lights, by GGX microfacets.
+
+The light that a lobe mirrors without anything in the way is summed over fixed directions, and has no noise. Shadow rays
+only say which share of it arrives (Heitz, Hill and McGuire 2018, "Combining Analytic Direct Illumination and Stochastic
+Shadows"): next to a share, radiance that differs much from pixel to pixel leaves noise, or is blurred by a filter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.renderer.light.lit_surface import Surface
+
+CAPTURED_SPECULAR = 0.08
+"""Reflectance up to which the light tent's mirror image counts as part of a captured colour, to be replaced by that of
+the scene's lights. Metals reflect more, and keep the rest as it was captured: it stands for what else they mirror."""
+
+LEAST_ROUGHNESS = 0.15
+"""Smoother surfaces would show the fixed directions one by one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lobe:
+    """What points mirror towards the camera: GGX with height-correlated masking and Schlick's Fresnel term.
+
+    See Walter et al. 2007, "Microfacet Models for Refraction", and Heitz 2014, "Understanding the Masking-Shadowing
+    Function".
+
+    Attributes:
+        normal, to_camera: Unit vectors.
+        alpha: Roughness of the distribution.
+        specular: Reflectance at normal incidence.
+    """
+
+    normal: Any
+    to_camera: Any
+    alpha: Any
+    specular: Any
+
+    @classmethod
+    def of(cls, surface: Surface) -> Lobe:
+        """The lobes of visible points."""
+        alpha = dr.square(dr.maximum(surface.roughness, LEAST_ROUGHNESS))
+        return cls(surface.normal, surface.to_camera, alpha, surface.specular)
+
+    def reflectance(self, to_light: Any) -> Any:
+        """Radiance towards the camera over irradiance from unit vectors towards the light."""
+        alpha2, cos_camera = dr.square(self.alpha), self._cos_camera()
+        cos_light = dr.dot(self.normal, to_light)
+        half = dr.normalize(to_light + self.to_camera)
+        cos_half = dr.dot(self.normal, half)
+        spread = dr.fma(cos_half * cos_half, alpha2 - 1, 1)
+        distribution = alpha2 / (dr.pi * dr.square(spread))
+        masking = cos_light * self._reach(cos_camera, alpha2) + cos_camera * self._reach(cos_light, alpha2)
+        fresnel = self._fresnel(dr.dot(half, to_light))
+        return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
+
+    def sample(self, point: Any) -> tuple[Any, Any]:
+        """Direction for a point of the unit square, and what of the radiance from there is mirrored.
+
+        Of the normals that the camera sees (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
+        """
+        frame, alpha2, cos_camera = mi.Frame3f(self.normal), dr.square(self.alpha), self._cos_camera()
+        seen = frame.to_local(self.to_camera)
+        seen = dr.normalize(mi.Vector3f(seen.x, seen.y, cos_camera))
+        microfacets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, True)
+        half = mi.Vector3f(microfacets.sample(seen, point)[0])
+        cos_half = dr.dot(seen, half)
+        direction = 2 * cos_half * half - seen
+        cos_light = direction.z
+        # G2 / G1, both of the camera's side.
+        own, other = self._reach(cos_camera, alpha2), self._reach(cos_light, alpha2)
+        masking = cos_light * (cos_camera + own) / dr.maximum(cos_light * own + cos_camera * other, 1e-6)
+        return frame.to_world(direction), dr.select(cos_light > 0, self._fresnel(cos_half) * masking, 0)
+
+    def _cos_camera(self) -> Any:
+        return dr.maximum(dr.dot(self.normal, self.to_camera), 1e-3)
+
+    @staticmethod
+    def _reach(cosine: Any, alpha2: Any) -> Any:
+        return dr.sqrt(dr.fma(cosine * cosine, 1 - alpha2, alpha2))
+
+    def _fresnel(self, cosine: Any) -> Any:
+        grazing = dr.power(dr.clip(1 - cosine, 0, 1), 5)
+        return dr.select(self.specular > 0, dr.fma(1 - self.specular, grazing, self.specular), 0)
+
+
+def mirrored_tent(surface: Surface) -> Any:
+    """Part of the captured colour that is light of the tent, mirrored: the lobe's reflectance under even light.
+
+    Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60 degrees: colours
+    of few SH bands do not show it, so that to take it away would blacken silhouettes.
+    """
+    cosine = dr.maximum(dr.dot(surface.normal, surface.to_camera), 0.5)
+    rough = surface.roughness
+    x, y, z, w = 1 - rough, dr.fma(-0.0275, rough, 0.0425), dr.fma(-0.572, rough, 1.04), dr.fma(0.022, rough, -0.04)
+    bend = dr.fma(dr.minimum(x * x, dr.exp2(-9.28 * cosine)), x, y)
+    specular = dr.minimum(surface.specular, CAPTURED_SPECULAR)
+    return dr.select(specular > 0, dr.maximum(specular * dr.fma(-1.04, bend, z) + dr.fma(1.04, bend, w), 0), 0)

@@ -1,0 +1,524 @@
+"""Traced light on splats: irradiance with and without the dynamic occluders, and a highlight.
+
+A splat stores what the camera saw, shadows included. Rendering it among new objects therefore needs no light transport
+from scratch but a factor per visible point x with normal n,
+
+    captured under the scene's light:   ratio = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
+    captured under uniform light:       ratio = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
+
+with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first is exactly 1 where no dynamic
+object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance under which the
+colours of the surroundings are exposed: an object taken in a light tent keeps its colours there, and is darker where
+less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.renderer.light.bounce`. The highlight
+is what
+the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
+
+Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take no more light than
+the wanted error, see :mod:`mitsplat.renderer.light.light_tiles`. All else gets as many as most need for that error, and
+more where light, as it looks in the picture, errs by more. Of visible planes in even light, one of four pixels gets
+them, see :mod:`mitsplat.renderer.light.light_planes`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.renderer.light.bounce import BOUNCE_RAYS, MESH_RAYS, RadianceGrid, Reflectors
+from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.light.highlight import Lobe, mirrored_tent
+from mitsplat.renderer.light.light_filter import NOWHERE, RADIUS, Estimate, LightFilter, packed
+from mitsplat.renderer.light.light_planes import LEAST_ROWS, Planes, between_samples, plane_codes
+from mitsplat.renderer.light.light_points import Points
+from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, Tiles, block_order, parity
+from mitsplat.renderer.light.lit_surface import Surface, VisibleSurfaces
+from mitsplat.renderer.occluders.proxies import Proxies, Stopper
+from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.device_arrays import gathered
+from mitsplat.renderer.splatting.sorting import stable_order
+
+ROBERTS = (3242174889, 2447445414)
+"""Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
+effectiveness of quasirandom sequences"), of which the search for shadows takes a point for each pixel."""
+
+RECURRENCE = (1996816038, 1246200886)
+"""The same, of which a pixel takes every 64th point, and its 8 x 8 neighbours the others.
+
+Those of a pixel are Roberts', of whose own recurrence every 16th point is nearly the same. There are 4096 of the kind;
+of this one consecutive points are farthest apart.
+"""
+
+FIRST = 0.3
+"""Rays per point after which its error is first estimated, times the wanted one: as many as most points need.
+
+With fewer, the estimates are so rough that they send rays to the wrong points, and take penumbras for even light.
+"""
+
+LEAST_FIRST = 4
+"""Least number of them."""
+
+DENSE = 2
+"""Times as many from a point that stands for four pixels of a plane. With as many as elsewhere light there would err by
+a quarter more than if each pixel had its own; with these it errs no more."""
+
+LEVEL_BITS = 4
+"""Of how often that number is doubled: 2^15 times it is more than any setting."""
+
+WORD = 32
+"""Rays whose fate is kept as bits of one number."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How many shadow rays are spent.
+
+    Attributes:
+        error: Standard error of light that is half of white for which rays are spent, and as much to the eye of all
+            other light; 0 spends ``most`` everywhere.
+        most: Most rays per pixel.
+        metered: Whether the picture is shown as bright on average as if half of its light arrived.
+    """
+
+    error: float
+    most: int
+    metered: bool = False
+
+    @property
+    def first(self) -> int:
+        """Rays per point after which its error is first estimated."""
+        wanted = max(LEAST_FIRST, round(FIRST / self.error)) if self.error > 0 else self.most
+        return min(wanted, self.most)
+
+    @property
+    def dense(self) -> int:
+        """The same per point that stands for four pixels of a plane."""
+        return min(DENSE * self.first, self.most)
+
+
+def light_factor(
+    scene: Any,
+    proxies: Proxies,
+    visible: VisibleSurfaces,
+    *,
+    accuracy: Accuracy,
+    seed: int,
+    point: tuple[float, ...],
+    reference: Any,
+    sky_reach: float = float("inf"),
+    grid: RadianceGrid | None = None,
+    bounce: bool = False,
+) -> tuple[Any, Any]:
+    """Light factor and highlight (Color3f) of every visible point, see the module docstring.
+
+    Sums over rays are averaged over neighbours before they are divided, so that points with little light do not turn
+    black by chance. A relit point takes its irradiance without occluders from one fixed set of directions, which has no
+    noise, and only the share that arrives from its rays.
+
+    Args:
+        scene: Mitsuba scene whose emitters give the light.
+        proxies: What can stand in its way.
+        visible: Where the camera's pixels, which are counted row by row, show something.
+        accuracy: How many rays to spend.
+        seed: Offset into the low-discrepancy sequence.
+        point: Where in the scene rays are shared out among emitters by how much light they send [m].
+        reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
+        sky_reach: What is farther than this from a point does not hide the sky from it [m].
+        grid: Captured colours of the surroundings; None if there are none.
+        bounce: Whether objects get the light that surroundings and visible meshes reflect to them.
+    """
+    emitters, view = Emitters(scene, point, sky_reach), visible.view
+    everything = visible.at(dr.arange(mi.UInt32, view.width * view.height))
+    needed, light = everything.valid, mi.Color3f(1)
+    if accuracy.error > 0:
+        captured = everything.valid & ~(everything.relit | (everything.specular > 0))
+        codes = plane_codes(everything, visible.eye)
+        some_captured, some_planes = dr.any(captured), dr.any(codes != 0)
+        dr.eval(everything.valid, captured, codes)
+        if some_captured:
+            tiles = _Tracer(emitters, proxies, everything, None, view, seed).search(captured)
+            needed = everything.valid & (~captured | tiles.differs(accuracy.error))
+            light = dr.select(everything.valid, tiles.light(), 1)
+    dr.eval(needed, light)
+    highlight = mi.Color3f(0)
+    first, plane = accuracy.first, None
+    if accuracy.error > 0 and view.height >= LEAST_ROWS and some_planes:
+        plane = _CoarseLight.of(Planes.of(codes, needed, view), visible, emitters, seed, accuracy)
+    if plane is not None:
+        needed &= ~plane.coarse | plane.lattice
+        dr.eval(needed)
+    index = dr.compress(needed)
+    if not dr.width(index):
+        return light, highlight
+    here = visible.at(index)
+    dr.eval(here)
+    light_filter = LightFilter(here, view, index, plane and plane.coarse)
+    order = _blockwise(light_filter.place, view)
+    points = Points.of(visible, here, index, light_filter.place, order)
+    pixels = dr.gather(mi.UInt32, index, points.owner)
+    tracer = _Tracer(emitters, proxies, points.surface, pixels, view, seed, plane and plane.lattice)
+    estimate = Estimate.nothing(dr.width(points.owner))
+    rest = order
+    if plane is not None:
+        places = dr.gather(mi.UInt32, light_filter.place, plane.pixel)
+        estimate = plane.estimate.moved(places, dr.width(points.owner))
+        rest = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Float, estimate.rays, order) == 0))
+    rows = points.rows(rest)
+    if dr.width(rows):
+        rays = points.shared(dr.opaque(mi.UInt32, first), rows)
+        estimate = tracer.trace(rows, estimate, rays, first, points.turn(rows))
+    special = dr.compress(here.relit | (here.specular > 0))
+    unshadowed = dr.full(mi.Float, 1, dr.width(index))
+    if dr.width(special):
+        open_light, mirrored, tent = _open_light(emitters, points, special)
+        relit = dr.gather(mi.Bool, here.relit, special)
+        dr.scatter(unshadowed, dr.sum(open_light / reference) / 3, special, relit)
+        dr.eval(unshadowed)
+    bounced, reflectors = None, Reflectors(grid, proxies, emitters, reference)
+    if bounce and reflectors.any and dr.width(special):
+        whole = _Tracer(emitters, proxies, here, index, view, seed, plane and plane.lattice)
+        bounced = whole.bounce(reflectors)
+    if first < accuracy.most:
+        pixels = dr.width(needed) if accuracy.metered else 0
+        wanted = light_filter.rays_for(points.summed(estimate), accuracy.error, unshadowed, pixels)
+        spent = dr.full(mi.UInt32, first, dr.width(index))
+        if plane is not None:
+            spent = dr.select(dr.gather(mi.Bool, plane.lattice, index), dr.opaque(mi.UInt32, accuracy.dense), spent)
+        dr.eval(spent)
+        more = dr.gather(mi.Float, wanted, order) > mi.Float(dr.gather(mi.UInt32, spent, order))
+        rows = points.rows(dr.gather(mi.UInt32, order, dr.compress(more)))
+        if dr.width(rows):
+            # Doubled until enough; pixels with the same number of rays go together, so that no lane waits for another.
+            owner = dr.gather(mi.UInt32, points.owner, rows)
+            level, extra = _doublings(dr.gather(mi.Float, wanted, owner), first, accuracy.most)
+            extra += dr.opaque(mi.UInt32, first) - dr.gather(mi.UInt32, spent, owner)
+            lane = stable_order(level, LEVEL_BITS)
+            rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.shared(extra, rows)))
+            estimate = tracer.trace(rows, estimate, extra, accuracy.most - first, points.turn(rows))
+    lit, base, shine, glare, bounced = light_filter.smooth(points.summed(estimate), bounced)
+    share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
+    light = mi.Color3f(*[v + dr.zeros(mi.Float, dr.width(needed)) for v in light])
+    dr.eval(light, share, shine, glare)
+    dr.scatter(light, share, index)
+    if dr.width(special):
+        own, pixels = gathered(here, special), dr.gather(mi.UInt32, index, special)
+        part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
+        dr.eval(own, part, shine, glare)
+        # Where no ray came from where the lobe is, as much of it arrives as of all light. (dr.mean would write the
+        # width of the array into the kernel.)
+        mirrored *= dr.select(glare > 0, shine / glare, dr.sum(part) / 3) * (dr.pi / reference)
+        relit = part * open_light / reference
+        mirrored -= dr.select(own.relit, relit * tent, 0)
+        dr.eval(relit, mirrored)
+        if bounced is not None:
+            # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
+            # known.
+            relit += dr.gather(mi.Color3f, bounced, special)
+        dr.scatter(light, relit, pixels, own.relit)
+        highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
+        dr.scatter(highlight, mirrored, pixels)
+    if plane is not None:
+        dr.eval(light)
+        light = between_samples(light, plane.coarse, view)
+    return light, highlight
+
+
+def _open_light(emitters: Emitters, points: Points, special: Any) -> tuple[Any, Any, Any]:
+    """Means over the points of pixels, without occluders: irradiance, mirrored light, and what the tent's takes."""
+    rows = points.rows(special)
+    own = gathered(points.surface, rows)
+    dr.eval(own)
+    count = dr.width(rows)
+    columns: Any = [dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count), mirrored_tent(own)]
+    columns.append(dr.select(own.valid, mi.Float(1), 0))
+    dr.eval(columns)
+    for shiny in (False, True):
+        which = dr.compress((own.specular > 0) == mi.Bool(shiny))
+        if dr.width(which):
+            some = gathered(own, which)
+            dr.eval(some)
+            found = emitters.open_light(
+                receiver(some.position, some.normal), Lobe.of(some) if shiny else None, some.valid
+            )
+            dr.eval(found)
+            for column, values in zip(columns, found, strict=False):
+                dr.scatter(column, values, which)
+    dr.eval(columns)
+    means = []
+    for column in columns:
+        by_row = dr.zeros(type(column), dr.width(points.owner))
+        dr.scatter(by_row, dr.select(own.valid, column, 0), rows)
+        dr.eval(by_row)
+        means.append(dr.gather(type(column), points.total(by_row), special))
+    *sums, count = means
+    light, mirrored, tent = (total / dr.maximum(count, 1) for total in sums)
+    dr.eval(light, mirrored, tent)
+    return light, mirrored, tent
+
+
+@dataclass(frozen=True, eq=False)
+class _CoarseLight:
+    """First rays of the pixels that stand for coarse tiles, see :mod:`mitsplat.renderer.light.light_planes`.
+
+    Attributes:
+        coarse: Whether a pixel of the image is in such a tile.
+        lattice: Whether it is one of those that stand for them.
+        pixel: These.
+        estimate: What their rays say.
+    """
+
+    coarse: Any
+    lattice: Any
+    pixel: Any
+    estimate: Estimate
+
+    @classmethod
+    def of(
+        cls, planes: Planes, visible: VisibleSurfaces, emitters: Emitters, seed: int, accuracy: Accuracy
+    ) -> _CoarseLight | None:
+        """Those of some planes that are lit evenly; None if there are none."""
+        if not planes.count:
+            return None
+        pixel, view = planes.samples(), visible.view
+        lattice = dr.full(mi.Bool, False, view.width * view.height)
+        dr.scatter(lattice, mi.Bool(True), pixel)
+        surface = visible.at(pixel)
+        dr.eval(surface, lattice)
+        tracer = _Tracer(emitters, visible.proxies, surface, pixel, view, seed, lattice)
+        count, rays, turn = dr.width(pixel), accuracy.dense, (mi.UInt32(0), mi.UInt32(1))
+        rows, rounds = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, rays)
+        estimate = tracer.trace(rows, Estimate.nothing(count), rounds, rays, turn, matt=True)
+        coarse = planes.coarse(estimate)
+        # Where a tile is not coarse, its samples are not the points of the sequence that go with its other pixels'.
+        lattice &= coarse
+        dr.eval(coarse, lattice)
+        kept = dr.compress(dr.gather(mi.Bool, lattice, pixel))
+        if not dr.width(kept):
+            return None
+        return cls(coarse, lattice, dr.gather(mi.UInt32, pixel, kept), gathered(estimate, kept))
+
+
+def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
+    """How often ``rays`` is doubled until it is enough or ``most``, and how many more rays these are."""
+    level, extra = (dr.zeros(mi.UInt32, dr.width(wanted)) for _ in range(2))
+    while rays < most:
+        more, step = wanted > dr.opaque(mi.Float, rays), min(rays, most - rays)
+        level += dr.select(more, mi.UInt32(1), 0)
+        extra += dr.select(more, dr.opaque(mi.UInt32, step), 0)
+        rays += step
+    dr.eval(level, extra)
+    return level, extra
+
+
+def _blockwise(place: Any, view: View) -> Any:
+    """What an image ``place`` holds, less where it is NOWHERE, in the order of :func:`block_order`."""
+    pixel, inside = block_order(view)
+    ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), NOWHERE)
+    return dr.gather(mi.UInt32, ordered, dr.compress(ordered != NOWHERE))
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracer:
+    """Rays from visible points.
+
+    Attributes:
+        surface: The points.
+        pixel: Which of the image's each of them is in.
+        lattice: Whether a pixel of the image is of those that stand for a plane; None if there are none.
+    """
+
+    emitters: Emitters
+    proxies: Proxies
+    surface: Surface
+    pixel: Any
+    view: View
+    seed: int
+    lattice: Any = None
+
+    def search(self, captured: Any) -> Tiles:
+        """What dynamic objects take of one ray of every captured point, by tiles. The points are those of all pixels.
+
+        Each of 2 x 2 blocks has points of its own, else what is too small for those of one block is missed in all.
+        What static objects take is only a share to divide by, which a quarter of the rays says well enough: the others
+        need to know of them where a dynamic object is in the way as well.
+        """
+        proxies, width = self.proxies, self.view.width
+        pixel, inside = block_order(self.view)
+        origin, normal, offset, instance = _packed_rays(self.surface, captured, pixel)
+        x, y = pixel % width, pixel // width
+        number = self._start(pixel) + parity(x // BLOCK, y // BLOCK) * STRIDE
+        active = inside & (offset > 0)
+        beam = self.emitters.sample(receiver(origin, normal), _sequence(number, ROBERTS), active)
+        ray, key = _shadow_ray(origin, beam, offset), pixel * RECURRENCE[0] + number
+        active &= dr.sum(beam.irradiance) > 0
+        taken, counts, share = mi.Bool(False), active, 1
+        for stopper in proxies.casting:
+            taken |= stopper.stop(ray, instance, key, active & ~taken)
+            if proxies.apart:
+                dr.eval(taken)
+        if proxies.static is not None:
+            one_of_four = ((x | y) & 1) == 0
+            stopped = proxies.static.stop(ray, instance, key, active & (taken | one_of_four))
+            taken &= ~stopped
+            counts, share = active & one_of_four & ~stopped, 4
+        arriving = dr.select(counts, beam.irradiance * share, 0)
+        lost = dr.select(taken, beam.irradiance, 0)
+        dr.eval(arriving, lost)
+        return Tiles.of(arriving, lost, self.view)
+
+    def trace(
+        self, places: Any, before: Estimate, rays: Any, most: int, turn: tuple[Any, Any], *, matt: bool = False
+    ) -> Estimate:
+        """What ``rays`` more rays, ``most`` at the most, add to an estimate at ``places``.
+
+        ``turn`` says which number of its pixel's sequence a place takes first, and how many come until its next one.
+        Where all points are ``matt``, what they would mirror is left out.
+        """
+        apart = self.proxies.apart
+        if apart and most > WORD:
+            for begin in range(0, most, WORD):
+                part = dr.minimum(dr.maximum(rays, begin) - begin, WORD)
+                before = self.trace(places, before, part, min(WORD, most - begin), turn, matt=matt)
+            return before
+        surface = gathered(self.surface, places)
+        pixel = dr.gather(mi.UInt32, self.pixel, places)
+        begin, step = turn
+        done = mi.UInt32(dr.gather(mi.Float, before.rays, places))
+        start, step = self._start(pixel) + (begin + done * step) * STRIDE, step * STRIDE
+        si = receiver(surface.position, surface.normal)
+        origin = _origin(surface)
+        lobe = Lobe.of(surface)
+        static, stoppers = self.proxies.static, self.proxies.stoppers
+        known: list[Any] = []
+
+        def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:
+            """Ray ``i`` of every point: where to, whether it counts, its number, and what is known to stop it."""
+            number = start + i * step
+            beam = self.emitters.sample(si, _sequence(number), surface.valid)
+            active = surface.valid & (dr.sum(beam.irradiance) > 0)
+            return beam, active, number, [(word >> i & 1) != 0 for word in known]
+
+        def stop(stopper: Stopper, beam: Beam, number: Any, active: Any) -> Any:
+            ray = _shadow_ray(origin, beam, surface.offset)
+            return stopper.stop(ray, surface.instance, pixel * RECURRENCE[0] + number, active)
+
+        def note(i: Any, word: Any) -> tuple[Any, Any]:
+            beam, free, number, stopped = send(i)
+            for each in stopped:
+                free = free & ~each
+            return i + 1, word | dr.select(stop(stoppers[len(known)], beam, number, free), mi.UInt32(1) << i, 0)
+
+        if apart:  # a bit for each ray and scene but the last, each by a kernel of its own
+            for _ in stoppers[1:]:
+                nothing = dr.zeros(mi.UInt32, dr.width(places))
+                _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < rays, note, label="stopped")
+                dr.eval(word)
+                known.append(word)
+
+        def body(i: Any, lit: Any, base: Any, shine: Any, glare: Any, squares: Any) -> tuple[Any, ...]:
+            beam, active, number, stopped = send(i)
+            static_light = free = active
+            for each, stopper in enumerate(stoppers):
+                free = free & ~(stopped[each] if each < len(stopped) else stop(stopper, beam, number, free))
+                if stopper is static:
+                    static_light = free
+            light, unshadowed = (dr.select(where, beam.irradiance, 0) for where in (free, static_light))
+            compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), unshadowed)
+            lit += light
+            base += compared
+            if not matt:
+                reflectance = lobe.reflectance(beam.direction)
+                shine += dr.sum(light) * reflectance
+                glare += dr.select(active, dr.sum(beam.irradiance) * reflectance, 0)
+            squares += dr.square(dr.sum(compared))
+            return i + 1, lit, base, shine, glare, squares
+
+        sums = [dr.gather(type(v), v, places) for v in before.sums]
+        state = dr.zeros(mi.UInt32, dr.width(places)), *sums
+        _, *sums = dr.while_loop(state, lambda i, *_: i < rays, body, label="light")
+        return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
+
+    def bounce(self, reflectors: Reflectors) -> tuple[Any, Any]:
+        """Irradiance (Color3f) from the surroundings over that of display white, and where it is known (Float).
+
+        It is that of relit points, by a few rays: their neighbours must be averaged. On meshes it is of one pixel in
+        each cell of 2 x 2, and a mean over many cells already: what is bright and small, as a wall is near a lamp, few
+        rays meet.
+        """
+        surface, view = self.surface, self.view
+        cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
+        x, y = self.pixel % view.width, self.pixel // view.width
+        column, row = x >> 1, y >> 1
+        chosen = ((x & 1) == (row & 1)) & ((y & 1) == ((column + row) & 1))  # as often in each row, and in each column
+        if self.lattice is not None:
+            chosen |= dr.gather(mi.Bool, self.lattice, self.pixel)
+        thing, count = surface.instance > 0, dr.width(self.pixel)
+        total, known = mi.Color3f(dr.zeros(mi.Float, count)), dr.zeros(mi.Float, count)
+        for on_mesh, which, rays in ((False, thing, BOUNCE_RAYS), (True, ~thing & chosen, MESH_RAYS)):
+            places = dr.compress(surface.relit & which)
+            if not dr.width(places):
+                continue
+            own = gathered(surface, places)
+            start = self._start(dr.gather(mi.UInt32, self.pixel, places))
+            origin, normal = mi.Point3f(_origin(own)), mi.Vector3f(own.normal)
+            dr.eval(own, start, origin, normal)
+            found = reflectors.irradiance(origin, normal, start, rays, _two_points)
+            if on_mesh:
+                cell = dr.gather(mi.UInt32, row * cells.width + column, places)
+                for stride in (1, RADIUS):
+                    found = LightFilter(own, cells, cell, stride=stride).average([*found])
+            dr.scatter(total, mi.Color3f(*found), places)
+            dr.scatter(known, mi.Float(1), places)
+            dr.eval(total, known)
+        return total, known
+
+    def _start(self, pixel: Any) -> Any:
+        start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
+        x, y = pixel % self.view.width, pixel // self.view.width
+        if self.lattice is not None:
+            # Neighbours lie two pixels apart there.
+            apart = dr.select(dr.gather(mi.Bool, self.lattice, pixel), mi.UInt32(1), 0)
+            x, y = x >> apart, y >> apart
+        return start + _bayer(x, y)
+
+
+def _origin(surface: Surface) -> Any:
+    """Where shadow rays start: on the smooth surface that the proxy stands for, and off the triangle itself."""
+    return surface.position + surface.lift + surface.face * surface.offset
+
+
+def _packed_rays(surface: Surface, chosen: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
+    """Origins of shadow rays, normals, offsets and instances at pixels in any order, of the points of all of them.
+
+    The offset is 0 where no point is ``chosen``. Together in memory, because fetching them takes half of the time.
+    """
+    offset = dr.select(chosen, surface.offset, 0)
+    rows = packed([*_origin(surface), *surface.normal, offset, surface.instance])
+    row = dr.gather(mi.ArrayXf, rows, pixel, shape=(8, dr.width(pixel)))
+    return mi.Point3f(*row[:3]), mi.Vector3f(*row[3:6]), row[6], row[7]
+
+
+def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
+    ray = mi.Ray3f(origin, beam.direction)
+    ray.maxt = dr.maximum(beam.reach - 2 * offset, 0)
+    return ray
+
+
+def _sequence(i: Any, recurrence: tuple[int, int] = RECURRENCE) -> Any:
+    """Point ``i`` of a low-discrepancy sequence, to 24 bits however large ``i`` is."""
+    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
+
+
+def _two_points(i: Any) -> tuple[Any, Any]:
+    return _sequence(i), _sequence(i, ROBERTS)
+
+
+def _bayer(x: Any, y: Any) -> Any:
+    """Rank of a pixel in an 8x8 ordered-dither matrix: neighbours take far-apart points of the sequence."""
+    result = mi.UInt32(0)
+    for bit in range(3):
+        a, b = (x >> bit) & 1, (y >> bit) & 1
+        result |= ((a ^ b) << (5 - 2 * bit)) | (b << (4 - 2 * bit))
+    return result

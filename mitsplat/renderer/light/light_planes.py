@@ -1,0 +1,179 @@
+"""Tiles of an image that show a plane in even light: one of four of their pixels stands for all.
+
+Light on a plane changes slowly but where a shadow begins. A tile of BLOCK x BLOCK pixels is coarse where it and those
+beside it are parts of planes, and its light is theirs, as far as the first rays from every second pixel of every second
+row tell. It is then traced and filtered at these pixels alone, and is linear between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.renderer.light.light_filter import Estimate
+from mitsplat.renderer.light.light_tiles import BLOCK
+from mitsplat.renderer.light.lit_surface import Surface
+from mitsplat.renderer.rays.camera_rays import View
+
+SAMPLES = (BLOCK // 2) ** 2
+"""Pixels that stand for a coarse tile."""
+
+LEAST_ROWS = 128
+"""Rows of an image from which on planes are looked for. Lower ones, as bands of a rolling shutter are, gain little, and
+what lies beyond a band's rows would decide which of its tiles are coarse."""
+
+LEAST_STEP = 0.04
+"""Difference between the shares of light that arrive at tiles side by side up to which light is even."""
+
+NOISE = 1.0
+"""Squared standard deviations of that difference, were rays drawn one by one, which are not taken for a shadow. Those
+of a tile are spread more evenly, so that it has less noise."""
+
+_PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1)
+"""Odd numbers that mix the digits of what they are multiplied with (those of xxHash)."""
+
+_NEEDED, _PLAIN = 0x80000000, 0x40000000
+
+
+def plane_codes(surface: Surface, eye: Any) -> Any:
+    """A number for the plane and the material at every pixel, 0 where light may not be even: on objects, or shiny.
+
+    Normals and the camera's distance to the plane are rounded, off the values that drawn planes have.
+    """
+    normal = surface.normal
+    away = dr.abs(dr.dot(normal, surface.position - eye))
+    parts = [mi.UInt32(mi.Int32(dr.floor(dr.fma(component, 200, 0.37)))) for component in normal]
+    parts += [dr.reinterpret_array(mi.UInt32, away) >> 12, mi.UInt32(surface.trait) * 2]
+    parts[-1] += dr.select(surface.relit, mi.UInt32(1), 0)
+    code = mi.UInt32(0)
+    for part, prime in zip(parts, _PRIMES, strict=True):
+        code = (code ^ part) * prime
+        code ^= code >> 15
+    plain = surface.valid & surface.known & surface.relit & (surface.instance == 0) & (surface.specular == 0)
+    return dr.select(plain, code & (_PLAIN - 1) | _PLAIN, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Tiles that show a plane.
+
+    Attributes:
+        number: Theirs, row by row of all tiles.
+        place: Of every tile among them; ``count`` where light is not needed, and ``count + 1`` where it is no plane.
+        view: Camera.
+    """
+
+    number: Any
+    place: Any
+    view: View
+
+    @classmethod
+    def of(cls, codes: Any, needed: Any, view: View) -> Planes:
+        """The tiles of which light is needed and all pixels have one code, as those right of it and below have."""
+        across, down = -(-view.width // BLOCK), -(-view.height // BLOCK)
+        tile = dr.arange(mi.UInt32, across * down)
+        x, y = tile % across * BLOCK, tile // across * BLOCK
+        codes = dr.select(needed, codes | _NEEDED, codes)
+        first = dr.gather(mi.UInt32, codes, y * view.width + x)
+        rounds, side = dr.opaque(mi.UInt32, (BLOCK + 1) ** 2), BLOCK + 1
+        whole = (x + BLOCK <= view.width) & (y + BLOCK <= view.height)
+
+        def look(i: Any, same: Any, wanted: Any) -> tuple[Any, Any, Any]:
+            px, py = x + i % side, y + i // side
+            inside = (px < view.width) & (py < view.height)
+            code = dr.gather(mi.UInt32, codes, py * view.width + px, inside)
+            within = (i % side < BLOCK) & (i // side < BLOCK)
+            # Beyond the tile, only what is there counts, not whether light is needed.
+            alike = dr.select(within, code, code | _NEEDED) == (first | dr.select(within, mi.UInt32(0), _NEEDED))
+            return i + 1, same & (alike | ~inside), wanted | (inside & within & (code >= _NEEDED))
+
+        state = dr.zeros(mi.UInt32, dr.width(tile)), whole & (first > _NEEDED), dr.full(mi.Bool, False, dr.width(tile))
+        # Neither can change any more where there is no plane but some need.
+        _, flat, wanted = dr.while_loop(state, lambda i, s, w: (i < rounds) & (s | ~w), look, label="planes")
+        dr.eval(flat, wanted)
+        number = dr.compress(flat)
+        count = dr.width(number)
+        place = dr.select(wanted, dr.opaque(mi.UInt32, count + 1), dr.opaque(mi.UInt32, count))
+        if count:
+            dr.scatter(place, dr.arange(mi.UInt32, count), number)
+        dr.eval(place)
+        return cls(number, place, view)
+
+    @property
+    def count(self) -> int:
+        """How many they are."""
+        return int(dr.width(self.number))
+
+    def samples(self) -> Any:
+        """Pixels that stand for them, those of one place in all tiles side by side."""
+        i, count, across = dr.arange(mi.UInt32, SAMPLES * self.count), dr.opaque(mi.UInt32, self.count), self._across
+        within = i // count
+        tile = dr.gather(mi.UInt32, self.number, i - within * count)
+        x, y = tile % across * BLOCK + within % (BLOCK // 2) * 2, tile // across * BLOCK + within // (BLOCK // 2) * 2
+        return y * self.view.width + x
+
+    def coarse(self, estimate: Estimate) -> Any:
+        """Whether pixels are of coarse tiles, by what rays from the :meth:`samples` say of them."""
+        count = dr.opaque(mi.UInt32, self.count)
+        lane, rounds = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, SAMPLES)
+
+        def add(i: Any, *sums: Any) -> tuple[Any, ...]:
+            at = lane + i * count
+            more = [dr.sum(dr.gather(mi.Color3f, colour, at)) for colour in (estimate.lit, estimate.base)]
+            more.append(dr.gather(mi.Float, estimate.squares, at))
+            return i + 1, *(s + m for s, m in zip(sums, more, strict=True))
+
+        state = dr.zeros(mi.UInt32, self.count), *(dr.zeros(mi.Float, self.count) for _ in range(3))
+        _, lit, base, squares = dr.while_loop(state, lambda i, *_: i < rounds, add, label="planes' light")
+        draws = dr.maximum(dr.square(base) / dr.maximum(squares, 1e-20), 1)
+        share = dr.select(base > 0, lit / base, 1)
+        likely = (share * draws + 0.5) / (draws + 1)
+        variance = likely * (1 - likely) / draws
+        dr.eval(share, variance)
+        even = mi.Bool(True)
+        for beside in self._beside():
+            plane = beside < count
+            theirs = dr.gather(mi.Float, share, beside, plane), dr.gather(mi.Float, variance, beside, plane)
+            # Where light is not needed, next to all of it arrives.
+            other, noise = (dr.select(plane, v, rest) for v, rest in zip(theirs, (mi.Float(1), 0), strict=True))
+            allowed = dr.fma(NOISE, variance + noise, LEAST_STEP**2)
+            even &= (beside <= count) & (dr.square(share - other) <= allowed)
+        by_tile = dr.full(mi.Bool, False, dr.width(self.place))
+        dr.scatter(by_tile, even, self.number)
+        dr.eval(by_tile)
+        pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
+        tile = pixel // self.view.width // BLOCK * self._across + pixel % self.view.width // BLOCK
+        return dr.gather(mi.Bool, by_tile, tile)
+
+    def _beside(self) -> Iterator[Any]:
+        """Places of the tiles beside each, all eight; outside of the image, its own."""
+        x, y = mi.Int32(self.number % self._across), mi.Int32(self.number // self._across)
+        down = -(-self.view.height // BLOCK)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                nx, ny = dr.clip(x + dx, 0, self._across - 1), dr.clip(y + dy, 0, down - 1)
+                yield dr.gather(mi.UInt32, self.place, mi.UInt32(ny * self._across + nx))
+
+    @property
+    def _across(self) -> int:
+        return -(-self.view.width // BLOCK)
+
+
+def between_samples(light: Any, coarse: Any, view: View) -> Any:
+    """Light (Color3f), in coarse tiles linear between their samples."""
+    pixel = dr.arange(mi.UInt32, view.width * view.height)
+    x, y = pixel % view.width, pixel // view.width
+    odd_x, odd_y = x & 1, y & 1
+    left, top = x - odd_x, y - odd_y
+    right, bottom = x + odd_x, y + odd_y
+    right, bottom = dr.select(right < view.width, right, left), dr.select(bottom < view.height, bottom, top)
+    between = coarse & ((odd_x | odd_y) != 0)
+    total = mi.Color3f(0)
+    for ny in (top, bottom):
+        for nx in (left, right):
+            total += dr.gather(mi.Color3f, light, ny * view.width + nx, between)
+    return dr.select(between, total * 0.25, light)

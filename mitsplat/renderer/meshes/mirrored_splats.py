@@ -1,0 +1,123 @@
+"""What rays that leave a visible mesh see of the splats: the colour of the first solid that they meet.
+
+The solids are those of :mod:`mitsplat.renderer.occluders.splat_occlusion`, by which a Gaussian stops a ray with the
+chance of its opacity there. The colour of the first one is then, in the mean, what blending front to back would give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.renderer.occluders.splat_occlusion import SETS, Caster, Solids
+from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.splatting.gaussian import evaluate_sh, rotation_axes
+from mitsplat.renderer.splatting.projection import CloudSet, Placement
+from mitsplat.renderer.splatting.splat_appearance import ROW, changed, rows_of
+
+MOST_SOLIDS = 1_000_000
+"""Of all sets together, roughly; large scenes have fewer sets, but never less than two."""
+
+_ROW = 16
+"""Floats per placement: rotation into the splats' frame (9), first Gaussian, whether relit, footprint [m], padding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpse:
+    """What rays see of splats.
+
+    Attributes:
+        distance: Along the ray [m], infinite where it meets none.
+        colour: Display-encoded captured colour (three arrays).
+        normal: Of the Gaussian's flattest side, towards the ray's origin.
+        relit: Whether the colour was captured under uniform light.
+        footprint: How far off the surface its own splats shadow nothing [m].
+    """
+
+    distance: Any
+    colour: list[Any]
+    normal: Any
+    relit: Any
+    footprint: Any
+
+
+@dataclass(frozen=True, eq=False)
+class SplatMirror:
+    """Splats of a scene as rays from anywhere see them.
+
+    Attributes:
+        solids: What they are to a ray.
+        clouds: Their colours.
+        gaussians: Placement and number in its cloud of each triangle's Gaussian, two per triangle.
+        table: ``_ROW`` floats per placement.
+        appearances: Floats per placement, see :mod:`mitsplat.renderer.splatting.splat_appearance`; None if there are
+        none.
+    """
+
+    solids: Solids
+    clouds: CloudSet
+    gaussians: Any
+    table: Any
+    appearances: Any | None = None
+
+    @classmethod
+    def build(
+        cls, clouds: CloudSet | None, placements: Sequence[Placement], splats: Sequence[Any], relit: Sequence[bool]
+    ) -> SplatMirror | None:
+        """The placements' splats, of which those are ``relit`` that were captured under uniform light."""
+        total = sum(len(splats[p.cloud]) for p in placements)
+        if clouds is None or not total:
+            return None
+        casters = [Caster(splats[p.cloud], p.instance, p.world_from_cloud) for p in placements]
+        solids = Solids.build(casters, int(np.clip(MOST_SOLIDS // total, 2, SETS)))
+        if solids is None:
+            return None
+        rows = np.zeros((len(placements), _ROW), np.float32)
+        firsts = np.array([clouds.first[p.cloud] for p in placements], np.uint32)
+        for row, placement, anew, footprint in zip(rows, placements, relit, solids.footprints, strict=True):
+            turn = placement.world_from_cloud[:3, :3]
+            row[:9] = (turn / np.cbrt(np.linalg.det(turn))).T.ravel()
+            row[9], row[10] = anew, footprint
+        caster, gaussian = solids.owners
+        owners = np.stack([caster, firsts[caster] + gaussian], axis=1)
+        appearances = None
+        if any(p.appearance is not None for p in placements):
+            appearances = wrapped(
+                mi.Float, np.pad(rows_of([p.appearance for p in placements]), ((0, 0), (0, _ROW - ROW)))
+            )
+        return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
+
+    def look(self, ray: Any, key: Any, active: Any) -> Glimpse:
+        """What rays see, each by the set of solids that its ``key`` decides."""
+        inside, start, met = self.solids.enter(ray, key, mi.Float(0))
+        hit = self.solids.scene.ray_intersect_preliminary(inside, active=active & met)
+        found = active & met & hit.is_valid()
+        owner = dr.gather(mi.Point2u, self.gaussians, hit.prim_index, found)
+        row = dr.gather(mi.ArrayXf, self.table, owner.x, found, shape=(_ROW, dr.width(owner)))
+        axes_of = [mi.Vector3f(*[row[3 * i + j] for j in range(3)]) for i in range(3)]
+        own = mi.Vector3f(*[dr.dot(axis, ray.d) for axis in axes_of])
+        stride = self.clouds.sh_stride
+        packet = dr.gather(mi.ArrayXf, self.clouds.sh, owner.y, found, shape=(stride, dr.width(owner)))
+        colour = evaluate_sh(own, lambda k: [packet[3 * k + i] for i in range(3)], self.clouds.sh_count)
+        geometry = dr.gather(mi.ArrayXf, self.clouds.geometry, owner.y, found, shape=(8, dr.width(owner)))
+        if self.appearances is not None:
+            looks = dr.gather(mi.ArrayXf, self.appearances, owner.x, found, shape=(_ROW, dr.width(owner)))
+            centre = mi.Vector3f(*[geometry[i] for i in range(3)])
+            colour = changed(colour, [looks[i] for i in range(ROW)], centre)
+        sigma = dr.gather(mi.Vector4f, self.clouds.scales, owner.y, found)
+        axes = rotation_axes([geometry[4 + i] for i in range(4)])
+        thin_x, thin_y = (sigma.x < sigma.y) & (sigma.x < sigma.z), sigma.y < sigma.z
+        side = dr.select(thin_x, axes[0], dr.select(thin_y, axes[1], axes[2]))
+        side = dr.select(dr.dot(side, own) > 0, -side, side)
+        return Glimpse(
+            distance=dr.select(found, start + hit.t, dr.inf),
+            colour=colour,
+            normal=axes_of[0] * side.x + axes_of[1] * side.y + axes_of[2] * side.z,
+            relit=found & (row[9] > 0),
+            footprint=row[10],
+        )

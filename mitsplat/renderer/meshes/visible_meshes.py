@@ -1,0 +1,451 @@
+"""Visible meshes: where a camera sees them, and the light that their materials send to it.
+
+Plainly diffuse ones are lit as splats are, see :mod:`mitsplat.renderer.light.light`. What else Mitsuba has of materials
+is path traced (Kajiya 1986): at every vertex one emitter is sampled and one direction of the material, weighted by the
+power heuristic (Veach 1997, section 9.2.4), as in Mitsuba's integrator ``path``, whose pictures of meshes alone these
+equal. A path ends where it meets a splat, whose captured colour holds all further bounces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import or_
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.renderer.light.emitter_sampling import receiver
+from mitsplat.renderer.meshes.mirrored_splats import Glimpse, SplatMirror
+from mitsplat.renderer.occluders.proxies import Hit, Proxies
+from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.device_arrays import gathered, ray_scene, wrapped
+from mitsplat.renderer.splatting.gaussian import srgb_to_linear
+
+LANES = 1 << 20
+"""Paths that are traced at once."""
+
+R7 = (3915259345, 3569120481, 3253582939, 2965941329, 2703729436, 2464699080, 2246800835)
+"""Additive recurrence of seven dimensions in units of 2^-32 (Roberts 2018): powers of 1/g with g^8 = g + 1."""
+
+PER_VERTEX = 16
+"""Random numbers that are kept for every vertex of a path."""
+
+ROUNDS = 8
+"""Of the hash behind them (Zafar et al. 2010): after four, numbers of neighbouring pixels are still alike."""
+
+FOOTPRINT = 4
+"""Points along each side of a pixel's footprint that the reflectance of patterned meshes is looked at."""
+
+_BENT = ("NormalMap", "BumpMap")
+"""Materials that bend the normals of the one that they hold."""
+
+
+def _has(flags: Any, *names: str) -> Any:
+    return (flags & reduce(or_, (int(getattr(mi.BSDFFlags, name)) for name in names))) != 0
+
+
+def is_plain(bsdf: Any) -> bool:
+    """Whether a material is diffuse and no more."""
+    flags, diffuse = int(bsdf.flags()), int(mi.BSDFFlags.DiffuseReflection)
+    return (flags & int(mi.BSDFFlags.All)) == diffuse and not any(name in str(bsdf) for name in _BENT)
+
+
+def is_clear(bsdf: Any) -> bool:
+    """Whether light passes through a material, so that it casts no shadow on splats and diffuse meshes."""
+    return bool(_has(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(bsdf)
+
+
+def has_texture(bsdf: Any) -> bool:
+    """Whether a material changes with texture coordinates; Mitsuba's flag for that is not set for textures."""
+    return any(key.endswith(".to_uv") for key in mi.traverse(bsdf).keys())  # noqa: SIM118 - no mapping
+
+
+@dataclass(frozen=True, eq=False)
+class Behind:
+    """Visible meshes as a camera sees them.
+
+    Attributes:
+        depth: Along z [m], infinite where there is none.
+        reflectance: Diffuse albedo (Color3f) of plain ones.
+        valid: Whether there is one.
+        plain: Whether it is plainly diffuse.
+        normal, face: Unit normals of the surface and of its triangle, towards the camera.
+        hit: Where it is met.
+    """
+
+    depth: Any
+    reflectance: Any
+    valid: Any
+    plain: Any
+    normal: Any
+    face: Any
+    hit: Any
+
+    def before(self, other: Hit) -> Hit:
+        """The nearer of the meshes and what else the same rays meet."""
+        closer = self.valid & (self.hit.t < other.distance)
+        return Hit(
+            dr.select(closer, self.hit.t, other.distance),
+            dr.select(closer, self.face, other.face),
+            dr.select(closer, self.normal, other.normal),
+            dr.select(closer, 0, other.lift),
+            dr.select(closer, 0, other.instance),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleMeshes:
+    """The meshes of a scene that are neither splats nor lights.
+
+    Attributes:
+        scene: A Mitsuba scene of them alone.
+        plain: By number of the shape, whether it is plainly diffuse; None if all are.
+        patterned: Whether the reflectance of any of them changes over its surface.
+    """
+
+    scene: Any
+    plain: Any
+    patterned: bool
+
+    @classmethod
+    def build(cls, shapes: Sequence[Any]) -> VisibleMeshes | None:
+        """The visible ones of ``shapes``; None if there are none."""
+        if not shapes:
+            return None
+        scene = ray_scene({f"visible_{i}": shape for i, shape in enumerate(shapes)})
+        plain = [is_plain(shape.bsdf()) for shape in shapes]
+        patterned = any(map(has_texture, (shape.bsdf() for shape in shapes)))
+        if all(plain):
+            return cls(scene, None, patterned)
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        table = np.zeros(1 + max(numbers), bool)
+        table[numbers] = plain
+        return cls(scene, wrapped(mi.Bool, table), patterned)
+
+    def is_plain(self, hit: Any) -> Any:
+        """Whether what is hit is plainly diffuse; false where nothing is."""
+        if self.plain is None:
+            return hit.is_valid()
+        return dr.gather(mi.Bool, self.plain, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
+
+    def trace(self, view: View, rays: Any, at: tuple[Any, Any] | None = None) -> Behind:
+        """What camera rays meet: those through positions ``at`` [px], or through the centres of all pixels."""
+        hit = self.scene.ray_intersect_preliminary(rays, coherent=True)
+        si = hit.compute_surface_interaction(rays)
+        valid = si.is_valid()
+        plain = self.is_plain(hit)
+        reflectance = self._reflectance(view, rays, at, si, valid & plain)
+        depth = dr.select(valid, si.t * view.cosine(rays), dr.inf)
+        normal, face = (dr.select(dr.dot(n, rays.d) > 0, -n, n) for n in (si.sh_frame.n, si.n))
+        behind = Behind(depth, reflectance, valid, plain, normal, face, hit)
+        dr.eval(behind)
+        return behind
+
+    def _reflectance(self, view: View, rays: Any, at: tuple[Any, Any] | None, si: Any, active: Any) -> Any:
+        """Diffuse albedo (Color3f) where rays meet meshes; of patterns, its mean over the pixel's footprint.
+
+        The footprint is the parallelogram of ray differentials (Igehy 1999), sampled at ``FOOTPRINT`` squared points.
+        """
+        if not self.patterned:
+            return si.bsdf().eval_diffuse_reflectance(si, active)
+        x, y = at or view.centres()
+        wide = mi.RayDifferential3f(rays)
+        wide.o_x, wide.o_y, wide.has_differentials = rays.o, rays.o, True
+        wide.d_x, wide.d_y = view.direction(x + 1, y), view.direction(x, y + 1)
+        si.compute_uv_partials(wide)
+        bsdf, uv, total = si.bsdf(), mi.Point2f(si.uv), mi.Color3f(0)
+        across, along = (dr.select(dr.isfinite(step), step, 0) for step in (si.duv_dx, si.duv_dy))
+        for i in range(FOOTPRINT**2):
+            s, t = ((number + 0.5) / FOOTPRINT - 0.5 for number in divmod(i, FOOTPRINT))
+            si.uv = uv + s * across + t * along
+            total += bsdf.eval_diffuse_reflectance(si, active)
+        si.uv = uv
+        return total / FOOTPRINT**2
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLights:
+    """Emitters as a camera sees them.
+
+    Attributes:
+        depth: Along z [m] of those that are shapes, infinite where there is none.
+        radiance: Theirs, or else that of the sky (Color3f).
+        everywhere: Whether there is a sky.
+    """
+
+    depth: Any
+    radiance: Any
+    everywhere: bool
+
+    @classmethod
+    def trace(cls, scene: Any, view: View, rays: Any) -> SeenLights | None:
+        """What the camera's rays see of a scene's emitters; None if it has none that can be seen."""
+        sky = scene.environment()
+        if any(shape.is_emitter() for shape in scene.shapes()):
+            si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
+        elif sky is not None:
+            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(rays))
+            si.t, si.wi = dr.full(mi.Float, dr.inf, dr.width(rays)), -rays.d
+        else:
+            return None
+        emitter = si.emitter(scene)
+        shines = emitter != None  # noqa: E711 - of every element
+        depth = dr.select(shines & si.is_valid(), si.t * view.cosine(rays), dr.inf)
+        # A mesh that hides the sky is told by its depth.
+        lights = cls(depth, dr.select(shines, emitter.eval(si, shines), 0), sky is not None)
+        dr.eval(lights)
+        return lights
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """Paths at a vertex.
+
+    Attributes:
+        lane: Number of the path.
+        ray, hit: The ray that has come here, and what it has met.
+        throughput: Radiance that reaches the camera per radiance that leaves here (Color3f).
+    """
+
+    lane: Any
+    ray: Any
+    hit: Any
+    throughput: Any
+
+
+@dataclass(frozen=True, eq=False)
+class PathTracer:
+    """Light that visible meshes send along camera rays.
+
+    Attributes:
+        meshes: What camera rays meet.
+        scene: The whole scene, with its emitters.
+        proxies: What else stands in the light.
+        mirror: Splats that paths may meet, or None.
+        exposure: What radiance is multiplied by in the picture (Color3f).
+        white: Irradiance (Color3f) under which uniformly captured colours are shown unchanged.
+        max_depth: Longest paths, counted as by Mitsuba: 2 is direct light.
+        bounce: Whether splats light diffuse surfaces; mirrors show them in any case.
+        seed: Of all random numbers.
+    """
+
+    meshes: VisibleMeshes
+    scene: Any
+    proxies: Proxies
+    mirror: SplatMirror | None
+    exposure: Any
+    white: Any
+    max_depth: int
+    bounce: bool
+    seed: int
+
+    def radiance(self, view: View, ray: Any, hit: Any, pixel: Any, samples: int) -> Any:
+        """Mean (Color3f) over ``samples`` paths from each of some pixels, in the picture's scale.
+
+        ``ray`` through the pixel's centre meets a mesh at ``hit``. Other rays of the pixel start paths where they do.
+        """
+        count = dr.width(pixel)
+        # Far apart, so that no two pictures share random numbers.
+        seed = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
+        most = max(1, min(samples, LANES // count))
+        total, done = mi.Color3f(dr.zeros(mi.Float, count)), 0
+        while done < samples:
+            own = min(most, samples - done)
+            lane = dr.arange(mi.UInt32, count * own)
+            row = lane // dr.opaque(mi.UInt32, own)
+            number = lane - row * own + dr.opaque(mi.UInt32, done)
+            dice = _Dice(dr.gather(mi.UInt32, pixel, row), number, seed)
+            centre = dr.gather(mi.Ray3f, ray, row), dr.gather(mi.PreliminaryIntersection3f, hit, row)
+            dr.eval(lane, dice, centre)
+            path = _Path(lane, *self._beside(view, dice, *centre), dr.full(mi.Color3f, 1, count * own))
+            dr.eval(path)
+            light = self._trace(path, dice)
+            total += mi.Color3f(*[dr.block_sum(channel, own) for channel in light])
+            dr.eval(total)
+            done += own
+        return total / samples
+
+    def _beside(self, view: View, dice: _Dice, ray: Any, hit: Any) -> tuple[Any, Any]:
+        """Rays through random points of the pixels and what they meet; through the centres where that is plain."""
+        row = dice.pixel // view.width
+        other = mi.Ray3f(ray)
+        x, y = mi.Float(dice.pixel - row * view.width), mi.Float(row)
+        other.d = view.direction(x + dice.number_of(0, 5), y + dice.number_of(0, 6))
+        beside = self.meshes.scene.ray_intersect_preliminary(other, coherent=True)
+        usable = beside.is_valid() & ~self.meshes.is_plain(beside)
+        return dr.select(usable, other, ray), dr.select(usable, beside, hit)
+
+    def _trace(self, path: _Path, dice: _Dice) -> Any:
+        """Radiance (Color3f) of every path."""
+        result = mi.Color3f(dr.zeros(mi.Float, dr.width(path.lane)))
+        lights = bool(self.scene.emitters())
+        for depth in range(self.max_depth - 1):
+            own = gathered(dice, path.lane)
+            si = self._interaction(path)
+            bsdf, context = si.bsdf(path.ray), mi.BSDFContext()
+            u = [own.number_of(depth, i) for i in range(5)]
+            if lights:
+                self._add_direct(result, path, si, bsdf, context, mi.Point2f(u[0], u[1]), own.key(depth))
+            sample, weight = bsdf.sample(context, si, u[2], mi.Point2f(u[3], u[4]))
+            throughput = path.throughput * weight
+            ray = si.spawn_ray(si.to_world(sample.wo))
+            delta = _has(sample.sampled_type, "Delta")
+            smooth = _has(sample.sampled_type, "Diffuse")
+            at, density = mi.Point3f(si.p), mi.Float(sample.pdf)
+            dr.eval(throughput, ray, delta, smooth, at, density)
+            alive = dr.compress(dr.max(throughput) > 0)
+            if not dr.width(alive):
+                break
+            lane = dr.gather(mi.UInt32, path.lane, alive)
+            throughput = dr.gather(mi.Color3f, throughput, alive)
+            ray = dr.gather(mi.Ray3f, ray, alive)
+            dr.eval(lane, throughput, ray)
+            hit = self.scene.ray_intersect_preliminary(ray)
+            dr.eval(hit)
+            path = _Path(lane, ray, hit, throughput)
+            going = hit.is_valid()
+            glimpse = self._look(path, dr.gather(mi.Bool, smooth, alive), dice, depth, result)
+            if glimpse is not None:
+                going &= glimpse.distance >= hit.t
+            if lights:
+                reference = dr.zeros(mi.Interaction3f, dr.width(lane))
+                reference.p = dr.gather(mi.Point3f, at, alive)
+                seen = mi.Bool(True) if glimpse is None else ~(glimpse.distance < hit.t)
+                chance = dr.gather(mi.Float, density, alive)
+                self._add_emission(result, path, reference, chance, dr.gather(mi.Bool, delta, alive), seen)
+            going = dr.compress(going)
+            if not dr.width(going):
+                break
+            path = _Path(
+                dr.gather(mi.UInt32, lane, going),
+                dr.gather(mi.Ray3f, ray, going),
+                dr.gather(mi.PreliminaryIntersection3f, hit, going),
+                dr.gather(mi.Color3f, throughput, going),
+            )
+            dr.eval(path)
+        return result
+
+    @staticmethod
+    def _interaction(path: _Path) -> Any:
+        """The surface where paths are, turned towards them if its material has one side and lets no light through."""
+        si = path.hit.compute_surface_interaction(path.ray, mi.RayFlags.All)
+        flags = si.bsdf().flags()
+        behind = (si.wi.z < 0) & ~_has(flags, "BackSide", "Transmission")
+        frame = si.sh_frame
+        si.sh_frame = mi.Frame3f(
+            dr.select(behind, -frame.s, frame.s), frame.t, mi.Normal3f(dr.select(behind, -frame.n, frame.n))
+        )
+        si.n = dr.select(behind, -si.n, si.n)
+        si.wi = si.to_local(-path.ray.d)
+        return si
+
+    def _add_direct(self, result: Any, path: _Path, si: Any, bsdf: Any, context: Any, point: Any, key: Any) -> None:
+        """Add light that arrives from one emitter."""
+        rough = _has(bsdf.flags(), "Smooth")
+        towards, light = self.scene.sample_emitter_direction(si, point, False, rough)
+        out = si.to_local(towards.d)
+        value, density = bsdf.eval_pdf(context, si, out, rough & (towards.pdf > 0))
+        weight = dr.select(towards.delta, 1, _power(towards.pdf, density))
+        arrives = path.throughput * value * light * self.exposure * weight
+        arrives = dr.select(rough & (towards.pdf > 0), arrives, 0)
+        ray = si.spawn_ray_to(si.p + towards.d * towards.dist)
+        infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
+        ray.maxt = dr.select(infinite, dr.inf, ray.maxt)
+        self._add_lit(result, path.lane, ray, arrives, key)
+
+    def _add_lit(self, result: Any, lane: Any, ray: Any, light: Any, key: Any) -> None:
+        """Add light to paths where nothing stands in the way of rays; a kernel for every scene that is traced."""
+        dr.eval(ray, light, key)
+        free = dr.max(light) > 0
+        free &= ~self.scene.ray_test(ray, active=free)
+        for stopper in self.proxies.stoppers:
+            dr.eval(free)
+            free = free & ~stopper.stop(ray, mi.UInt32(0), key, free)
+        _add(result, lane, dr.select(free, light, 0))
+
+    def _look(self, path: _Path, smooth: Any, dice: _Dice, depth: int, result: Any) -> Glimpse | None:
+        """Add what paths see of splats."""
+        if self.mirror is None:
+            return None
+        own = gathered(dice, path.lane)
+        key = own.key(depth)
+        glimpse = self.mirror.look(path.ray, key, True)
+        colour = mi.Color3f(*[srgb_to_linear(c) for c in glimpse.colour])
+        nearer = glimpse.distance < path.hit.t
+        if not self.bounce:
+            colour = dr.select(smooth, 0, colour)
+        colour = dr.select(nearer, colour * path.throughput, 0)
+        dr.eval(glimpse, colour, key, nearer)
+        _add(result, path.lane, dr.select(glimpse.relit, 0, colour))
+        anew = dr.compress(nearer & glimpse.relit)
+        if dr.width(anew) and self.scene.emitters():
+            ray, normal = dr.gather(mi.Ray3f, path.ray, anew), dr.gather(mi.Vector3f, glimpse.normal, anew)
+            place = ray(dr.gather(mi.Float, glimpse.distance, anew))
+            si = receiver(place, normal)
+            dice_here = gathered(own, anew)
+            point = mi.Point2f(dice_here.number_of(depth, 7), dice_here.number_of(depth, 8))
+            towards, light = self.scene.sample_emitter_direction(si, point, False)
+            cosine = dr.maximum(dr.dot(normal, towards.d), 0)
+            lit = dr.gather(mi.Color3f, colour, anew) * light * cosine / self.white
+            infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
+            off = dr.gather(mi.Float, glimpse.footprint, anew)
+            shadow = mi.Ray3f(place + normal * off, towards.d)
+            shadow.maxt = dr.select(infinite, dr.inf, dr.maximum(towards.dist * (1 - 1e-3) - off, 0))
+            lane = dr.gather(mi.UInt32, path.lane, anew)
+            self._add_lit(result, lane, shadow, lit, dr.gather(mi.UInt32, key, anew))
+        return glimpse
+
+    def _add_emission(self, result: Any, path: _Path, reference: Any, density: Any, delta: Any, active: Any) -> None:
+        """Add light of emitters that paths have met."""
+        si = path.hit.compute_surface_interaction(path.ray, mi.RayFlags.All)
+        emitter = si.emitter(self.scene)
+        towards = mi.DirectionSample3f(self.scene, si, reference)
+        chance = self.scene.pdf_emitter_direction(reference, towards, active & ~delta)
+        weight = dr.select(delta, 1, _power(density, chance))
+        light = path.throughput * emitter.eval(si, active) * self.exposure * weight
+        _add(result, path.lane, dr.select(active & (emitter != None), light, 0))  # noqa: E711 - of every element
+
+
+@dataclass(frozen=True, eq=False)
+class _Dice:
+    """Random numbers of paths: the first vertices of a pixel's paths share a low-discrepancy sequence."""
+
+    pixel: Any
+    number: Any
+    seed: Any
+
+    def key(self, depth: int) -> Any:
+        """Something different for every path and vertex."""
+        return self.pixel * 0x9E3779B1 + self.number * PER_VERTEX * 64 + self._dimension(depth, 9) + self.seed
+
+    def number_of(self, depth: int, dimension: int) -> Any:
+        """A number in [0, 1)."""
+        if depth == 0 and dimension < len(R7):
+            shift = mi.sample_tea_32(self.pixel, self.seed + self._dimension(0, dimension), ROUNDS)[0]
+            return mi.Float((shift + self.number * R7[dimension]) >> 8) * 2.0**-24
+        own = mi.sample_tea_32(self.pixel, self.number + self.seed, ROUNDS)[0]
+        return mi.sample_tea_float32(own, self._dimension(depth, dimension), ROUNDS)
+
+    @staticmethod
+    def _dimension(depth: int, dimension: int) -> Any:
+        return dr.opaque(mi.UInt32, depth * PER_VERTEX + dimension)
+
+
+def _has_emitter_flag(emitter: Any, flag: Any) -> Any:
+    return (emitter.flags() & int(flag)) != 0
+
+
+def _power(own: Any, other: Any) -> Any:
+    return dr.select(own > 0, dr.rcp(1 + dr.square(other / own)), 0)
+
+
+def _add(total: Any, lane: Any, light: Any) -> None:
+    """Add ``light`` to the paths ``lane``, no two of which are the same."""
+    light = dr.gather(mi.Color3f, total, lane) + light
+    dr.eval(light)
+    dr.scatter(total, light, lane)
+    dr.eval(total)

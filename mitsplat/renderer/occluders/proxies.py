@@ -1,0 +1,223 @@
+"""Proxy surfaces that rays are traced against: what stands in the light, and where light arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
+from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
+from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
+
+NOISE_CREASE = 10.0
+"""Dihedral angle of a crease over the lower quartile of a mesh, which is zero where it was drawn: flat faces have edges
+inside; and from 2 to 8 degrees where a smooth surface was reconstructed."""
+
+SHARPEST = np.radians(80.0)
+"""Dihedral angle that is a crease in any mesh [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """A proxy surface.
+
+    Attributes:
+        mesh: Surface in its own frame [m].
+        instance: Instance id, 0 for the environment.
+        dynamic: Whether its shadow is missing in what was captured.
+        world_from_mesh: Where it is: a similarity transform, shape (4, 4).
+    """
+
+    mesh: trimesh.Trimesh
+    instance: int
+    dynamic: bool
+    world_from_mesh: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
+class Hit:
+    """Where rays meet a proxy.
+
+    Attributes:
+        distance: Along the ray [m], infinite for a miss.
+        face: Unit normal of the triangle, towards the ray's origin.
+        normal: The same of the smooth surface that the triangles stand for.
+        lift: Displacement from the triangle to that surface [m], where it bulges out; else zero.
+        instance: Instance id, 0 for a miss.
+    """
+
+    distance: Any
+    face: Any
+    normal: Any
+    lift: Any
+    instance: Any
+
+    @classmethod
+    def nothing(cls) -> Hit:
+        """A miss."""
+        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0))
+
+
+class Stopper(Protocol):
+    """A ray-traceable scene of what stops light."""
+
+    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+        """Whether rays from points of some instances are stopped; a ``key`` per ray decides where chance does."""
+
+
+class Proxies:
+    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones.
+
+    Attributes:
+        static, dynamic: They, as they are met.
+        casting: What casts the shadows of what is dynamic: none, one or two scenes.
+        shows_meshes: Whether visible meshes are among the dynamic ones.
+        apart: Whether a kernel may trace but one scene, as on CUDA: there Dr.Jit leaves out all but the first one.
+    """
+
+    def __init__(
+        self, occluders: Sequence[Occluder], visible: Sequence[Any] = (), casters: Sequence[Caster] | None = None
+    ) -> None:
+        """Proxies from meshes, and visible Mitsuba shapes, which are dynamic: no capture holds their shadows.
+
+        The shadows of dynamic proxies are cast by ``casters``, or else by their meshes.
+        """
+        self.static = _TraceScene.build([o for o in occluders if not o.dynamic])
+        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
+        casting = [self.dynamic] if casters is None else [_TraceScene.build([], visible), SplatOccluders.build(casters)]
+        self.casting: tuple[Stopper, ...] = tuple(stopper for stopper in casting if stopper is not None)
+        self.shows_meshes = bool(visible)
+        self.apart = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
+
+    @property
+    def stoppers(self) -> tuple[Stopper, ...]:
+        """All that stops light, the static proxies first."""
+        return self.casting if self.static is None else (self.static, *self.casting)
+
+    def nearest(self, ray: Any) -> tuple[Hit, Hit]:
+        """What rays meet first, and what they would meet without the dynamic proxies."""
+        static = _TraceScene.nearest(self.static, ray, Hit.nothing())
+        dr.eval(static)  # a kernel of its own, see `apart`
+        return _TraceScene.nearest(self.dynamic, ray, static), static
+
+
+@dataclass(frozen=True, eq=False)
+class _TraceScene:
+    """All meshes as one (or None), with the instance id of every triangle, beside visible shapes."""
+
+    scene: Any
+    mesh: Any
+    instances: Any
+    corners: Any
+    normals: Any
+
+    def nearest(self: _TraceScene | None, ray: Any, other: Hit) -> Hit:
+        """The nearer of ``other`` and what the rays meet here."""
+        if self is None:
+            return other
+        si = self.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True)
+        closer = si.t < other.distance
+        proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
+        number = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)
+        flip = dr.select(dr.dot(si.n, ray.d) > 0, -1.0, 1.0)
+        normal, lift = self._smooth(si, flip, proxy)
+        face = si.n * flip
+        return Hit(
+            dr.select(closer, si.t, other.distance),
+            dr.select(closer, face, other.face),
+            dr.select(closer, dr.select(proxy, normal, face), other.normal),
+            dr.select(closer, dr.select(proxy, lift, 0), other.lift),
+            dr.select(closer, number, other.instance),
+        )
+
+    def is_visible(self, hit: Any) -> Any:
+        """Whether what rays have met is a visible shape."""
+        return mi.Bool(True) if self.mesh is None else hit.shape != self.mesh
+
+    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+        """Whether rays are stopped."""
+        return self.scene.ray_test(ray, active=active)
+
+    def _smooth(self, si: Any, flip: Any, proxy: Any) -> tuple[Any, Any]:
+        """Interpolated normal, and the way to the surface that bulges out from a triangle's corners.
+
+        That surface is the mean of the projections on the corners' tangent planes: light that grazes it is not shadowed
+        by the triangles next to it (Hanika 2021, "Hacking the Shadow Terminator", Ray Tracing Gems II, chapter 4).
+        """
+        weights = 1 - si.uv.x - si.uv.y, si.uv.x, si.uv.y
+        normal, lift = mi.Normal3f(0), mi.Vector3f(0)
+        for corner, weight in enumerate(weights):
+            index = si.prim_index * 3 + corner
+            own = dr.gather(mi.Normal3f, self.normals, index, proxy) * flip
+            above = dr.dot(dr.gather(mi.Point3f, self.corners, index, proxy) - si.p, own)
+            normal += own * weight
+            lift += own * (dr.maximum(above, 0) * weight)
+        return mi.Normal3f(dr.normalize(normal)), lift
+
+    @classmethod
+    def build(cls, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> _TraceScene | None:
+        others = {f"visible_{i}": shape for i, shape in enumerate(visible)}
+        occluders = [o for o in occluders if len(o.mesh.faces)]
+        if not occluders:
+            if not others:
+                return None
+            nothing = mi.Float([0.0] * 9)
+            return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing)
+        parts = tuple((o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes()) for o in occluders)
+        return _merged(parts, others) if others else _kept(parts, str(mi.variant()))
+
+
+_Parts = tuple[tuple[trimesh.Trimesh, int, bytes], ...]
+"""Meshes, each with its instance id and its pose, 16 floats."""
+
+
+@lru_cache(maxsize=2)
+def _kept(parts: _Parts, _variant: str) -> _TraceScene:
+    """The static meshes, kept from layout to layout, and the last dynamic ones."""
+    return _merged(parts, {})
+
+
+def _merged(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
+    corners, normals = [], []
+    for part, _, pose in parts:
+        world_from_mesh = np.frombuffer(pose).reshape(4, 4)
+        turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
+        corners.append(part.triangles.reshape(-1, 3) @ turn.T + shift)
+        turn = turn / np.cbrt(np.linalg.det(turn))
+        normals.append(smooth_normals(part).reshape(-1, 3) @ turn.T)
+    positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
+    count = sum(len(c) for c in corners)
+    mesh = mi.Mesh("proxies", count, count // 3)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = positions
+    params["faces"] = dr.arange(mi.UInt32, count)
+    params.update()
+    instances = np.repeat([instance for _, instance, _ in parts], [len(part.faces) for part, _, _ in parts])
+    return _TraceScene(
+        ray_scene({"mesh": mesh, **others}),
+        dr.opaque(mi.ShapePtr, mesh),  # its number would be written into kernels, and changes with every layout
+        wrapped(mi.UInt32, instances.astype(np.uint32)),
+        positions,
+        wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
+    )
+
+
+@lru_cache(maxsize=64)
+def smooth_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Corner normals, kept from layout to layout.
+
+    Reconstructed surfaces are rough everywhere: what would be a crease in a drawing is noise there, and no edge is one
+    that is not much sharper than the flattest quarter of the others, by length.
+    """
+    angles, ends = mesh.face_adjacency_angles, mesh.vertices[mesh.face_adjacency_edges]
+    order = np.argsort(angles)
+    lengths = np.cumsum(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order])
+    usual = angles[order[np.searchsorted(lengths, 0.25 * lengths[-1])]] if len(order) else 0.0
+    return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))

@@ -1,0 +1,114 @@
+"""Radiance of meshes by Mitsuba's path tracer: along single rays, and as pictures to compare splats with."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.renderer.rays.sensors import view_of
+
+RAYS_PER_LAUNCH = 1 << 21
+"""Paths that are traced at once: bounds the memory, and changes no result but by its seeds."""
+
+
+def trace_radiance(
+    scene: mi.Scene,
+    origins: Float64Array,
+    directions: Float64Array,
+    *,
+    samples: int,
+    bounces: int,
+    seed: int,
+) -> tuple[Float64Array, BoolArray]:
+    """Mean radiance (R, 3) that arrives at ``origins`` (R, 3) [m] from ``directions`` (R, 3), and where a surface is.
+
+    Every ray is traced ``samples`` times by Mitsuba's path tracer.
+    """
+    radiance, hit = np.empty((len(origins), 3)), np.empty(len(origins), dtype=bool)
+    step = max(1, RAYS_PER_LAUNCH // samples)
+    for launch, start in enumerate(range(0, len(origins), step)):
+        chunk = slice(start, start + step)
+        from_points = mi.Point3f(origins[chunk].T.astype(np.float32))
+        along = mi.Vector3f(directions[chunk].T.astype(np.float32))
+        ray = dr.arange(mi.UInt32, len(origins[chunk]) * samples) // dr.opaque(mi.UInt32, samples)
+        total, hits = _mean_radiance(
+            scene,
+            dr.gather(mi.Point3f, from_points, ray),
+            dr.gather(mi.Vector3f, along, ray),
+            samples=samples,
+            bounces=bounces,
+            seed=seed + launch,
+        )
+        radiance[chunk], hit[chunk] = total, hits > 0
+    return radiance, hit
+
+
+def _mean_radiance(
+    scene: mi.Scene, origins: Any, directions: Any, *, samples: int, bounces: int, seed: int
+) -> tuple[Float64Array, Float64Array]:
+    """Mean radiance (N, 3) of every ``samples`` consecutive rays, black where nothing is, and the share that hits (N,).
+
+    The paths of one mean share a multi-jittered pattern (Kensler 2013), which has several times less noise than
+    independent ones.
+    """
+    integrator, sampler = _path_tracer(bounces, samples, mi.variant())
+    sampler.seed(seed, dr.width(directions))
+    spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
+    # A path that meets a sliver may end in no number, a few of ten million in drawings: the mean is of the others.
+    finite = dr.all(dr.isfinite(spectrum))
+    radiance = mi.Color3f(dr.select(valid & finite, spectrum, 0.0))
+    hit, number = (dr.select(which, mi.Float(1), 0) for which in (valid, finite))
+    # Together: what is left for later would trace all paths again.
+    dr.eval(radiance, hit, number)
+    *sums, hits, numbers = (
+        np.asarray(dr.block_sum(channel, samples), dtype=np.float64) for channel in (*radiance, hit, number)
+    )
+    return np.stack(sums, axis=1) / np.maximum(numbers, 1.0)[:, None], hits / samples
+
+
+@lru_cache(maxsize=4)
+def _path_tracer(bounces: int, samples: int, variant: str) -> tuple[Any, Any]:
+    """Integrator and sampler: a GPU traces a picture while they load. To seed the sampler resets it."""
+    integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+    if sampler.sample_count() == samples:
+        sampler.set_samples_per_wavefront(samples)
+    else:  # a number that has no grid
+        sampler = mi.load_dict({"type": "independent"})
+    return integrator, sampler
+
+
+def render_mesh(
+    scene: mi.Scene, camera: Camera, *, samples: int, bounces: int = 6, seed: int = 0
+) -> tuple[Float64Array, Float64Array]:
+    """Path-traced radiance (H, W, 3) of a pinhole ``camera``, black where nothing is, and coverage (H, W) in [0, 1].
+
+    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it
+    is encoded, because the mean of encoded noise is too dark. Only the background counts encoded, as splats blend.
+    """
+    view, side = view_of(make_sensor(camera)), max(1, round(samples**0.5))
+    samples, pixels = side * side, camera.width * camera.height
+    across, width = dr.opaque(mi.UInt32, side), dr.opaque(mi.UInt32, camera.width)
+    mean, cover = np.empty((pixels, 3)), np.empty(pixels)
+    step = max(1, RAYS_PER_LAUNCH // samples)
+    for launch, start in enumerate(range(0, pixels, step)):
+        count = min(step, pixels - start)
+        ray = dr.arange(mi.UInt32, count * samples)
+        pixel, within = ray // (across * across), ray % (across * across)
+        pixel += dr.opaque(mi.UInt32, start)
+        x = mi.Float(pixel % width) + (mi.Float(within % across) + 0.5) / mi.Float(across)
+        y = mi.Float(pixel // width) + (mi.Float(within // across) + 0.5) / mi.Float(across)
+        rays, chunk = view.rays_through(x, y), slice(start, start + count)
+        mean[chunk], cover[chunk] = _mean_radiance(
+            scene, rays.o, rays.d, samples=samples, bounces=bounces, seed=seed + launch
+        )
+    blended = decode_srgb(encode_srgb(mean / np.maximum(cover, 1e-9)[:, None]) * cover[:, None])
+    return blended.reshape(camera.height, camera.width, 3), cover.reshape(camera.height, camera.width)

@@ -1,0 +1,367 @@
+"""The camera as the splat renderer sees it: ray slopes per pixel, tiles, and the tiles that slopes fall into."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.geometry.camera import FISHEYE_MAX, Camera, Lens, fisheye_radius, fisheye_rate
+
+TILE_WIDTH, TILE_HEIGHT = 8, 4
+"""Size of a tile [px]. Smaller tiles make more pairs to sort; larger ones idle more lanes, blend further from the order
+of each ray, and bound depths less tightly. A packet of eight lanes carries all of a tile and fetches a record once."""
+
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+
+Kind = tuple[int, int, int, Lens, int, int]
+"""Width, height, number of coefficients of distortion, lens, samples and zoom of a view."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Intrinsics, lens distortion and pose of one camera, see :class:`mitsplat.geometry.camera.Camera`.
+
+    Attributes:
+        width, height: Image size [px].
+        fx, fy, cx, cy: Intrinsics [px].
+        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6, or empty; k1, k2, k3, k4 of a fisheye.
+        near: Nearest depth that is seen [m].
+        world_from_camera: Pose, OpenCV axes, shape (4, 4).
+        samples: Rays per pixel along each axis.
+        lens: Model of the lens.
+        aperture_radius, focus_distance: Of a thin lens [m].
+        zoom: How many of its pixels lie along one of the picture's, see :meth:`finer`.
+        shift: What the slopes of rays lack of those through the lens's centre; of a view through another of its points.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: np.ndarray
+    distortion: tuple[float, ...] = ()
+    near: float = 0.01
+    samples: int = 1
+    lens: Lens = "opencv"
+    aperture_radius: float = 0.0
+    focus_distance: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    zoom: int = 1
+    _opaque: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.lens == "opencv":
+            padded = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+            object.__setattr__(self, "distortion", padded if any(padded) else ())
+        # Opaque, so that a new camera reuses the compiled kernels.
+        for name in ("fx", "fy", "cx", "cy", "near"):
+            self._opaque[name] = dr.opaque(mi.Float, getattr(self, name))
+        for i, value in enumerate(self.distortion):
+            self._opaque[f"k{i}"] = dr.opaque(mi.Float, value)
+        if self.distortion:
+            self._opaque["du"], self._opaque["dv"] = (dr.opaque(mi.Float, value) for value in self.shift)
+
+    @property
+    def near_plane(self) -> Any:
+        """``near`` as an opaque value."""
+        return self._opaque["near"]
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What tells two views apart."""
+        lens = self.fx, self.fy, self.cx, self.cy, self.distortion, self.lens, self.shift
+        return self.width, self.height, *lens, self.near, self.samples, self.world_from_camera.tobytes()
+
+    @property
+    def kind(self) -> Kind:
+        """What decides the kernels of a view beside its :attr:`numbers`."""
+        return self.width, self.height, len(self.distortion), self.lens, self.samples, self.zoom
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What views of one kind differ in, on the device; the pose is in a table of placements."""
+        return self._opaque | ({"extent": self._extent} if self.distortion else {})
+
+    @classmethod
+    def of_numbers(cls, kind: Kind, numbers: Mapping[str, Any]) -> View:
+        """A view that knows no more than its kind and :attr:`numbers`: enough to project, not to march."""
+        view = object.__new__(cls)
+        width, height, coefficients, lens, samples, zoom = kind
+        known = {"width": width, "height": height, "distortion": (0.0,) * coefficients, "lens": lens}
+        known |= {"samples": samples, "zoom": zoom, "_opaque": dict(numbers)}
+        if coefficients:
+            known["_extent"] = numbers["extent"]
+        view.__dict__.update(known)
+        return view
+
+    @property
+    def tiles_x(self) -> int:
+        """Number of tiles along x."""
+        return -(-self.width // TILE_WIDTH)
+
+    @property
+    def tiles_y(self) -> int:
+        """Number of tiles along y."""
+        return -(-self.height // TILE_HEIGHT)
+
+    def sampled(self, samples: int) -> View:
+        """The same view with ``samples`` x ``samples`` rays per pixel."""
+        return self if samples == self.samples else replace(self, samples=samples)
+
+    def finer(self, zoom: int) -> View:
+        """The same view in ``zoom`` x ``zoom`` pixels for each of its own."""
+        numbers: dict[str, Any] = {n: zoom * getattr(self, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
+        return replace(self, zoom=zoom * self.zoom, **numbers)
+
+    @property
+    def camera(self) -> Camera:
+        """The same camera on the host, one ray per pixel."""
+        return Camera(
+            self.width,
+            self.height,
+            *(self.fx, self.fy, self.cx, self.cy),
+            self.world_from_camera,
+            self.distortion,
+            self.near,
+            self.lens,
+            self.aperture_radius,
+            self.focus_distance,
+        )
+
+    def apertures(self, rings: int) -> list[View]:
+        """Views through evenly spaced points of the aperture, the centre first: a hexagon and so many rings around it.
+
+        All of them see the plane at ``focus_distance`` at the same pixels. A pinhole has one.
+        """
+        if self.aperture_radius == 0:
+            return [self]
+        points, count = [(0.0, 0.0)], 1 + 3 * rings * (rings + 1)
+        for ring in range(1, rings + 1):
+            # In the middle, by area, of the annulus that belongs to the ring's 6 n points.
+            radius = self.aperture_radius * np.sqrt((1 + 3 * ring * ring) / count)
+            angles = (np.arange(6 * ring) + 0.5 * (ring % 2)) * np.pi / (3 * ring)
+            points += [(radius * np.cos(angle), radius * np.sin(angle)) for angle in angles]
+        return [self._through(float(x), float(y)) for x, y in points]
+
+    def _through(self, x: float, y: float) -> View:
+        pose = self.world_from_camera.copy()
+        pose[:3, 3] += pose[:3, 0] * x + pose[:3, 1] * y
+        du, dv = x / self.focus_distance, y / self.focus_distance
+        if self.distortion:
+            return replace(self, world_from_camera=pose, shift=(du, dv))
+        return replace(self, world_from_camera=pose, cx=self.cx + self.fx * du, cy=self.cy + self.fy * dv)
+
+    def rows(self, start: int, stop: int) -> View:
+        """The part of the view from pixel row ``start`` up to ``stop``."""
+        return replace(self, height=stop - start, cy=self.cy - start)
+
+    def rays(self) -> Any:
+        """World-space rays through the pixels' centres, row-major, of unit direction."""
+        ray = self.rays_through(*self.centres())
+        dr.eval(ray)
+        return ray
+
+    def centres(self) -> tuple[Any, Any]:
+        """Positions (x, y) of the pixels' centres, row-major [px]."""
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        row = pixel // self.width
+        return mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5
+
+    def rays_through(self, x: Any, y: Any) -> Any:
+        """World-space rays through pixel positions (x, y) [px], of unit direction."""
+        ray = dr.zeros(mi.Ray3f, dr.width(x))
+        ray.d = self.direction(x, y)
+        ray.o = mi.Point3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 3]])
+        ray.maxt = dr.inf
+        return ray
+
+    def direction(self, x: Any, y: Any) -> Any:
+        """World-space unit vectors of the rays through pixel positions (x, y) [px]."""
+        u, v = self.slopes(x, y)
+        axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3, :3].T]
+        right, down, forward = axes
+        return dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
+
+    def cosine(self, rays: Any) -> Any:
+        """Depth along z per unit of distance along each ray."""
+        forward = mi.Vector3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 2]])
+        return dr.dot(rays.d, forward)
+
+    def slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Undistorted slopes (u, v) of the rays through pixel positions (x, y) [px]."""
+        o = self._opaque
+        xd, yd = (x - o["cx"]) / o["fx"], (y - o["cy"]) / o["fy"]
+        if not self.distortion:
+            return xd, yd
+        if self.lens == "fisheye":
+            u, v = self._fisheye_slopes(xd, yd)
+            return u - o["du"], v - o["dv"]
+        u, v = xd, yd
+        # Newton's method on the 2-D distortion map with a numerical-free Jacobian: converges in 3 to 5 steps.
+        for _ in range(8):
+            pu, pv, j = self.distort(u, v)
+            ru, rv = xd - pu, yd - pv
+            det = j[0] * j[3] - j[1] * j[2]
+            u, v = u + (j[3] * ru - j[1] * rv) / det, v + (j[0] * rv - j[2] * ru) / det
+        return u - o["du"], v - o["dv"]
+
+    def _fisheye_slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
+        radius = dr.maximum(dr.sqrt(x * x + y * y), 1e-9)
+        angle = mi.Float(radius)
+        for _ in range(8):
+            angle -= (fisheye_radius(angle, self._k) - radius) / fisheye_rate(angle, self._k)
+        scale = dr.tan(dr.clip(angle, 0, FISHEYE_MAX)) / radius
+        return x * scale, y * scale
+
+    @property
+    def _k(self) -> list[Any]:
+        return [self._opaque[f"k{i}"] for i in range(len(self.distortion))]
+
+    def _fisheye_distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+        slope2 = dr.maximum(u * u + v * v, 1e-12)
+        slope = dr.sqrt(slope2)
+        angle = dr.atan(slope)
+        rate, scale = fisheye_rate(angle, self._k), fisheye_radius(angle, self._k) / slope
+        # Along the radius the map grows by d(shown)/d(slope), across it by the scale.
+        growth = (rate / (1 + slope2) - scale) / slope2
+        return u * scale, v * scale, (scale + growth * u * u, growth * u * v, growth * u * v, scale + growth * v * v)
+
+    def distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+        """OpenCV's distortion of slopes, and its Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
+
+        Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational model, and "Fisheye camera
+        model" (Kannala and Brandt 2006).
+        """
+        if self.lens == "fisheye":
+            return self._fisheye_distort(u, v)
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._k
+        r2 = u * u + v * v
+        top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = top / bottom
+        slope = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom
+        pu = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+        pv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+        cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
+        return (
+            pu,
+            pv,
+            (
+                radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u,
+                cross,
+                cross,
+                radial + 2 * v * v * slope + 6 * p1 * v + 2 * p2 * u,
+            ),
+        )
+
+    def pixel_covariance(self, u: Any, v: Any, variance: float) -> tuple[Any, Any, Any]:
+        """Covariance (uu, uv, vv) in slopes, at (u, v), of an isotropic ``variance`` [px^2] on the image."""
+        o = self._opaque
+        variance = dr.opaque(mi.Float, variance)
+        if not self.distortion:
+            return variance / dr.square(o["fx"]), mi.Float(0), variance / dr.square(o["fy"])
+        lo_u, hi_u, lo_v, hi_v = self._extent
+        _, _, (a, b, c, d) = self.distort(dr.clip(u, lo_u, hi_u) + o["du"], dr.clip(v, lo_v, hi_v) + o["dv"])
+        # Inverse of the map from slopes to pixels, diag(f) J.
+        det = (a * d - b * c) * o["fx"] * o["fy"]
+        a, b, c, d = d * o["fy"] / det, -b * o["fx"] / det, -c * o["fy"] / det, a * o["fx"] / det
+        return variance * (a * a + b * b), variance * (a * c + b * d), variance * (c * c + d * d)
+
+    def tile_box(self, u0: Any, u1: Any, v0: Any, v1: Any) -> tuple[Any, Any, Any, Any]:
+        """Half-open ranges of tiles (x0, x1, y0, y1) that a box of slopes may meet, clipped to the image."""
+        o = self._opaque
+        if not self.distortion:
+            box = u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], v0 * o["fy"] + o["cy"], v1 * o["fy"] + o["cy"]
+            return self._clip_tiles(*box, 0.0)
+        # Beyond the image's own slopes the distortion may fold back: clip there first, then follow the box's outline.
+        lo_u, hi_u, lo_v, hi_v = self._extent
+        empty = (u1 < lo_u) | (u0 > hi_u) | (v1 < lo_v) | (v0 > hi_v)
+        u0, u1 = dr.clip(u0, lo_u, hi_u), dr.clip(u1, lo_u, hi_u)
+        v0, v1 = dr.clip(v0, lo_v, hi_v), dr.clip(v1, lo_v, hi_v)
+        lo_x = lo_y = mi.Float(dr.inf)
+        hi_x = hi_y = mi.Float(-dr.inf)
+        for s in (0.0, 0.25, 0.5, 0.75, 1.0):
+            for t in (0.0, 0.25, 0.5, 0.75, 1.0):
+                if s not in (0.0, 1.0) and t not in (0.0, 1.0):
+                    continue
+                pu, pv, _ = self.distort(dr.lerp(u0, u1, s) + o["du"], dr.lerp(v0, v1, t) + o["dv"])
+                x, y = pu * o["fx"] + o["cx"], pv * o["fy"] + o["cy"]
+                lo_x, hi_x = dr.minimum(lo_x, x), dr.maximum(hi_x, x)
+                lo_y, hi_y = dr.minimum(lo_y, y), dr.maximum(hi_y, y)
+        margin = TILE_WIDTH / 2 + 0.05 * dr.maximum(hi_x - lo_x, hi_y - lo_y)
+        x0, x1, y0, y1 = self._clip_tiles(lo_x, hi_x, lo_y, hi_y, margin)
+        return x0, dr.select(empty, x0, x1), y0, y1
+
+    def tile_columns(self, u0: Any, u1: Any) -> tuple[Any, Any]:
+        """Half-open range of columns of tiles that a range of slopes meets in an undistorted view."""
+        o = self._opaque
+        return self._tile_range(u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], TILE_WIDTH, self.tiles_x)
+
+    def _clip_tiles(self, x0: Any, x1: Any, y0: Any, y1: Any, margin: Any) -> tuple[Any, Any, Any, Any]:
+        columns = self._tile_range(x0 - margin, x1 + margin, TILE_WIDTH, self.tiles_x)
+        return *columns, *self._tile_range(y0 - margin, y1 + margin, TILE_HEIGHT, self.tiles_y)
+
+    def _tile_range(self, low: Any, high: Any, size: int, tiles: int) -> tuple[Any, Any]:
+        # A pixel is sampled at its centre: what ends before the first centre or starts after the last one is out.
+        half = 0.5 if self.samples == 1 else 0.0
+        first, last = dr.floor((low + half) / size), dr.floor((high - half) / size) + 1.0
+        return mi.UInt32(dr.clip(first, 0.0, float(tiles))), mi.UInt32(dr.clip(last, 0.0, float(tiles)))
+
+    def tile_slopes(self, tile: Any) -> tuple[Any, Any, Any, Any]:
+        """Box (u_min, u_max, v_min, v_max) of the slopes of a tile's rays."""
+        if self.distortion:
+            box = dr.gather(mi.Array4f, self._tile_table, tile)
+            return box.x, box.y, box.z, box.w
+        o = self._opaque
+        half = 0.5 if self.samples == 1 else 0.0
+        row = tile // self.tiles_x
+        x, y = mi.Float((tile - row * self.tiles_x) * TILE_WIDTH), mi.Float(row * TILE_HEIGHT)
+        return (
+            (x + half - o["cx"]) / o["fx"],
+            (x + (TILE_WIDTH - half) - o["cx"]) / o["fx"],
+            (y + half - o["cy"]) / o["fy"],
+            (y + (TILE_HEIGHT - half) - o["cy"]) / o["fy"],
+        )
+
+    def tile_grid(self) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+        """Slope of the first tile's middle, step from tile to tile, and a tile's width, along u and along v.
+
+        Of an undistorted view.
+        """
+        o, inset = self._opaque, 1.0 if self.samples == 1 else 0.0
+        return (
+            ((0.5 * TILE_WIDTH - o["cx"]) / o["fx"], TILE_WIDTH / o["fx"], (TILE_WIDTH - inset) / o["fx"]),
+            ((0.5 * TILE_HEIGHT - o["cy"]) / o["fy"], TILE_HEIGHT / o["fy"], (TILE_HEIGHT - inset) / o["fy"]),
+        )
+
+    @cached_property
+    def _tile_table(self) -> Any:
+        """Slope boxes of all tiles of a distorted view, 4 floats each, from the slopes around each tile's edge."""
+        tiles = self.tiles_x * self.tiles_y
+        tile = dr.arange(mi.UInt32, tiles)
+        x, y = mi.Float(tile % self.tiles_x * TILE_WIDTH), mi.Float(tile // self.tiles_x * TILE_HEIGHT)
+        lo_u = lo_v = mi.Float(dr.inf)
+        hi_u = hi_v = mi.Float(-dr.inf)
+        edge = {(i, dy) for i in range(TILE_WIDTH + 1) for dy in (0, TILE_HEIGHT)}
+        edge |= {(dx, i) for dx in (0, TILE_WIDTH) for i in range(TILE_HEIGHT + 1)}
+        for dx, dy in sorted(edge):
+            u, v = self.slopes(x + dx, y + dy)
+            lo_u, hi_u = dr.minimum(lo_u, u), dr.maximum(hi_u, u)
+            lo_v, hi_v = dr.minimum(lo_v, v), dr.maximum(hi_v, v)
+        table = dr.empty(mi.Float, 4 * tiles)
+        dr.scatter(table, mi.Array4f(lo_u, hi_u, lo_v, hi_v), tile)
+        dr.eval(table)
+        return table
+
+    @cached_property
+    def _extent(self) -> tuple[Any, Any, Any, Any]:
+        rows = np.array(self._tile_table).reshape(-1, 4)
+        lo, hi = rows.min(axis=0), rows.max(axis=0)
+        return tuple(dr.opaque(mi.Float, float(v)) for v in (lo[0], hi[1], lo[2], hi[3]))

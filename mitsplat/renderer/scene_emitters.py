@@ -1,0 +1,75 @@
+"""The lights of a scene file as Mitsuba's emitters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.arrays import Float64Array
+from mitsplat.images.colour import black_body_colour
+from mitsplat.runtime.variant import ensure_variant
+from mitsplat.scene.spec.light_spec import LightSpec
+
+
+def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]:
+    """Mitsuba's description of one light; images of environments are relative to ``folder``."""
+    ensure_variant()
+    colour = np.asarray(light.colour)
+    if light.kind != "environment" and light.temperature is not None:
+        colour = colour * black_body_colour(light.temperature)
+    if light.kind == "environment":
+        if light.image is None:
+            return {"type": "constant", "radiance": _rgb(light.radiance * colour)}
+        return {
+            "type": "envmap",
+            "filename": str((folder or Path()) / light.image),
+            "scale": light.radiance,
+            "to_world": y_up_to_z_up(light.rotate_z),
+        }
+    if light.kind == "point":
+        return {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity * colour)}
+    forward = np.subtract(light.target, light.position)
+    up = [0.0, 0.0, 1.0] if np.hypot(forward[0], forward[1]) > 1e-6 * np.linalg.norm(forward) else [0.0, 1.0, 0.0]
+    pose = mi.ScalarTransform4f().look_at(origin=list(light.position), target=list(light.target), up=up)
+    if light.kind == "spot":
+        return {
+            "type": "spot",
+            "to_world": pose,
+            "cutoff_angle": light.cone,
+            "intensity": _rgb(light.intensity * colour),
+        }
+    return {
+        "type": "rectangle",
+        "to_world": pose @ mi.ScalarTransform4f().scale([0.5 * light.size[0], 0.5 * light.size[1], 1.0]),
+        "emitter": {"type": "area", "radiance": _rgb(light.radiance * colour)},
+    }
+
+
+def movable(description: dict[str, Any]) -> Any:
+    """An emitter that is somewhere else in every frame: a rectangle is made here, so that kernels do not contain where.
+
+    Its frame is then computed on the device, which may differ in the last bit from one that is a constant of kernels.
+    """
+    if description["type"] != "rectangle":  # of all others nothing but data says where they are
+        return description
+    shape = mi.load_dict(description)
+    state = mi.traverse(shape)
+    pose = state["to_world"]
+    dr.make_opaque(pose)
+    state["to_world"] = pose
+    state.update()
+    return shape
+
+
+def _rgb(value: Float64Array) -> dict[str, Any]:
+    return {"type": "rgb", "value": value.tolist()}
+
+
+def y_up_to_z_up(degrees: float) -> mi.ScalarTransform4f:
+    """Turns Mitsuba's y-up environment maps z up, then about z."""
+    transform = mi.ScalarTransform4f()
+    return transform.rotate([0, 0, 1], degrees) @ transform.rotate([1, 0, 0], 90.0)

@@ -1,0 +1,154 @@
+"""Antialiased silhouettes: where instances border on each other, a pixel is the mean of ZOOM x ZOOM rays.
+
+One ray through a pixel's centre sees either side of a silhouette, and a row of such pixels shows steps. Pixels of which
+a neighbour shows another instance, or another visible mesh, are therefore looked at again, in a view of as many pixels
+as there are rays; of its tiles only those that hold such pixels have lists. Linear colours in light are averaged.
+
+Light is not traced again. A ray has that of the nearest pixel among its own and those around it which shows the same
+thing, so that both sides of a silhouette are lit as they are beside it (compare Salvi and Vidimce 2012, "Surface based
+anti-aliasing", which shades once for each surface). Ids, depths and all that labels are made of stay those of the
+pixel's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.quality import Quality
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
+from mitsplat.renderer.splatting.march import Image, march_apart
+from mitsplat.renderer.splatting.pairs import CrowdedError
+from mitsplat.renderer.splatting.projection import CloudSet, Placement
+from mitsplat.renderer.splatting.tile_subset import ChosenTiles
+from mitsplat.renderer.splatting.tiles import bin_gaussians
+
+ZOOM = 2
+"""Rays along each axis of a pixel, a divisor of a tile's width and height."""
+
+BLOCK_WIDTH, BLOCK_HEIGHT = TILE_WIDTH // ZOOM, TILE_HEIGHT // ZOOM
+"""Size of a block of pixels that are looked at again together [px]: one tile of the finer view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The blocks of a view's pixels that hold a border, and the finer view of them.
+
+    Rays of the finer view are counted tile after tile of ``chosen``, and row by row in each.
+
+    Attributes:
+        view: The picture's.
+        fine: The finer one.
+        chosen: Its tiles.
+    """
+
+    view: View
+    fine: View
+    chosen: ChosenTiles
+
+    @classmethod
+    def find(cls, key: Any, view: View) -> Edges | None:
+        """Where pixels differ in ``key`` (UInt32, row-major) from one of the eight around them; None if nowhere."""
+        fine = view.finer(ZOOM)
+        block = dr.arange(mi.UInt32, fine.tiles_x * fine.tiles_y)
+        row = block // fine.tiles_x
+        x, y = mi.Int32(block - row * fine.tiles_x) * BLOCK_WIDTH, mi.Int32(row) * BLOCK_HEIGHT
+        own, differs = dr.gather(mi.UInt32, key, _pixel(x, y, view)), mi.Bool(False)
+        for dx, dy in np.ndindex(BLOCK_WIDTH + 2, BLOCK_HEIGHT + 2):
+            differs |= dr.gather(mi.UInt32, key, _pixel(x + (dx - 1), y + (dy - 1), view)) != own
+        dr.eval(differs)
+        chosen = ChosenTiles.of(differs, fine)
+        return cls(view, fine, chosen) if chosen.count else None
+
+    def rays(self) -> Any:
+        """World-space rays of the finer view, of unit direction."""
+        rays = self.fine.rays_through(*self.positions())
+        dr.eval(rays)
+        return rays
+
+    def positions(self) -> tuple[Any, Any]:
+        """Pixel positions (x, y) of those rays in the finer view [px]."""
+        x, y = self._places()
+        return mi.Float(x) + 0.5, mi.Float(y) + 0.5
+
+    def trace(self, clouds: CloudSet, placements: Sequence[Placement], quality: Quality, z_max: Any | None) -> Image:
+        """What those rays see of splats; arguments as of :func:`mitsplat.renderer.splatting.march.trace`.
+
+        They are so few that any tolerance of the order that is not infinite is kept by the order per ray.
+
+        Raises:
+            CrowdedError: If even one tile is too crowded for the memory.
+        """
+        exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
+        return _trace(clouds, placements, self.fine, self.chosen, exact, z_max)
+
+    def alike(self, keys: Any, own: Any) -> Any:
+        """For rays that show ``own``, the nearest pixel around them that shows the same by ``keys``, or else theirs."""
+        x, y = self._places()
+        px, py = mi.Int32(x // ZOOM), mi.Int32(y // ZOOM)
+        # Which of the neighbours along each axis is nearer.
+        right, down = (dr.select(place % ZOOM * 2 >= ZOOM, mi.Int32(1), -1) for place in (x, y))
+        found, pixel = mi.Bool(False), _pixel(px, py, self.view)
+        for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)):
+            other = _pixel(px + dx * right, py + dy * down, self.view)
+            same = ~found & (dr.gather(mi.UInt32, keys, other) == own)
+            pixel, found = dr.select(same, other, pixel), found | same
+        return pixel
+
+    def averaged(self, values: Any, fine: Any) -> Any:
+        """The pixels ``values`` of the picture (Float or Color3f), in the chosen blocks the means over the rays."""
+        size = BLOCK_WIDTH * BLOCK_HEIGHT
+        lane = dr.arange(mi.UInt32, self.chosen.count * size)
+        tile, within = lane // size, lane % size
+        bx, by = within % BLOCK_WIDTH, within // BLOCK_WIDTH
+        total = type(fine)(0)
+        for dx, dy in np.ndindex(ZOOM, ZOOM):
+            place = tile * TILE_PIXELS + (by * ZOOM + dy) * TILE_WIDTH + bx * ZOOM + dx
+            total += dr.gather(type(fine), fine, place)
+        number = dr.gather(mi.UInt32, self.chosen.number, tile)
+        row = number // self.fine.tiles_x
+        x, y = (number - row * self.fine.tiles_x) * BLOCK_WIDTH + bx, row * BLOCK_HEIGHT + by
+        inside = (x < self.view.width) & (y < self.view.height)
+        result = dr.copy(values)
+        dr.scatter(result, total / (ZOOM * ZOOM), y * self.view.width + x, inside, mode=dr.ReduceMode.Permute)
+        return result
+
+    def _places(self) -> tuple[Any, Any]:
+        """Column and row of the finer view's pixels."""
+        lane = dr.arange(mi.UInt32, self.chosen.count * TILE_PIXELS)
+        number = dr.gather(mi.UInt32, self.chosen.number, lane // TILE_PIXELS)
+        row = number // self.fine.tiles_x
+        x = (number - row * self.fine.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
+        return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
+
+
+def _pixel(x: Any, y: Any, view: View) -> Any:
+    """Number of a pixel, the nearest one in the image."""
+    return mi.UInt32(dr.clip(y, 0, view.height - 1) * view.width + dr.clip(x, 0, view.width - 1))
+
+
+def _trace(
+    clouds: CloudSet,
+    placements: Sequence[Placement],
+    view: View,
+    chosen: ChosenTiles,
+    quality: Quality,
+    z_max: Any | None,
+) -> Image:
+    try:
+        return march_apart(bin_gaussians(clouds, placements, view, quality, chosen=chosen), view, quality, z_max)
+    except CrowdedError:
+        if chosen.count == 1:
+            raise
+    parts, start = [], 0
+    for half in chosen.halves(view):
+        pixels = dr.arange(mi.UInt32, half.count * TILE_PIXELS) + start
+        part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
+        parts.append(_trace(clouds, placements, view, half, quality, part_z))
+        start += half.count * TILE_PIXELS
+    return Image.joined(parts)

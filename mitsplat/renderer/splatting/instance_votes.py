@@ -1,0 +1,122 @@
+"""Which instance has the largest share of a ray, for any number of instances.
+
+A ray's first walk keeps the sums of weights of the environment and of the first instances that it meets, which are
+whole, because none of them leaves, and one sum of all others. The largest of the whole ones wins for sure unless that
+one sum is larger. Rays where it is are walked again: every walk sums up the weights of the next instances in the order
+of ids, until those that are left weigh less together than the best one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.quality import Order, Quality
+from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.splatting.tiles import TileLists
+from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, walk
+
+FIRST = 3
+"""Instances that the first walk tells apart."""
+
+NEXT = 8
+"""Instances that each further walk tells apart."""
+
+OWN, OTHERS, SLOTS = range(3)
+"""State of a tally: weight of the environment, of all instances without a slot; and from there on id and weight of
+those that have one, 0 where it is empty."""
+
+
+def new_tally() -> list[Any]:
+    """The tally of a ray that has met nothing."""
+    return [mi.Float(0.0) for _ in range(SLOTS + 2 * FIRST)]
+
+
+def add_to_tally(tally: list[Any], weight: Any, instance: Any) -> list[Any]:
+    """The tally after one more Gaussian."""
+    placed = instance == 0
+    result = [dr.select(placed, tally[OWN] + weight, tally[OWN]), tally[OTHERS]]
+    placed |= weight <= 0
+    for number, total in zip(tally[SLOTS::2], tally[SLOTS + 1 :: 2], strict=True):
+        here = ~placed & ((number == instance) | (number == 0))
+        placed |= here
+        result += [dr.select(here, instance, number), dr.select(here, total + weight, total)]
+    result[OTHERS] = dr.select(placed, tally[OTHERS], tally[OTHERS] + weight)
+    return result
+
+
+def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
+    """Instance (Float) with the largest share of a ray, and whether another one may have more.
+
+    What is left of the ray shows what lies behind, and counts as environment.
+    """
+    instance, most = mi.Float(0), tally[OWN] + transmittance
+    for number, total in zip(tally[SLOTS::2], tally[SLOTS + 1 :: 2], strict=True):
+        instance, most = dr.select(total > most, number, instance), dr.maximum(total, most)
+    return instance, tally[OTHERS] > most
+
+
+def settle_instances(
+    instance: Any, unsure: Any, lists: TileLists, view: View, quality: Quality, order: Order, z_max: Any | None
+) -> Any:
+    """The instance image (UInt32, row-major) with the right ids where it is ``unsure`` (Bool).
+
+    Rays are walked in the ``order`` of the picture. Other rays are not walked, but their lanes are launched, so that
+    nothing has to be read from the device. The other arguments are those of
+    :func:`mitsplat.renderer.splatting.march.march`.
+    """
+    lanes = Lanes(lists, view, rows=1)
+    (pixel,), (inside,) = lanes.pixel, lanes.inside
+    wanted = inside & dr.gather(mi.Bool, unsure, pixel, inside)
+    far = mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, wanted)
+    slopes = lanes.slopes(*(dr.opaque(mi.Float, 0.5) for _ in range(2)))
+
+    def body(last: Any, best: Any, most: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        rays = Rays.through(
+            lists, view, quality, slopes, [far], lanes.start, dr.select(active, lanes.stop, lanes.start)
+        )
+        ((transmittance, own, left, *slots),) = walk(
+            rays, order, _nothing, lambda pixel, alpha, record, _: _count(pixel, pixel[0] * alpha, record[15], last)
+        )
+        # The same in every walk, and 0 at first: what the ray shows of the environment.
+        most = dr.maximum(most, own + transmittance)
+        for number, total in zip(slots[0::2], slots[1::2], strict=True):
+            best, most = dr.select(active & (total > most), number, best), dr.maximum(total, most)
+        return slots[-2], best, most, active & (left > most)
+
+    nothing = dr.zeros(mi.Float, dr.width(pixel))
+    state = nothing, mi.Float(nothing), mi.Float(nothing), wanted
+    _, best, _, _ = dr.while_loop(state, lambda *state: state[-1], body, label="settle instances")
+    settled = dr.copy(instance)
+    dr.scatter(settled, mi.UInt32(best), pixel, wanted, mode=dr.ReduceMode.Permute)
+    return settled
+
+
+def _nothing() -> Pixel:
+    """State of a ray of a further walk that has met nothing: as a tally, with slots in the order of ids."""
+    slots = [mi.Float(value) for _ in range(NEXT) for value in (dr.inf, 0.0)]
+    return [mi.Float(1.0), mi.Float(0.0), mi.Float(0.0), *slots]
+
+
+def _count(pixel: Pixel, weight: Any, instance: Any, last: Any) -> Pixel:
+    """The state after one more Gaussian: the least ids above ``last`` keep their slots.
+
+    None that ends up among them was ever without a slot, so that their sums are whole.
+    """
+    transmittance, own, left, *slots = pixel
+    own = dr.select(instance == 0, own + weight, own)
+    counted = (weight > 0) & (instance > last)
+    number, weight_left = dr.select(counted, instance, dr.inf), dr.select(counted, weight, 0)
+    result = []
+    for slot, total in zip(slots[0::2], slots[1::2], strict=True):
+        same, before = number == slot, number < slot
+        result += [
+            dr.select(before, number, slot),
+            dr.select(before, weight_left, dr.select(same, total + weight_left, total)),
+        ]
+        # What was in the slot moves on to the next one; what was added to it is placed.
+        number = dr.select(before, slot, dr.select(same, dr.inf, number))
+        weight_left = dr.select(before, total, dr.select(same, 0, weight_left))
+    return [transmittance - weight, own, left + weight_left, *result]

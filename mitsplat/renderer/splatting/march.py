@@ -1,0 +1,401 @@
+"""The march: rays through all pixels walk their tiles' lists, see module `walk`, and become an image.
+
+What the order of blending does to the colour of a ray. Let some Gaussians be blended in the order of their peaks, with
+weights w_i and colours c_i, and let one more come, of opacity a, whose peak lies in front of some of them, the set B.
+In its place it takes the share a of the light of B, and is seen through what is in front of B; at the end of the row it
+is also seen through B:
+
+    in its place   sum_front w_i c_i + a (T + W) c + (1 - a) C
+    at the end     sum_front w_i c_i + C + a T c
+
+with W and C the sums of w_i and of w_i c_i over B, and T the transmittance behind all. The difference is
+
+    a (W c - C),
+
+for one neighbour the well-known a_i a_j T (c_j - c_i). Summed over all Gaussians it is the whole error of a ray, and
+the sum of its absolute values bounds that. B would have to be searched for among all that was blended. What comes late
+mostly lies just in front of the deepest ones, so that W and C are estimated from sums of w_i, w_i c_i and w_i z_i that
+forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of them, S being the sum of weights. Of these
+sums counts what lies behind the late peak, if they reach evenly from the deepest peak to as far in front of their mean.
+Those are seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
+
+`fast` adds that difference to the colour instead (`amends`): what comes late takes from what it hides. Its weight and
+theirs change by the same amount, so that one colour stays one colour. Sums there forget more of what lies in front,
+S / (S + 8 w).
+
+Most tiles need no more than their own order, and one walk in that, several rays to a lane, tells which: where the
+estimate exceeds the tolerance, it ends. Such tiles are walked in a window, and those of them in which an estimate still
+exceeds the tolerance in the order of each ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial, reduce
+from operator import or_
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.quality import Order, Quality
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, View
+from mitsplat.renderer.splatting.instance_votes import add_to_tally, new_tally, settle_instances, winner_of_tally
+from mitsplat.renderer.splatting.pairs import CrowdedError
+from mitsplat.renderer.splatting.projection import CloudSet, Placement
+from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, in_ray_order, some_tiles
+from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, largest, rows_together, walk
+
+
+@dataclass(eq=False)
+class Image:
+    """What the rays of one view saw, flat and row-major over height x width pixels.
+
+    Attributes:
+        rgb: Display-encoded colour, not divided by alpha, three arrays.
+        alpha: Opacity.
+        depth: Depth along z [m] at which a ray has lost half its light, or, where it keeps more, the mean depth of what
+            it met; 0 where it met nothing.
+        instance: Id with the largest share of the ray; 0 is the environment, which has what is left of the ray as well.
+        centre_alpha: Opacity of the ray through the pixel's centre, whose depth and instance these are.
+        error: Estimate of what the order of blending leaves wrong in ``rgb``, see the module; None if there is none.
+    """
+
+    rgb: list[Any]
+    alpha: Any
+    depth: Any
+    instance: Any
+    centre_alpha: Any
+    error: Any | None
+
+    @classmethod
+    def empty(cls, count: int) -> Image:
+        """Rays that met nothing."""
+        nothing = dr.zeros(mi.Float, count)
+        return cls([nothing] * 3, nothing, nothing, dr.zeros(mi.UInt32, count), nothing, nothing)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Image]) -> Image:
+        """The image whose rows are those of the parts, one after the other."""
+        rgb = [dr.concat([part.rgb[c] for part in parts]) for c in range(3)]
+        rest = [dr.concat([getattr(p, name) for p in parts]) for name in ("alpha", "depth", "instance", "centre_alpha")]
+        known = all(part.error is not None for part in parts)
+        rest.append(dr.concat([part.error for part in parts]) if known else None)
+        return cls(rgb, *rest)
+
+    def with_tiles(self, part: Image, lists: TileLists, view: View) -> Image:
+        """This image with the tiles of ``lists`` from another."""
+        changed = dr.zeros(mi.Bool, view.width * view.height)
+        lanes = Lanes(lists, view)
+        for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
+            dr.scatter(changed, mi.Bool(True), pixel, inside)
+        dr.eval(changed, part)
+        return Image(**{f.name: _select(changed, getattr(part, f.name), getattr(self, f.name)) for f in fields(Image)})
+
+
+def _select(changed: Any, new: Any, old: Any) -> Any:
+    if new is None or old is None:
+        return None
+    if isinstance(new, list):
+        return [dr.select(changed, a, b) for a, b in zip(new, old, strict=True)]
+    return dr.select(changed, new, old)
+
+
+def largest_and_mean(error: Any) -> tuple[Any, Any]:
+    """Of the pixels' errors, up to 1; the mean by whole numbers, whose sum does not depend on its order."""
+    unit = 1 << 24
+    total = dr.sum(mi.UInt64(dr.minimum(error, 1.0) * unit))
+    return dr.minimum(dr.max(error), 1.0), mi.Float(total) / (unit * dr.width(error))
+
+
+T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
+"""State of a ray: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and from there
+on the tally of its instances where there are several. What is known of late peaks comes last, see :data:`_EXTRA`."""
+
+Late = Literal["taken", "estimated", "amended"]
+"""What becomes of peaks that come late in the order of a tile: nothing, an estimate of the error, or its correction."""
+
+_EXTRA: dict[Late, int] = {"taken": 0, "estimated": 7, "amended": 6}
+"""Numbers that a ray's state holds for that."""
+
+ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
+"""State of late peaks: estimate of the error; deepest peak, and sums of the last weights and of these times depth, red,
+green, blue."""
+
+_FORGETS = 8
+"""Weights of a new deepest peak that sums give way to where late ones are amended. From 2 on, more is better for solid
+walls, and less for a solid object: between 2 and 16 the PSNR of captures changes by up to 1.4 dB."""
+
+
+def _fresh(several: bool, late: Late) -> Pixel:
+    """A ray that has met nothing yet."""
+    nothing = [mi.Float(0.0) for _ in range(TALLY - 1)]
+    tally, extra = new_tally() if several else [], [mi.Float(0.0) for _ in range(_EXTRA[late])]
+    return [mi.Float(1.0), *nothing, *tally, *extra]
+
+
+def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: Late) -> Pixel:
+    """The pixel after one more Gaussian."""
+    weight = pixel[T] * alpha
+    transmittance = pixel[T] - weight
+    colour = [record[6], record[7], record[8]]
+    sums = [dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)]
+    extra: list[Any] = []
+    if late == "estimated":
+        extra = _add_to_error(pixel, alpha, weight, colour, z)
+    elif late == "amended":
+        change, extra = _amended(pixel, alpha, weight, colour, z)
+        sums = [a + b for a, b in zip(sums, change, strict=True)]
+    return [
+        transmittance,
+        *sums,
+        dr.fma(weight, z, pixel[SUM_Z]),
+        dr.select((pixel[T] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z]),
+        *(add_to_tally(pixel[TALLY : len(pixel) - len(extra)], weight, record[15]) if several else []),
+        *extra,
+    ]
+
+
+def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, forgets: int) -> tuple[Any, Any]:
+    """Share of the sums that lies behind a peak if it is late, and that is left of them if it is the deepest one.
+
+    See the module. One division is enough for both.
+    """
+    total, moment, *_ = pixel[SUMS]
+    gap, reach = (pixel[DEEPEST] - z) * total, 2 * dr.fma(pixel[DEEPEST], total, -moment)
+    ratio = dr.select(late, gap, total) / dr.select(late, reach, dr.fma(forgets, weight, total))
+    return dr.select(gap < reach, ratio, 1.0), ratio
+
+
+def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> list[Any]:
+    """The estimate after one more Gaussian, see the module."""
+    total, _, *colours = pixel[SUMS]
+    deepest, met = pixel[DEEPEST], weight > 0
+    late = met & (z < deepest)
+    change = mi.Float(0.0)
+    for c, sum_c in zip(colour, colours, strict=True):
+        change = dr.maximum(change, dr.abs(dr.fma(total, c, -sum_c)))
+    behind, kept = _shares(pixel, weight, late, z, 2)
+    keep = dr.select(met & ~late, kept, 1.0)
+    return [
+        dr.select(late, dr.fma(alpha * behind, change, pixel[ERROR]), pixel[ERROR]),
+        dr.select(met, dr.maximum(z, deepest), deepest),
+        *(dr.fma(keep, old, weight * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
+    ]
+
+
+def _amended(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
+    """What one more Gaussian changes of the colour if it is late, and the state of late peaks after it."""
+    total, _, *colours = pixel[SUMS]
+    deepest, met = pixel[DEEPEST], weight > 0
+    late = met & (z < deepest)
+    behind, kept = _shares(pixel, weight, late, z, _FORGETS)
+    taken = dr.select(late, alpha * behind, 0.0)
+    change = [taken * dr.fma(total, c, -sum_c) for c, sum_c in zip(colour, colours, strict=True)]
+    keep = dr.select(met & ~late, kept, 1.0 - taken)
+    own = dr.fma(taken, total, weight)
+    return change, [
+        dr.select(met, dr.maximum(z, deepest), deepest),
+        *(dr.fma(keep, old, own * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
+    ]
+
+
+def trace(
+    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, *, z_max: Any | None = None
+) -> Image:
+    """Image of all placements; one that is too crowded for the memory is made in parts.
+
+    Args:
+        clouds: Gaussians on the device.
+        placements: Where they are.
+        view: The camera, from :meth:`View.sampled`.
+        quality: Order, cut-offs and kernel.
+        z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
+
+    Raises:
+        CrowdedError: If even one row of tiles is too crowded.
+    """
+    try:
+        return march(bin_gaussians(clouds, placements, view, quality), view, quality, z_max=z_max)
+    except CrowdedError:
+        if view.tiles_y == 1:
+            raise
+    middle = view.tiles_y // 2 * TILE_HEIGHT
+    parts = []
+    for start, stop in ((0, middle), (middle, view.height)):
+        pixels = dr.arange(mi.UInt32, (stop - start) * view.width) + start * view.width
+        part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
+        parts.append(trace(clouds, placements, view.rows(start, stop), quality, z_max=part_z))
+        dr.eval(parts[-1])
+    return Image.joined(parts)
+
+
+def march(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    *,
+    z_max: Any | None = None,
+    slopes: tuple[list[Any], list[Any]] | None = None,
+) -> Image:
+    """Blend every ray of a view front to back, and average the colours of each pixel.
+
+    What labels are made of belongs to the pixel's centre, through which a ray goes whatever the number of samples.
+
+    Args:
+        lists: Depth-sorted Gaussians per tile.
+        view: Camera.
+        quality: Order, cut-off and early end.
+        z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
+        slopes: Those of the rays, where they are known already; for one sample per pixel.
+    """
+    if quality.order != "window" or not lists.pairs:
+        return _march(lists, view, quality, quality.order, z_max, slopes)[0]
+    image, chosen = _march(lists, view, quality, "tile", z_max, estimated=True)
+    if dr.width(chosen) == 0:
+        return image
+    some = some_tiles(lists, chosen)
+    part, chosen = _march(some, view, quality, "window", z_max, estimated=True)
+    if dr.width(chosen):
+        again = in_ray_order(some, chosen, view)
+        part = part.with_tiles(march(again, view, replace(quality, tolerance=0.0), z_max=z_max), again, view)
+    return image.with_tiles(part, some, view)
+
+
+def _march(
+    lists: TileLists,
+    view: View,
+    quality: Quality,
+    order: Order,
+    z_max: Any | None,
+    slopes: tuple[list[Any], list[Any]] | None = None,
+    estimated: bool = False,
+) -> tuple[Image, Any]:
+    """The image of one march, and the places of the tiles whose errors are ``estimated`` above the tolerance."""
+    lanes = Lanes(lists, view, len(slopes[0]) if slopes else rows_together(order))
+    far = [
+        dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
+        for p, m in zip(lanes.pixel, lanes.inside, strict=True)
+    ]
+    if order == "ray":
+        dr.eval(lists.nearest)
+    several = lists.instance is None
+    tolerance = dr.opaque(mi.Float, quality.tolerance) if estimated else None
+    gives_up = estimated and order == "tile"
+    late: Late = "estimated" if estimated else _late(quality)
+
+    def right(pixels: list[Pixel]) -> Any:
+        """Whether lanes have no ray whose error exceeds the tolerance."""
+        return ~_too_wrong([pixel[ERROR] for pixel in pixels], lanes.inside, tolerance)
+
+    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
+        """States of the rays at a place in the pixels, and estimates of their errors."""
+        state: dict[str, Any] = {"several": labelled and several, "late": late}
+        where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
+        rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
+        found = walk(rays, order, partial(_fresh, **state), partial(_blend, **state), right if gives_up else None)
+        return _without_extra(found, late), [pixel[ERROR] for pixel in found] if estimated else []
+
+    found, errors = pixels(0.5, 0.5, labelled=True)
+    image, unsure = _collect(found, lanes, lists.instance, quality)
+    if gives_up and several:
+        unsure &= lanes.image(mi.Bool, [~_too_wrong(errors, lanes.inside, tolerance)] * lanes.rows)
+    if quality.order != "tile":
+        image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
+    if estimated:
+        dr.eval(image, unsure, errors)  # in one kernel
+    # One bit is soon read on a CPU, and mostly saves the launch; a GPU would have to be waited for.
+    if several and (dr.backend_v(unsure) == dr.JitBackend.CUDA or dr.any(unsure)):
+        image.instance = settle_instances(image.instance, unsure, lists, view, quality, order, z_max)
+    n, colours = view.samples, []
+    for y, x in np.ndindex(n, n) if n > 1 else ():
+        if (2 * x + 1, 2 * y + 1) == (n, n):  # the centre is one of an odd number of samples
+            colours.append([*image.rgb, image.alpha])
+        else:
+            found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
+            colours.append([*_picture(found, lanes, quality)])
+            errors = [dr.maximum(a, b) for a, b in zip(errors, also, strict=True)]
+        dr.eval(colours[-1], errors)
+    if n > 1:
+        *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
+        if estimated:
+            image.error = lanes.image(mi.Float, errors)
+    return image, _tiles_of(_too_wrong(errors, lanes.inside, tolerance), lanes) if estimated else None
+
+
+def _late(quality: Quality) -> Late:
+    """What becomes of late peaks where no error is estimated: in the order of rays there are none."""
+    return "amended" if quality.amends and quality.order == "tile" else "taken"
+
+
+def _without_extra(pixels: list[Pixel], late: Late) -> list[Pixel]:
+    """States of rays without what is known of late peaks."""
+    return [pixel[: len(pixel) - _EXTRA[late]] for pixel in pixels]
+
+
+def _too_wrong(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
+    """Whether the estimate for any of a lane's rays inside of the image exceeds the tolerance."""
+    return largest([dr.select(m, error, 0.0) for error, m in zip(errors, inside, strict=True)]) > tolerance
+
+
+def _tiles_of(flags: Any, lanes: Lanes) -> Any:
+    """Places of the tiles that have flagged lanes."""
+    dr.eval(flags)
+    per_tile = TILE_PIXELS // lanes.rows
+    lane = dr.arange(mi.UInt32, dr.width(flags) // per_tile) * per_tile
+    return dr.compress(reduce(or_, [dr.gather(mi.Bool, flags, lane + k) for k in range(per_tile)]))
+
+
+def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | None = None) -> Image:
+    """The pixels of some tiles, tile after tile, by one ray through the centre of each.
+
+    Arguments are those of :func:`march`, but nothing is repaired: the order is per tile or per ray.
+    """
+    lanes = Lanes(lists, view, rows_together(quality.order), apart=True)
+    places = zip(lanes.pixel, lanes.inside, strict=True)
+    far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
+    if quality.order == "ray":
+        dr.eval(lists.nearest)
+    late = _late(quality)
+    state: dict[str, Any] = {"several": lists.instance is None, "late": late}
+    where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
+    rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
+    found = walk(rays, quality.order, partial(_fresh, **state), partial(_blend, **state))
+    image, _ = _collect(_without_extra(found, late), lanes, lists.instance, quality)
+    dr.eval(image)
+    return image
+
+
+def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
+    """Red, green, blue and opacity of the lanes' pixels as row-major arrays."""
+    shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[T]] for pixel in pixels]
+    if quality.extends:
+        end = dr.opaque(mi.Float, quality.transmittance_min)
+        whole = [dr.select(pixel[T] <= end, dr.rcp(1.0 - pixel[T]), 1.0) for pixel in pixels]
+        shown = [[value * scale for value in values] for values, scale in zip(shown, whole, strict=True)]
+    return [lanes.image(mi.Float, list(channel)) for channel in zip(*shown, strict=True)]
+
+
+def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quality) -> tuple[Image, Any]:
+    """The lanes' pixels as row-major arrays, and where an instance may be wrong.
+
+    ``only`` is the id of all Gaussians if there is but one.
+    """
+    *rgb, alpha = _picture(pixels, lanes, quality)
+    depths = []
+    for pixel in pixels:
+        opacity = 1.0 - pixel[T]
+        mean = dr.select(opacity > 0, pixel[SUM_Z] / opacity, 0.0)
+        depths.append(dr.select(pixel[T] < 0.5, pixel[HALF_Z], mean))
+    unsure = None
+    if only is None:
+        winners = [winner_of_tally(pixel[TALLY:], pixel[T]) for pixel in pixels]
+        numbers = [number for number, _ in winners]
+        unsure = lanes.image(mi.Bool, [doubt for _, doubt in winners])
+    else:
+        everything = dr.opaque(mi.Float, only)
+        numbers = [dr.select(1.0 - pixel[T] > pixel[T], everything, 0.0) for pixel in pixels]
+    depth, instance = lanes.image(mi.Float, depths), lanes.image(mi.UInt32, numbers)
+    return Image(rgb, alpha, depth, instance, alpha, None), unsure

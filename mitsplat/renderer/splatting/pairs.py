@@ -1,0 +1,190 @@
+"""Pairs of Gaussians and the image tiles that their cut-off ellipses meet, with the keys that they are sorted by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.errors import MissingResourceError
+from mitsplat.quality import Quality
+from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.splatting.gaussian import RECORD, conic_touches_rectangle, ellipse_spans
+from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depths_by_tile, level_of
+from mitsplat.renderer.splatting.tile_subset import ChosenTiles, TileBox
+
+NUMBER_BITS = 26
+"""Bits of the number of a record or pair in what pairs are sorted by."""
+
+PAIRS_MAX = 1 << NUMBER_BITS
+"""Most pairs of a Gaussian and a tile that are held at once, about 40 bytes each."""
+
+TILES_MAX = 1 << (64 - DEPTH_BITS - NUMBER_BITS)
+"""Most tiles of a view."""
+
+
+class CrowdedError(MissingResourceError):
+    """A view has more pairs than :data:`PAIRS_MAX`, or tiles than :data:`TILES_MAX`: render a part of it."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the splats cover too much of the image for the memory: render a smaller image, or split the splats"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of a record and a tile, record after record.
+
+    Attributes:
+        key: What they are sorted by, see :meth:`key_of`.
+        record: Number of each one's record, of pairs that are numbered themselves.
+        first: First pair of each record, and the number of pairs; of the same.
+    """
+
+    key: Any
+    record: Any | None = None
+    first: Any | None = None
+
+    @staticmethod
+    def key_of(tile: Any, level: Any, number: Any) -> Any:
+        """Tile, level of depth, and the number of the record, or of the pair, in one."""
+        return mi.UInt64(tile) << (DEPTH_BITS + NUMBER_BITS) | mi.UInt64(level) << NUMBER_BITS | mi.UInt64(number)
+
+
+def pair_records(
+    records: Any,
+    near: Any | None,
+    least: Any,
+    box: Any,
+    view: View,
+    quality: Quality,
+    chosen: ChosenTiles | TileBox | None,
+    numbered: bool,
+    groups: Any | None = None,
+) -> Pairs | None:
+    """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
+
+    ``groups`` are numbers of the records, below 2^DEPTH_BITS, that they are sorted by in a tile instead of by depth.
+
+    Raises:
+        CrowdedError: If there are more than :data:`PAIRS_MAX`, or their keys have no room for tiles or records.
+    """
+    count = dr.width(least)
+    if count > 1 << NUMBER_BITS or view.tiles_x * view.tiles_y > TILES_MAX:
+        raise CrowdedError
+    order = dr.arange(mi.UInt32, count)
+    x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
+    row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0), view.tiles_y)
+    if rows == 0:
+        return None
+    # Rows first: one lane finds the spans of one record, and then one lane fills one span.
+    record = dr.gather(mi.ArrayXf, records, order, shape=(RECORD, count))
+    cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
+    owner, first_tile = dr.empty(mi.UInt32, rows), dr.empty(mi.UInt32, rows)
+    length = dr.empty(mi.UInt32, rows)
+    span_of = _spans(record, cut, x0, x1, view)
+
+    def one_row(y: Any) -> tuple[Any]:
+        lo, hi = span_of(y)
+        row = row_of + (y - y0)
+        begin, size = y * view.tiles_x + lo, dr.select(hi > lo, hi - lo, 0)
+        if chosen is not None:
+            begin, size = chosen.among(begin, size)
+        dr.scatter(owner, order, row, mode=dr.ReduceMode.Permute)
+        dr.scatter(first_tile, begin, row, mode=dr.ReduceMode.Permute)
+        dr.scatter(length, size, row, mode=dr.ReduceMode.Permute)
+        return (y + 1,)
+
+    dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
+    dr.eval(owner, first_tile, length)
+    pair_of, pairs = prefix_ranges(length, view.tiles_x)
+    if pairs == 0:
+        return None
+    record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
+    ellipsoid = dr.gather(mi.Float, least, owner)
+    key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
+
+    def in_view(tile: Any, active: Any = True) -> Any:
+        return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile, active)
+
+    if groups is None:
+        depth_of = depths_by_tile(record, near, ellipsoid, in_view(first_tile, length > 0), view, quality)
+    else:
+        group = dr.gather(mi.UInt32, groups, owner)
+
+    def one_tile(k: Any) -> tuple[Any]:
+        tile, pair = first_tile + k, pair_of + k
+        level = level_of(depth_of(in_view(tile)), view) if groups is None else group
+        own = Pairs.key_of(tile, level, pair if numbered else owner)
+        dr.scatter(key, own, pair, mode=dr.ReduceMode.Permute)
+        if numbered:
+            dr.scatter(number, owner, pair, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, rows),), lambda k: k < length, one_tile, label="pairs")
+    if not numbered:
+        dr.eval(key)
+        return Pairs(key)
+    first = dr.empty(mi.UInt32, count + 1)
+    end, inside = dr.opaque(mi.UInt32, pairs), row_of < dr.opaque(mi.UInt32, rows)
+    dr.scatter(first, dr.select(inside, dr.gather(mi.UInt32, pair_of, row_of, inside), end), order)
+    dr.scatter(first, end, dr.opaque(mi.UInt32, count))
+    dr.eval(key, number, first)
+    return Pairs(key, number, first)
+
+
+def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
+    """Where each of consecutive ranges begins, none of them larger than ``most``, and their whole size.
+
+    Raises:
+        CrowdedError: If that is more than :data:`PAIRS_MAX`.
+    """
+    count = dr.width(sizes)
+    begin, last = dr.prefix_sum(sizes), count - 1
+    sums = [dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last)]
+    if count * most > 0xFFFFFFFF:  # added as floats too, because a sum of integers may wrap
+        sums.append(mi.UInt32(dr.minimum(dr.sum(mi.Float(sizes)), 2.0 * PAIRS_MAX)))
+    totals: list[int] = np.array(dr.concat(sums)).tolist()
+    if max(totals) > PAIRS_MAX:
+        raise CrowdedError
+    return begin, totals[0]
+
+
+def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any], tuple[Any, Any]]:
+    """Function from a row of tiles to the half-open range of its tiles that a record's cut-off ellipse meets.
+
+    Gaussians at the camera's plane take their whole box. Under lens distortion, rows are no bands of slopes: the tiles
+    of the box are tried one by one.
+    """
+    u0, v0, a, b2, c, opacity, _, _, _, _, e, f, g, h, i, _ = record
+    k2 = opacity - cut
+    conic = a - k2 * g, b2 - k2 * h, c - k2 * i, -k2 * e, -k2 * f, -k2
+    whole = a < 0
+    if not view.distortion:
+        span_between = ellipse_spans(conic)
+        _, (first_v, step_v, height) = view.tile_grid()
+
+    def straight(y: Any) -> tuple[Any, Any]:
+        dv = dr.fma(mi.Float(y), step_v, first_v) - v0
+        lo_u, hi_u, meets = span_between(dv - 0.5 * height, dv + 0.5 * height)
+        lo, hi = view.tile_columns(u0 + lo_u, u0 + hi_u)
+        lo, hi = dr.maximum(lo, x0), dr.minimum(dr.select(meets, hi, 0), x1)
+        return dr.select(whole, x0, lo), dr.select(whole, x1, hi)
+
+    def distorted(y: Any) -> tuple[Any, Any]:
+        def one_tile(x: Any, lo: Any, hi: Any) -> tuple[Any, Any, Any]:
+            lo_u, hi_u, lo_v, hi_v = view.tile_slopes(y * view.tiles_x + x)
+            meets = whole | conic_touches_rectangle(conic, lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
+            return x + 1, dr.select(meets, dr.minimum(lo, x), lo), dr.select(meets, x + 1, hi)
+
+        _, lo, hi = dr.while_loop(
+            (mi.UInt32(x0), mi.UInt32(x1), mi.UInt32(x0)), lambda x, lo, hi: x < x1, one_tile, label="tiles of a row"
+        )
+        return lo, hi
+
+    return distorted if view.distortion else straight

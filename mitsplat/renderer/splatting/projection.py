@@ -1,0 +1,371 @@
+"""Projection: Gaussians of all placements, in one set of device arrays, to view records of those that a camera sees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.quality import KERNELS, Quality
+from mitsplat.renderer.rays.camera_rays import Kind, View
+from mitsplat.renderer.rays.device_arrays import concatenated, wrapped
+from mitsplat.renderer.splatting.gaussian import (
+    LOG2_E_HALF,
+    RECORD,
+    Cloud,
+    Response,
+    ellipse_bounds,
+    evaluate_sh,
+    general_response,
+    project_gaussian,
+    rotation_axes,
+)
+from mitsplat.renderer.splatting.splat_appearance import ROW, Appearance, changed, rows_of
+from mitsplat.renderer.splatting.tile_subset import ChosenTiles
+from mitsplat.runtime.recorded_kernels import Table, recorded
+
+PLACEMENT = 32
+"""Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
+cloud's frame as a sum of two floats (3 + 3), appearance (13). Two floats keep the difference exact far from the
+origin."""
+
+_APPEARANCE = PLACEMENT - ROW
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A cloud in the world.
+
+    Attributes:
+        cloud: Index of the cloud.
+        world_from_cloud: Rotation, translation and uniform scale, shape (4, 4).
+        instance: Instance id; 0 is the environment.
+        appearance: What its colours are changed by, if anything.
+    """
+
+    cloud: int
+    world_from_cloud: np.ndarray
+    instance: int
+    appearance: Appearance | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CloudSet:
+    """Several clouds in one set of device arrays, so that one kernel serves every placement of a scene."""
+
+    counts: tuple[int, ...]
+    first: tuple[int, ...]
+    geometry: Any
+    scales: Any
+    sh: Any
+    sh_count: int
+    sh_stride: int
+    _numbers: dict[tuple[int, ...], tuple[Any, Any]] = field(default_factory=dict, init=False, repr=False)
+
+    def numbers(self, chosen: Sequence[int]) -> tuple[Any, Any]:
+        """For every Gaussian of some clouds, one after the other: its cloud's place in ``chosen``, and its own number.
+
+        Those of the last two choices are kept: all of a layout's placements, and its objects alone.
+        """
+        key = tuple(chosen)
+        if key not in self._numbers:
+            while len(self._numbers) > 1:
+                del self._numbers[next(iter(self._numbers))]
+            self._numbers[key] = self._count_off(key)
+        return self._numbers[key]
+
+    def _count_off(self, chosen: tuple[int, ...]) -> tuple[Any, Any]:
+        counts = [self.counts[cloud] for cloud in chosen]
+        total = int(sum(counts))
+        number = dr.arange(mi.UInt32, total)
+        if total == 0:
+            return number, number
+        if len(chosen) == 1:
+            return dr.zeros(mi.UInt32, total), number + dr.opaque(mi.UInt32, self.first[chosen[0]])
+        begins = np.cumsum(counts) - counts
+        owner = dr.zeros(mi.UInt32, total)
+        # Clouds without Gaussians share a start with the next one: count each start as often as it occurs.
+        starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
+        if len(starts):
+            repeats, starts = (wrapped(mi.UInt32, values.astype(np.uint32)) for values in (repeats, starts))
+            dr.scatter(owner, repeats, starts)
+            owner = dr.cumsum(owner)
+        if not counts[0]:  # those without Gaussians before the first that has some
+            owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
+        shift = wrapped(mi.Int32, (np.array([self.first[cloud] for cloud in chosen]) - begins).astype(np.int32))
+        local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, shift, owner))
+        dr.eval(owner, local)
+        return owner, local
+
+
+def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
+    """Concatenate clouds on the device; SH are padded with zeros to the largest degree present."""
+    counts = tuple(c.count for c in clouds)
+    first = tuple(int(i) for i in np.concatenate([[0], np.cumsum(counts)[:-1]]))
+    if len(clouds) == 1:
+        (c,) = clouds
+        return CloudSet(counts, first, c.geometry, c.scales, c.sh, c.sh_count, c.sh_stride)
+    stride = max(c.sh_stride for c in clouds)
+    geometry, scales = concatenated([c.geometry for c in clouds]), concatenated([c.scales for c in clouds])
+    if all(c.sh_stride == stride for c in clouds):
+        sh = concatenated([c.sh for c in clouds])
+    else:
+        sh = dr.zeros(mi.Float, stride * sum(counts))
+        for start, c in zip(first, clouds, strict=True):
+            if c.count == 0:  # Dr.Jit adds nothing to arrays of no elements
+                continue
+            i = dr.arange(mi.UInt32, c.count * c.sh_stride)
+            # Opaque, so that another set of clouds reuses the compiled kernels.
+            row = i // c.sh_stride + dr.opaque(mi.UInt32, start)
+            dr.scatter(sh, c.sh, row * stride + i % c.sh_stride, mode=dr.ReduceMode.Permute)
+    dr.eval(geometry, scales, sh)
+    return CloudSet(counts, first, geometry, scales, sh, max(c.sh_count for c in clouds), stride)
+
+
+_ADJOINT = dr.ReduceMode.NoConflicts
+"""How gradients are added to a cloud: they are asked for where it is placed once, so each Gaussian has but one sum. The
+default would write the number of Gaussians into the kernels, and compile them anew whenever it changes."""
+
+
+def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
+    """Placement rows on the device, and for every Gaussian of every placement its row and its number in the clouds."""
+    rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
+    if placements:
+        matrix = np.array([p.world_from_cloud for p in placements], dtype=np.float64)
+        turn, shift = matrix[:, :3, :3], matrix[:, :3, 3]
+        scale = np.cbrt(np.linalg.det(turn))
+        pose = view.world_from_camera
+        centre = np.linalg.solve(turn, (pose[:3, 3] - shift)[..., None])[..., 0]
+        coarse = centre.astype(np.float32)
+        rows[:, :9] = (pose[:3, :3].T @ (turn / scale[:, None, None])).reshape(-1, 9)
+        rows[:, 9] = scale
+        rows[:, 10] = [p.instance for p in placements]
+        rows[:, 12:15] = coarse
+        rows[:, 16:19] = centre - coarse
+        rows[:, _APPEARANCE:] = rows_of([p.appearance for p in placements])
+    return wrapped(mi.Float, rows), *clouds.numbers([p.cloud for p in placements])
+
+
+class Projector:
+    """Gaussians of placements as the projection kernels read them; ``changed`` is whether any has an appearance."""
+
+    def __init__(
+        self, clouds: CloudSet, table: Any, view: View, quality: Quality, at_camera: bool, changed: bool = False
+    ) -> None:
+        self.clouds, self.table, self.view, self.quality, self.at_camera = clouds, table, view, quality, at_camera
+        self.changed = changed
+        self.cut = dr.opaque(mi.Float, quality.alpha_min)
+
+    def _load(self, owner: Any, local: Any) -> dict[str, Any]:
+        row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PLACEMENT, dr.width(owner)))
+        packet = dr.gather(mi.ArrayXf, self.clouds.geometry, local, mode=_ADJOINT, shape=(8, dr.width(local)))
+        sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, mode=_ADJOINT, shape=(4, dr.width(local)))
+        mean = mi.Vector3f(*[packet[i] - row[12 + i] - row[16 + i] for i in range(3)])
+        return {
+            "mean": mean,
+            "axes": rotation_axes([packet[4 + i] for i in range(4)]),
+            "sigma": [sigma[i] for i in range(3)],
+            "right": mi.Vector3f(row[0], row[1], row[2]),
+            "down": mi.Vector3f(row[3], row[4], row[5]),
+            "forward": mi.Vector3f(row[6], row[7], row[8]),
+            "scale": row[9],
+        } | {
+            "opacity": packet[3],
+            "instance": row[10],
+            "row": row,
+            "point": mi.Vector3f(*[packet[i] for i in range(3)]),
+        }
+
+    def _bounds(self, g: dict[str, Any]) -> tuple[Any, ...]:
+        """Response, opacity, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth.
+
+        Gaussians near the plane keep the exact response: a pixel is small against them, and no line of sight central.
+        """
+        view, kernel = self.view, KERNELS[self.quality.kernel]
+        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
+        k = dr.safe_sqrt(2 * dr.log(g["opacity"] / self.cut))
+        reach = [
+            g["scale"]
+            * k
+            * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(g["axes"], g["sigma"], strict=True)]))
+            for v in (g["right"], g["down"], g["forward"])
+        ]
+        centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
+        response, opacity = project_gaussian(**shape), g["opacity"]
+        if kernel.variance > 0:
+            # A filter is as wide as the view's pixels; what trainers add is of the picture's, however fine the view is.
+            variance = kernel.variance * (1 if kernel.keeps_light else view.zoom**2)
+            covariance = view.pixel_covariance(response.u0, response.v0, variance)
+            response, det = response.filtered(*covariance)
+            if kernel.keeps_light:
+                opacity = opacity * dr.rsqrt(det)
+        if self.quality.response == "ewa":
+            response = response.parallel()
+        k2 = 2 * dr.log(opacity / self.cut)
+        du0, du1, dv0, dv1, ellipse = ellipse_bounds(response.cutoff(k2))
+        near = ~ellipse | (centre[2] - reach[2] < view.near_plane)
+        opacity, k2 = dr.select(near, g["opacity"], opacity), dr.select(near, k * k, k2)
+        farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
+
+        # Slopes of the part of the ellipsoid's box beyond the near plane: loose, but only few Gaussians need it.
+        def slopes(axis: int) -> tuple[Any, Any]:
+            lo, hi = centre[axis] - reach[axis], centre[axis] + reach[axis]
+            return (
+                lo / dr.select(lo < 0, view.near_plane, farthest),
+                hi / dr.select(hi > 0, view.near_plane, farthest),
+            )
+
+        (near_u0, near_u1), (near_v0, near_v1) = slopes(0), slopes(1)
+        box = (
+            dr.select(near, near_u0, response.u0 + du0),
+            dr.select(near, near_u1, response.u0 + du1),
+            dr.select(near, near_v0, response.v0 + dv0),
+            dr.select(near, near_v1, response.v0 + dv1),
+        )
+        visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
+        if not self.at_camera:
+            visible &= ~near
+        return response, opacity, k2, near, visible, box, centre[2] - reach[2]
+
+    def cull(self, owner: Any, local: Any, chosen: ChosenTiles | None = None) -> tuple[Any, Any]:
+        """Whether Gaussians are in view, or near some tiles of it, and whether they reach the camera's plane."""
+        g = self._load(owner, local)
+        _, _, _, near, visible, box, _ = self._bounds(g)
+        x0, x1, y0, y1 = self.view.tile_box(*box)
+        visible, near = dr.detach(visible & (x1 > x0) & (y1 > y0)), dr.detach(near)
+        if chosen is not None:
+            visible &= chosen.any_in(x0, x1, y0, y1, visible)
+        dr.eval(visible, near)
+        return visible, near
+
+    def records(self, owner: Any, local: Any, near: Any) -> tuple[Any, Any, Any, Any]:
+        """View records, rows of those at the camera, least depths of the ellipsoids, and boxes of tiles."""
+        count = dr.width(local)
+        g = self._load(owner, local)
+        response, opacity, _, _, _, box, least = self._bounds(g)
+        record = self._record(g, response, opacity, local)
+        near_rows = None
+        near_index = dr.compress(near)
+        near_number = dr.zeros(mi.UInt32, count)
+        if dr.width(near_index) > 0:
+            near_rows = self._near_rows(near_index, owner, local)
+            dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
+        record[0], record[2] = dr.select(near, mi.Float(near_number), record[0]), dr.select(near, -1.0, record[2])
+        records, tile_box = _rows(mi.Float, record), _rows(mi.UInt32, self._tile_box(box))
+        least = dr.detach(least)
+        dr.eval(records, tile_box, least)
+        return records, near_rows, least, tile_box
+
+    def every_record(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """View records of all Gaussians, least depths, boxes of tiles, which are seen, and which of those at the plane.
+
+        Boxes of those that are not seen are empty, and records of those that reach the camera's plane do not say so.
+        Unlike after :meth:`cull`, no width depends on the view.
+        """
+        g = self._load(owner, local)
+        response, opacity, _, near, visible, box, least = self._bounds(g)
+        x0, x1, y0, y1 = self._tile_box(box)
+        visible = dr.detach(visible) & (x1 > x0) & (y1 > y0)
+        record = self._record(g, response, opacity, local)
+        boxes = _rows(mi.UInt32, [x0, x1, y0, dr.select(visible, y1, y0)])
+        return _rows(mi.Float, record), dr.detach(least), boxes, visible, visible & dr.detach(near)
+
+    def records_at_once(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
+        """As :meth:`records`, of all Gaussians, those out of view with empty boxes: by recorded kernels.
+
+        There is no gradient to them.
+        """
+        clouds, view = self.clouds, self.view
+        shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
+        arrays = Table(clouds.geometry), Table(clouds.scales), Table(clouds.sh), Table(self.table)
+        records, least, boxes, near = _every_record(view.kind, view.numbers, shape, arrays, owner, local)
+        if not dr.any(near):
+            return records, None, least, boxes
+        index = dr.compress(near)
+        rows = self._near_rows(index, owner, local)
+        dr.scatter(records, mi.Float(dr.arange(mi.UInt32, dr.width(index))), index * RECORD)
+        dr.scatter(records, mi.Float(-1.0), index * RECORD + 2)
+        dr.eval(records)
+        return records, rows, least, boxes
+
+    def _record(self, g: dict[str, Any], response: Response, opacity: Any, local: Any) -> list[Any]:
+        """View records of Gaussians that do not reach the camera's plane."""
+        scaled = LOG2_E_HALF
+        colour = self._colour(g["mean"], local)
+        if self.changed:
+            colour = changed(colour, [g["row"][_APPEARANCE + i] for i in range(ROW)], g["point"])
+        return [
+            response.u0,
+            response.v0,
+            response.a * scaled,
+            response.b2 * scaled,
+            response.c * scaled,
+            dr.log2(opacity),
+            *colour,
+            response.depth,
+            response.e,
+            response.f,
+            response.g,
+            response.h,
+            response.i,
+            g["instance"],
+        ]
+
+    def _tile_box(self, box: tuple[Any, ...]) -> list[Any]:
+        return list(self.view.tile_box(*(dr.detach(side) for side in box)))
+
+    def _near_rows(self, index: Any, owner: Any, local: Any) -> Any:
+        """General responses of Gaussians at the camera's plane."""
+        count = dr.width(index)
+        g = self._load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
+        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
+        c = [dr.detach(v) for v in general_response(**shape)]
+        rows = dr.empty(mi.Float, RECORD * count)
+        row = [*[x * LOG2_E_HALF for x in c[:6]], *c[6:], mi.Float(0)]
+        dr.scatter(rows, mi.ArrayXf(row), dr.arange(mi.UInt32, count))
+        dr.eval(rows)
+        return rows
+
+    def _colour(self, mean: Any, local: Any) -> list[Any]:
+        clouds = self.clouds
+        bands = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
+        floats = -(-3 * bands // 4) * 4
+        base = local * (clouds.sh_stride // 4)
+        packets = [dr.gather(mi.Array4f, clouds.sh, base + j, mode=_ADJOINT) for j in range(floats // 4)]
+
+        def coefficient(k: int) -> list[Any]:
+            return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]
+
+        # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
+        direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
+        return evaluate_sh(direction, coefficient, bands)
+
+
+@recorded
+def _every_record(
+    kind: Kind,
+    numbers: Mapping[str, Any],
+    shape: tuple[Quality, bool, bool, int, int],
+    arrays: tuple[Any, Any, Any, Any],
+    owner: Any,
+    local: Any,
+) -> tuple[Any, Any, Any, Any]:
+    """Records, least depths, boxes of tiles, and which reach the camera's plane, see ``Projector.every_record``."""
+    quality, at_camera, changed, sh_count, sh_stride = shape
+    geometry, scales, sh, table = arrays
+    clouds = CloudSet((dr.width(owner),), (0,), geometry, scales, sh, sh_count, sh_stride)
+    projector = Projector(clouds, table, View.of_numbers(kind, numbers), quality, at_camera, changed)
+    records, least, boxes, _, near = projector.every_record(owner, local)
+    return records, least, boxes, near
+
+
+def _rows(kind: Any, columns: list[Any]) -> Any:
+    """Columns side by side, as a flat array of type ``kind``."""
+    count = dr.width(columns)
+    rows = dr.empty(kind, len(columns) * count)
+    dr.scatter(rows, (mi.ArrayXf if kind is mi.Float else mi.ArrayXu)(columns), dr.arange(mi.UInt32, count))
+    return rows

@@ -1,0 +1,114 @@
+"""How one copy of captured Gaussians differs from another: their colours, and the dirt on them.
+
+A Gaussian's colour is that of its spherical harmonics towards the camera, all bands of it. It is made linear, taken by
+a 3x3 matrix, multiplied by dirt, and encoded again; nothing becomes brighter than white that was not. Dirt is a
+function of the Gaussian's centre in its own frame, the same from wherever it is seen: three octaves of value noise on a
+lattice, the first with :data:`CELLS` cells along the object (Ebert et al. 2003, "Texturing and Modeling", chapter 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.renderer.splatting.gaussian import linear_to_srgb, srgb_to_linear
+
+ROW = 13
+"""Floats of an appearance: whether there is one, the matrix row by row, wear, seed, and cells per unit of length."""
+
+CELLS = 3.0
+"""Cells of the coarsest noise along the longest side of an object."""
+
+OCTAVES = 3
+"""Of noise, each of twice the frequency and half the amplitude of the one before."""
+
+CLEAN, COVERED = 0.4, 0.7
+"""Values of the noise up to which there is no dirt, and from which it is at its thickest."""
+
+DIRT = (0.12, 0.09, 0.06)
+"""Factor of dirt that lets nothing through on linear red, green and blue."""
+
+_PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x9E3779B1)
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What a placement's colours are changed by.
+
+    Attributes:
+        matrix: On linear colours, row by row.
+        wear: Share of light that dirt takes where it is thickest, but for its own colour, in [0, 1].
+        seed: Of its noise, below 2^23.
+        size: Longest extent of the object in its own frame.
+    """
+
+    matrix: tuple[float, ...]
+    wear: float
+    seed: int
+    size: float
+
+    @property
+    def row(self) -> list[float]:
+        """As the kernels read it."""
+        return [1.0, *self.matrix, self.wear, float(self.seed), CELLS / self.size]
+
+
+def rows_of(appearances: list[Appearance | None]) -> np.ndarray:
+    """Rows of :data:`ROW` floats, of zeros where there is none."""
+    return np.array([[0.0] * ROW if one is None else one.row for one in appearances], np.float32).reshape(-1, ROW)
+
+
+def changed(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
+    """Display-encoded colours of Gaussians at ``point`` in their own frames, as their placements' rows say."""
+
+    def change(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
+        linear = [srgb_to_linear(c) for c in colour]
+        cover = row[10] * dirt(point * row[12], mi.UInt32(row[11]))
+        white = dr.maximum(dr.maximum(colour[0], colour[1]), dr.maximum(colour[2], 1.0))
+        result = []
+        for i in range(3):
+            mixed = sum(row[1 + 3 * i + j] * linear[j] for j in range(3))
+            result.append(dr.minimum(linear_to_srgb(mixed * (1 - cover * (1 - DIRT[i]))), white))
+        return result
+
+    return list(
+        dr.if_stmt((colour, row, point), row[0] > 0, change, lambda colour, *_: list(colour), label="appearance")
+    )
+
+
+def dirt(point: Any, seed: Any) -> Any:
+    """How thick dirt is at points in cells of the coarsest noise, in [0, 1]."""
+    total, weight = mi.Float(0), 0.0
+    for octave in range(OCTAVES):
+        total += 0.5**octave * _value_noise(point * 2.0**octave, seed + octave)
+        weight += 0.5**octave
+    t = dr.clip((total / weight - CLEAN) / (COVERED - CLEAN), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _value_noise(point: Any, seed: Any) -> Any:
+    """Random values in [0, 1) at whole coordinates, and cubic steps between them."""
+    low = [mi.Int32(dr.floor(c)) for c in point]
+    share = [c - mi.Float(i) for c, i in zip(point, low, strict=True)]
+    share = [t * t * (3 - 2 * t) for t in share]
+    total = mi.Float(0)
+    for corner in range(8):
+        ahead = [corner >> axis & 1 for axis in range(3)]
+        weight = mi.Float(1)
+        key = seed * _PRIMES[3]
+        for i, step, t, prime in zip(low, ahead, share, _PRIMES, strict=False):
+            weight *= t if step else 1 - t
+            key += mi.UInt32(i + step) * prime
+        total += weight * mi.Float(_hashed(key) >> 8) * 2.0**-24
+    return total
+
+
+def _hashed(key: Any) -> Any:
+    """32 bits of which each depends on each of the key (Wellons 2018, "Hash Function Prospector", lowbias32)."""
+    key = (key ^ (key >> 16)) * 0x7FEB352D
+    key = (key ^ (key >> 15)) * 0x846CA68B
+    return key ^ (key >> 16)

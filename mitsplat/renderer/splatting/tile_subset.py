@@ -1,0 +1,120 @@
+"""Some tiles of a view: their numbers, and how many of them lie in a part of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.renderer.rays.camera_rays import View
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenTiles:
+    """Tiles of a view that are looked at apart from all others.
+
+    Attributes:
+        number: Theirs in the view, ascending.
+        count: How many they are.
+        before: How many of them lie before each of the view's tiles, and of all.
+        above: How many lie above and to the left of each corner of the view's tiles, row by row (Crow 1984,
+            "Summed-area tables for texture mapping").
+        columns: Corners in a row.
+    """
+
+    number: Any
+    count: int
+    before: Any
+    above: Any
+    columns: int
+
+    @classmethod
+    def of(cls, flags: Any, view: View) -> ChosenTiles:
+        """Those of a view's tiles that are flagged (Bool)."""
+        columns, rows = view.tiles_x + 1, view.tiles_y + 1
+        number = dr.compress(flags)
+        corner = dr.arange(mi.UInt32, columns * rows)
+        y = corner // columns
+        x = corner - y * columns
+        tile = y * view.tiles_x + x
+        inside = (x < view.tiles_x) & (y < view.tiles_y)
+        flag = dr.select(dr.gather(mi.Bool, flags, tile, inside), mi.UInt32(1), 0)
+        # Sums along the rows of corners, then along their columns: whole sums, less those at the line's start.
+        running = dr.prefix_sum(flag)
+        along = running - dr.gather(mi.UInt32, running, y * columns)
+        across = x * rows + y
+        turned = dr.empty(mi.UInt32, columns * rows)
+        dr.scatter(turned, along, across, mode=dr.ReduceMode.Permute)
+        dr.eval(turned)
+        running = dr.prefix_sum(turned)
+        above = dr.gather(mi.UInt32, running, across) - dr.gather(mi.UInt32, running, x * rows)
+        ones = dr.select(flags, mi.UInt32(1), 0)
+        before = dr.empty(mi.UInt32, dr.width(flags) + 1)
+        order = dr.arange(mi.UInt32, dr.width(flags))
+        dr.scatter(before, dr.prefix_sum(ones), order, mode=dr.ReduceMode.Permute)
+        dr.scatter(before, dr.opaque(mi.UInt32, dr.width(number)), dr.opaque(mi.UInt32, dr.width(flags)))
+        dr.eval(number, before, above)
+        return cls(number, dr.width(number), before, above, columns)
+
+    def halves(self, view: View) -> tuple[ChosenTiles, ChosenTiles]:
+        """The first and the second half of them."""
+        middle, tiles = self.count // 2, dr.width(self.before) - 1
+        flags = [dr.zeros(mi.Bool, tiles) for _ in range(2)]
+        place = dr.arange(mi.UInt32, self.count)
+        for flag, mine in zip(flags, (place < middle, place >= middle), strict=True):
+            dr.scatter(flag, mi.Bool(True), self.number, mine)
+        first, second = (ChosenTiles.of(flag, view) for flag in flags)
+        return first, second
+
+    def any_in(self, x0: Any, x1: Any, y0: Any, y1: Any, active: Any = True) -> Any:
+        """Whether there are any in half-open ranges of columns and rows."""
+
+        def above(x: Any, y: Any) -> Any:
+            return dr.gather(mi.UInt32, self.above, y * self.columns + x, active)
+
+        return above(x1, y1) + above(x0, y0) > above(x0, y1) + above(x1, y0)
+
+    def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
+        """Place of the first, and number, of those among ``size`` consecutive tiles from ``begin`` on."""
+        first = dr.gather(mi.UInt32, self.before, begin)
+        return first, dr.gather(mi.UInt32, self.before, begin + size) - first
+
+
+@dataclass(frozen=True, eq=False)
+class TileBox:
+    """All tiles of a view in a box of them, as :class:`ChosenTiles` that need no tables.
+
+    Attributes:
+        number: Theirs in the view, ascending.
+        count: How many they are.
+        left, top, columns: Its first column and row, and its columns, as opaque values.
+        across: The view's columns.
+    """
+
+    number: Any
+    count: int
+    left: Any
+    top: Any
+    columns: Any
+    across: int
+
+    @classmethod
+    def around(cls, boxes: Any, view: View) -> TileBox:
+        """The smallest around half-open ranges (x0, x1, y0, y1), four numbers each, none of which is empty."""
+        x0, x1, y0, y1 = dr.gather(mi.Array4u, boxes, dr.arange(mi.UInt32, dr.width(boxes) // 4))
+        ends = np.array(dr.concat([dr.min(x0), dr.max(x1), dr.min(y0), dr.max(y1)])).tolist()
+        left, right, top, bottom = (int(end) for end in ends)
+        place = dr.arange(mi.UInt32, (right - left) * (bottom - top))
+        first_column, first_row, columns = (dr.opaque(mi.UInt32, n) for n in (left, top, right - left))
+        row = place // columns
+        number = (first_row + row) * view.tiles_x + first_column + (place - row * columns)
+        dr.eval(number)
+        return cls(number, dr.width(number), first_column, first_row, columns, view.tiles_x)
+
+    def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
+        """Place of the first, and number, of ``size`` consecutive tiles in the box from ``begin`` on."""
+        row = begin // self.across
+        return (row - self.top) * self.columns + (begin - row * self.across - self.left), size

@@ -1,0 +1,307 @@
+"""From clouds of Gaussians to depth-sorted lists per image tile, all on the device.
+
+1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel). 2. *Project*
+what is left to view records (one kernel), see :mod:`mitsplat.renderer.splatting.projection`. On a GPU, both at once. 3.
+*Pair* each with the tiles that its cut-off ellipse really meets, see
+   :mod:`mitsplat.renderer.splatting.pairs`.
+4. *Sort* the pairs by tile and by depth there, see :mod:`mitsplat.renderer.splatting.tile_depths`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.quality import Quality
+from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.device_arrays import concatenated
+from mitsplat.renderer.splatting.gaussian import RECORD
+from mitsplat.renderer.splatting.pairs import NUMBER_BITS, Pairs, pair_records, prefix_ranges
+from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
+from mitsplat.renderer.splatting.sorting import numpy_sorts_slowly, sort_in_threads, stable_order
+from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
+from mitsplat.renderer.splatting.tile_subset import ChosenTiles, TileBox
+
+AT_ONCE = 1 << 22
+"""Most Gaussians that are projected without a look at which of them are seen: records take 84 bytes each."""
+
+
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """Depth-sorted Gaussians of every tile.
+
+    Attributes:
+        records: View records, see :data:`mitsplat.renderer.splatting.gaussian.RECORD`.
+        near: Coefficients of :func:`mitsplat.renderer.splatting.gaussian.general_response`, 16 floats each, of the
+        Gaussians that
+            reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
+        entries: Record numbers, tile after tile.
+        slots: Place of every entry if they were sorted by record number instead; of lists that are for gradients.
+        first: First of those places of each record, and the number of entries; of the same.
+        nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
+        start, stop: Range of each tile in ``entries``.
+        visible, pairs: Number of records and of entries.
+        instance: Id of all of them, or None if they have several.
+        levels: What entries are sorted by in their tile.
+        tiles: Numbers of the tiles whose ranges these are; None for all of the view's.
+        least: Depth [m] in front of which no peak of each record lies, for tiles that are sorted again.
+    """
+
+    records: Any
+    near: Any | None
+    entries: Any
+    slots: Any
+    first: Any
+    nearest: Any
+    start: Any
+    stop: Any
+    visible: int
+    pairs: int
+    instance: int | None
+    levels: Any
+    tiles: Any | None = None
+    least: Any | None = None
+
+
+def bin_gaussians(
+    clouds: CloudSet,
+    placements: Sequence[Placement],
+    view: View,
+    quality: Quality,
+    *,
+    at_camera: bool = True,
+    chosen: ChosenTiles | None = None,
+    fitted: bool = False,
+    groups: Any | None = None,
+    for_gradients: bool = False,
+) -> TileLists:
+    """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
+
+    Args:
+        clouds: Gaussians on the device.
+        placements: Where they are.
+        view: The camera.
+        quality: Order, cut-offs and kernel.
+        at_camera: Whether Gaussians that reach the camera's plane are seen.
+        chosen: The only tiles that have lists; all of the view's if None.
+        fitted: Whether only the tiles in a box around all that is seen have lists.
+        groups: By instance id, a number below 2^DEPTH_BITS that its entries have for a level, instead of their depth.
+        for_gradients: Whether entries are to be known by record too.
+
+    Raises:
+        CrowdedError: If the view has too many pairs to hold.
+    """
+    table, owner, local = placement_table(clouds, placements, view)
+    if dr.width(local) == 0:
+        return _empty(view, chosen)
+    changed = any(placement.appearance is not None for placement in placements)
+    source = Projector(clouds, table, view, quality, at_camera, changed)
+
+    if chosen is None and not (fitted or for_gradients) and _at_once(dr.width(local)):
+        records, near_rows, least, box = source.records_at_once(owner, local)
+    else:
+        visible, near = source.cull(owner, local, chosen)
+        index = dr.compress(visible)
+        if dr.width(index) == 0:
+            return _empty(view, chosen)
+        owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
+        near = dr.gather(mi.Bool, near, index)
+        dr.eval(owner, local, near)
+        records, near_rows, least, box = source.records(owner, local, near)
+    ids = {placement.instance for placement in placements}
+    only = ids.pop() if len(ids) == 1 else None
+    listed: ChosenTiles | TileBox | None = TileBox.around(box, view) if fitted else chosen
+    if groups is not None:
+        row = dr.arange(mi.UInt32, dr.width(least)) * RECORD
+        groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, row + (RECORD - 1))))
+    return bin_records(
+        records, near_rows, least, box, view, quality, only, listed, groups=groups, for_gradients=for_gradients
+    )
+
+
+def _at_once(count: int) -> bool:
+    """Whether so many Gaussians are projected before it is known which are seen.
+
+    On a GPU, that takes less time than to wait for the number of them, and to trace what comes then.
+    """
+    return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and count <= AT_ONCE
+
+
+def bin_records(
+    records: Any,
+    near: Any,
+    least: Any,
+    box: Any,
+    view: View,
+    quality: Quality,
+    only: int | None,
+    chosen: ChosenTiles | TileBox | None = None,
+    *,
+    groups: Any | None = None,
+    for_gradients: bool = False,
+) -> TileLists:
+    """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
+
+    ``groups`` are as of :func:`mitsplat.renderer.splatting.pairs.pair_records`.
+
+    Raises:
+        CrowdedError: If there are too many pairs to hold.
+    """
+    pairs = pair_records(dr.detach(records), near, least, box, view, quality, chosen, for_gradients, groups)
+    if pairs is None:
+        return _empty(view, chosen, records)
+    tiles, own = _numbered(view, chosen)
+    return _listed(records, near, pairs, least, dr.width(least), tiles, view, only, own)
+
+
+def _listed(
+    records: Any,
+    near: Any,
+    pairs: Pairs,
+    least: Any,
+    visible: int,
+    tiles: int,
+    view: View,
+    only: int | None,
+    own: Any = None,
+) -> TileLists:
+    """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
+    count = dr.width(pairs.key)
+    # As many bits as numbers of all tiles have, so that lists of a few need no kernels of their own.
+    key = _sorted(pairs.key, DEPTH_BITS + max(1, (view.tiles_x * view.tiles_y - 1).bit_length()))
+    number, tile = mi.UInt32(key & ((1 << NUMBER_BITS) - 1)), dr.arange(mi.UInt32, tiles)
+    slots, entries = (None, number) if pairs.record is None else (number, dr.gather(mi.UInt32, pairs.record, number))
+    begins = _first_entries(key, tiles)
+    start, stop = dr.gather(mi.UInt32, begins, tile), dr.gather(mi.UInt32, begins, tile + 1)
+    dr.eval(entries, slots, start, stop)
+    levels = mi.UInt32(key >> NUMBER_BITS) & ((1 << DEPTH_BITS) - 1)
+    return TileLists(
+        records=records,
+        near=near,
+        entries=entries,
+        slots=slots,
+        first=pairs.first,
+        levels=levels,
+        nearest=depth_of_level(levels, view),
+        start=start,
+        stop=stop,
+        least=least,
+        visible=visible,
+        pairs=count,
+        instance=only,
+        tiles=own,
+    )
+
+
+def _numbered(view: View, chosen: ChosenTiles | TileBox | None) -> tuple[int, Any]:
+    """How many tiles have lists, and their numbers in the view unless they are all of it."""
+    return (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
+
+
+def _empty(view: View, chosen: ChosenTiles | TileBox | None, records: Any | None = None) -> TileLists:
+    tiles, own = _numbered(view, chosen)
+    zeros = dr.zeros(mi.UInt32, tiles)
+    dr.eval(zeros)
+    entry = dr.zeros(mi.UInt32, 1)
+    visible = 0 if records is None else dr.width(records) // RECORD
+    records = dr.zeros(mi.Float, RECORD) if records is None else records
+    none = dr.zeros(mi.Float, max(visible, 1))
+    return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, own, none)
+
+
+def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:
+    """The lists of some tiles of a view with the Gaussians of both, as if they had been binned together.
+
+    Raises:
+        CrowdedError: If there are too many pairs to hold.
+    """
+    visible = dr.width(first.records) // RECORD
+    both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
+    pairs = Pairs(Pairs.key_of(*(concatenated(parts) for parts in zip(*both, strict=True))))
+    dr.eval(pairs.key)
+    records, near = second.records, second.near
+    if near is not None and first.near is not None:
+        # The rows of the second follow those of the first.
+        row, before = dr.arange(mi.UInt32, second.visible) * RECORD, dr.opaque(mi.Float, dr.width(first.near) // RECORD)
+        shifted, at_camera = dr.copy(records), dr.gather(mi.Float, records, row + 2) < 0
+        dr.scatter(shifted, dr.gather(mi.Float, records, row) + before, row, at_camera)
+        records, near = shifted, concatenated([first.near, near])
+    records = concatenated([first.records, records])
+    near = first.near if near is None else near
+    least = concatenated([first.least, second.least])
+    return _listed(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
+
+
+def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
+    """The lists of some tiles by their places, as they are."""
+    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
+    start, stop = dr.gather(mi.UInt32, lists.start, chosen), dr.gather(mi.UInt32, lists.stop, chosen)
+    dr.eval(tiles, start, stop)
+    return replace(lists, start=start, stop=stop, tiles=tiles)
+
+
+def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
+    """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
+    place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
+    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
+    record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
+    slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
+    level = level_of(least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
+    again, count = Pairs(Pairs.key_of(place, level, number)), dr.width(tiles)
+    dr.eval(again.key)
+    return _listed(lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles)
+
+
+def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:
+    """Places in ``tiles``, levels, and records (from ``shift`` on) of the entries of some tiles; None if none."""
+    start = dr.gather(mi.UInt32, lists.start, tiles)
+    length = dr.gather(mi.UInt32, lists.stop, tiles) - start
+    begin, size = prefix_ranges(length, lists.pairs)
+    if size == 0:
+        return None
+    number, place, level = (dr.empty(mi.UInt32, size) for _ in range(3))
+    offset, own = dr.opaque(mi.UInt32, shift), dr.arange(mi.UInt32, dr.width(tiles))
+
+    def one_pair(k: Any) -> tuple[Any]:
+        entry, at = start + k, begin + k
+        dr.scatter(number, dr.gather(mi.UInt32, lists.entries, entry) + offset, at, mode=dr.ReduceMode.Permute)
+        dr.scatter(place, own, at, mode=dr.ReduceMode.Permute)
+        dr.scatter(level, dr.gather(mi.UInt32, lists.levels, entry), at, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, dr.width(tiles)),), lambda k: k < length, one_pair, label="merge")
+    dr.eval(place, level, number)
+    return place, level, number
+
+
+def _sorted(key: Any, bits: int) -> Any:
+    """Keys (UInt64, evaluated) of pairs by their leading ``bits``, above their numbers, by which they ascend already.
+
+    On most CPUs NumPy sorts several of them with each instruction, in their own memory.
+    """
+    if dr.backend_v(key) == dr.JitBackend.LLVM and not numpy_sorts_slowly():
+        sort_in_threads(key.numpy(), min(8, max(1, dr.thread_count() // 2)))
+        return key
+    in_order = dr.gather(mi.UInt64, key, stable_order(key >> NUMBER_BITS, bits))
+    dr.eval(in_order)
+    return in_order
+
+
+def _first_entries(key: Any, tiles: int) -> Any:
+    """Number of the first entry of every tile, and of all entries, by bisection of sorted keys."""
+    wanted = Pairs.key_of(dr.arange(mi.UInt32, tiles + 1), mi.UInt32(0), mi.UInt32(0))
+    pairs = dr.opaque(mi.UInt32, dr.width(key))
+
+    def halve(low: Any, high: Any) -> tuple[Any, Any]:
+        middle = (low + high) // 2
+        before = dr.gather(mi.UInt64, key, middle, low < high) < wanted
+        return dr.select(before, middle + 1, low), dr.select(before, high, middle)
+
+    state = dr.zeros(mi.UInt32, tiles + 1), pairs + dr.zeros(mi.UInt32, tiles + 1)
+    first, _ = dr.while_loop(state, lambda low, high: low < high, halve, label="first entries")
+    dr.eval(first)
+    return first

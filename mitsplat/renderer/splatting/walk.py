@@ -1,0 +1,439 @@
+"""Walks: rays go through their tiles' lists front to back, and blend what they meet.
+
+What a ray keeps of that is up to the caller: its state is a list of numbers whose first is the transmittance, and a
+function makes the next state of one and a Gaussian. One lane may carry several rays of a tile, because fetching a
+record costs several times more than evaluating it for a packet of rays: the more rays share a fetch, the better, until
+registers run out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.quality import KERNELS, Order, Quality
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
+from mitsplat.renderer.splatting.gaussian import RECORD, general_depth
+from mitsplat.renderer.splatting.tiles import TileLists
+
+SORT_SLOTS = 8
+"""Gaussians that the per-ray order collects in one walk over a part of a list."""
+
+WINDOW_SLOTS = 8
+"""Gaussians of a list that a ray holds back until it knows which of them comes first."""
+
+Pixel = list[Any]
+"""State of a ray, the transmittance first."""
+
+Blend = Callable[[Pixel, Any, Any, Any], Pixel]
+"""The state of a ray after one more Gaussian in front-to-back order: from the state, the Gaussian's opacity on the
+ray, its record, of which colour and instance may be asked for, and the depth of its peak. An opacity of 0 changes
+nothing."""
+
+
+def rows_together(order: Order) -> int:
+    """Pixels of a column that a lane carries, of a walk in an order.
+
+    A GPU has lanes enough for a ray each, and those of a warp fetch the same record then: the march takes 0.6 of the
+    time that it does with four. The orders of rays hold too many numbers for more than one.
+    """
+    return TILE_HEIGHT if order == "tile" and dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 1
+
+
+class Lanes:
+    """Which pixels each lane carries: one or more of a column of a tile.
+
+    Attributes:
+        pixel: Number of each of the lane's pixels, row-major.
+        inside: Whether it is in the image.
+        count: Of all pixels.
+        start, stop: Range of the tile's list.
+    """
+
+    def __init__(self, lists: TileLists, view: View, rows: int = TILE_HEIGHT, *, apart: bool = False) -> None:
+        """Lanes of ``rows`` pixels each, a divisor of a tile's height.
+
+        Tiles that are taken ``apart`` from their view have pixels of their own, tile after tile and row by row.
+        """
+        count = view.tiles_x * view.tiles_y if lists.tiles is None else dr.width(lists.tiles)
+        per_tile = TILE_PIXELS // rows
+        lane = dr.arange(mi.UInt32, count * per_tile)
+        own = lane // per_tile
+        tile = own if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, own)
+        tile_y, column, row = tile // view.tiles_x, lane % TILE_WIDTH, lane % per_tile // TILE_WIDTH * rows
+        self.view, self.rows = view, rows
+        self.x = (tile - tile_y * view.tiles_x) * TILE_WIDTH + column
+        self.y = tile_y * TILE_HEIGHT + row
+        self.count = count * TILE_PIXELS if apart else view.width * view.height
+        if apart:
+            first = own * TILE_PIXELS + row * TILE_WIDTH + column
+            self.pixel = [first + k * TILE_WIDTH for k in range(rows)]
+        else:
+            self.pixel = [(self.y + k) * view.width + self.x for k in range(rows)]
+        self.inside = [(self.x < view.width) & (self.y + k < view.height) for k in range(rows)]
+        self.start = dr.gather(mi.UInt32, lists.start, own)
+        self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, own), self.start)
+
+    def centre_slopes(self) -> tuple[list[Any], list[Any]]:
+        """Slopes u and v of the rays through the pixels' centres; those of a distorted view are in memory."""
+        if not self.view.distortion:
+            return self.slopes(0.5, 0.5)
+        number = dr.arange(mi.UInt32, self.view.width * self.view.height)
+        row = number // self.view.width
+        u, v = self.view.slopes(mi.Float(number - row * self.view.width) + 0.5, mi.Float(row) + 0.5)
+        dr.eval(u, v)
+        places = list(zip(self.pixel, self.inside, strict=True))
+        return [dr.gather(mi.Float, u, p, m) for p, m in places], [dr.gather(mi.Float, v, p, m) for p, m in places]
+
+    def image(self, kind: Any, values: list[Any]) -> Any:
+        """Row-major array of type ``kind`` of a value for each of the lane's pixels."""
+        target = dr.empty(kind, self.count)
+        for value, number, mask in zip(values, self.pixel, self.inside, strict=True):
+            dr.scatter(target, kind(value), number, mask, mode=dr.ReduceMode.Permute)
+        return target
+
+    def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
+        """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
+        pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(self.rows)]
+        return [u for u, _ in pairs], [v for _, v in pairs]
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays of some lanes, several each, which share a list.
+
+    Attributes:
+        lists: Depth-sorted Gaussians per tile.
+        us, vs: Slopes of a lane's rays.
+        far: Depths along z [m] beyond which they see nothing.
+        start, stop: Range of the lane's list.
+        near: Nearest depth that is seen [m].
+        cut, cap: Least and highest opacity that counts (log2); None for no highest.
+        end: Transmittance at which a ray ends.
+        column: Whether the slopes ``us`` of a lane are all the same.
+    """
+
+    lists: TileLists
+    us: list[Any]
+    vs: list[Any]
+    far: list[Any]
+    start: Any
+    stop: Any
+    near: Any
+    cut: Any
+    cap: Any | None
+    end: Any
+    column: bool
+
+    @classmethod
+    def through(
+        cls,
+        lists: TileLists,
+        view: View,
+        quality: Quality,
+        slopes: tuple[list[Any], list[Any]],
+        far: list[Any],
+        start: Any,
+        stop: Any,
+    ) -> Rays:
+        """Rays of a view that see as a quality says."""
+        highest = KERNELS[quality.kernel].alpha_max
+        return cls(
+            lists,
+            *slopes,
+            far,
+            start,
+            stop,
+            near=view.near_plane,
+            cut=faintest(quality),
+            cap=dr.log2(dr.opaque(mi.Float, highest)) if highest < 1 else None,
+            end=dr.opaque(mi.Float, quality.transmittance_min),
+            column=not view.distortion,
+        )
+
+    def respond(self, record: Any) -> list[tuple[Any, Any]]:
+        """(log2 of opacity along the ray, depth of the peak) of one Gaussian on the rays of each lane."""
+        return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
+
+
+def walk(
+    rays: Rays,
+    order: Order,
+    fresh: Callable[[], Pixel],
+    blend: Blend,
+    going: Callable[[list[Pixel]], Any] | None = None,
+) -> list[Pixel]:
+    """States of the rays at their ends, in the order of their tile's list, of their own peaks, or between the two.
+
+    Args:
+        rays: The rays.
+        order: As of :class:`mitsplat.quality.Quality`.
+        fresh: Makes the state of a ray that has met nothing.
+        blend: What Gaussians add to it.
+        going: Whether lanes go on, by the states of their rays; for the order of the tile's list.
+    """
+    if order == "tile":
+        return _walk_in_tile_order(rays, fresh, blend, going)
+    return (_walk_in_window if order == "window" else _walk_in_ray_order)(rays, fresh, blend)
+
+
+def largest(values: Sequence[Any]) -> Any:
+    """Of the values of a lane's rays, none of them NaN, by which the lane knows when it is done."""
+    return reduce(lambda a, b: dr.select(a > b, a, b), values)
+
+
+def faintest(quality: Quality) -> Any:
+    """Logarithm to base 2 of the opacity below which a response does not count, one that :func:`exp2` takes."""
+    return dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
+
+
+def exp2(x: Any) -> Any:
+    """2^x from -126 to 126, by less than 2e-7 of it; anything beyond that.
+
+    On a CPU by the nearest whole number, which is added to the exponent, and a polynomial of the rest, that is 1 at 0:
+    half of the instructions of Dr.Jit's own, which knows no limits. A GPU has one instruction for it.
+    """
+    if dr.backend_v(x) == dr.JitBackend.CUDA:
+        return dr.exp2(x)
+    rounded = x + _ROUNDS
+    rest = x - (rounded - _ROUNDS)
+    power = mi.Float(_EXP2[-1])
+    for coefficient in reversed(_EXP2[:-1]):
+        power = dr.fma(power, rest, coefficient)
+    exponent = dr.reinterpret_array(mi.UInt32, rounded) << 23
+    return dr.reinterpret_array(mi.Float, dr.reinterpret_array(mi.UInt32, power) + exponent)
+
+
+_ROUNDS = 1.5 * 2.0**23
+"""What is added to this has the place of its ones at the end of its bits."""
+
+_EXP2 = 1.0, 0.69314700, 0.24022242, 0.055507336, 0.0096715130, 0.0013264727
+"""Coefficients of the powers of x of 2^x between -1/2 and 1/2, of least relative error."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fields:
+    """Fields of the records of that number, fetched where they are asked for: rays of a lane meet different ones."""
+
+    records: Any
+    number: Any
+    mask: Any
+
+    def __getitem__(self, field: int) -> Any:
+        return dr.gather(mi.Float, self.records, self.number * RECORD + field, self.mask)
+
+
+def respond_along(
+    record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
+) -> list[tuple[Any, Any]]:
+    """(log2 of opacity along the ray, depth of the peak) of one Gaussian on several rays, as in module `gaussian`."""
+    u0, v0, a, b2, c, opacity, _, _, _, depth, e, f, g, h, i, _ = record
+    result: list[Any] = []
+    previous: Any = None
+    slant = 0.5 * depth * f
+    for u, v in zip(us, vs, strict=True):
+        if previous is None or not shared_column:
+            du = u - u0
+            ahead = depth * dr.fma(0.5 * du, e, 1)
+            previous = a * du * du, b2 * du, dr.fma(du, dr.fma(du, g, e), 1), dr.fma(du, h, f), ahead
+        top, top_v, bottom, bottom_v, ahead = previous
+        dv = v - v0
+        numerator = dr.fma(dv, dr.fma(dv, c, top_v), top)
+        inverse = dr.rcp(dr.fma(dv, dr.fma(dv, i, bottom_v), bottom))
+        result += [dr.fma(-numerator, inverse, opacity), dr.fma(dv, slant, ahead) * inverse]
+
+    def at_the_camera(result: list[Any], row: Any) -> tuple[list[Any], Any]:
+        k = dr.gather(mi.ArrayXf, lists.near, mi.UInt32(row), shape=(RECORD, dr.width(row)))
+        found: list[Any] = []
+        for u, v in zip(us, vs, strict=True):
+            inverse, depth = general_depth(k, u, v)
+            numerator = (k[0] * u + k[1] * v + k[3]) * u + (k[2] * v + k[4]) * v + k[5]
+            found += [opacity - numerator * inverse, depth]
+        return found, row
+
+    if lists.near is not None:
+        result, _ = dr.if_stmt(
+            (result, u0), a < 0, at_the_camera, lambda result, row: (result, row), label="gaussian at the camera"
+        )
+    # Rounding can lift the response of a needle over its peak, by any factor.
+    most = opacity if cap is None else dr.minimum(opacity, cap)
+    log_alphas = [dr.select(log_alpha > most, most, log_alpha) for log_alpha in result[0::2]]
+    return list(zip(log_alphas, result[1::2], strict=True))
+
+
+def _walk_in_tile_order(
+    rays: Rays, fresh: Callable[[], Pixel], blend: Blend, going: Callable[[list[Pixel]], Any] | None
+) -> list[Pixel]:
+    """Blend in the order of the tile's list: that of the peaks along one of its rays."""
+    lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
+
+    def body(i: Any, pixels: list[Pixel]) -> tuple[Any, list[Pixel]]:
+        record = dr.gather(
+            mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
+        )
+        blended = []
+        responses = rays.respond(record)
+        for pixel, (log_alpha, z), z_far in zip(pixels, responses, far, strict=True):
+            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[0] > end)
+            alpha, z = dr.select(hit, exp2(log_alpha), 0.0), dr.select(hit, z, 0.0)
+            blended.append(blend(pixel, alpha, record, z))
+        return i + 1, blended
+
+    def alive(i: Any, pixels: list[Pixel]) -> Any:
+        unfinished = (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
+        return unfinished if going is None else unfinished & going(pixels)
+
+    _, pixels = dr.while_loop((rays.start, [fresh() for _ in far]), alive, body, label="march")
+    return pixels
+
+
+def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
+    """Blend in the order of the tile's list, but for what a window can put right.
+
+    A ray holds back the last :data:`WINDOW_SLOTS` Gaussians that it met, sorted by their peaks along it, and blends the
+    first one when another comes. What is more places too late in the list than that is blended late.
+    """
+    lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
+
+    def push(pixel: Pixel, window: _Slots, z: Any, alpha: Any, number: Any) -> tuple[Pixel, _Slots]:
+        result: _Slots = []
+        for slot_z, slot_alpha, slot_number in reversed(window):
+            # Whatever lies in front of the new peak, or is its equal, moves forward by one.
+            deeper = z >= slot_z
+            result.insert(
+                0,
+                (
+                    dr.maximum(z, slot_z),
+                    dr.select(deeper, alpha, slot_alpha),
+                    dr.select(deeper, number, slot_number),
+                ),
+            )
+            alpha, number = dr.select(deeper, slot_alpha, alpha), dr.select(deeper, slot_number, number)
+            z = dr.minimum(z, slot_z)
+        return blend(pixel, alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
+
+    def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
+        return (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
+
+    def body(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> tuple[Any, list[Pixel], list[_Slots]]:
+        number = dr.gather(mi.UInt32, lists.entries, i)
+        record = dr.gather(mi.ArrayXf, lists.records, number, shape=(RECORD, dr.width(i)))
+        states = []
+        for pixel, window, (log_alpha, z), z_far in zip(pixels, windows, rays.respond(record), far, strict=True):
+            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[0] > end)
+            state = pixel, window, z, exp2(log_alpha), number
+            states.append(dr.if_stmt(state, hit, push, lambda pixel, window, *_: (pixel, window), label="push"))
+        return i + 1, [pixel for pixel, _ in states], [window for _, window in states]
+
+    # An empty slot lies in front of all peaks, and nothing is seen of it.
+    empty = [[(mi.Float(0), mi.Float(0), mi.UInt32(0)) for _ in range(WINDOW_SLOTS)] for _ in far]
+    state = mi.UInt32(rays.start), [fresh() for _ in far], empty
+    _, pixels, windows = dr.while_loop(state, alive, body, label="march in a window")
+    ends = []
+    for pixel, window in zip(pixels, windows, strict=True):
+        for z, alpha, number in window:
+            seen = (alpha > 0) & (pixel[0] > end)
+            pixel = blend(pixel, dr.select(seen, alpha, 0.0), _Fields(lists.records, number, seen), z)
+        ends.append(pixel)
+    return ends
+
+
+def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
+    """Blend in the exact order of the peaks along each ray.
+
+    Every walk collects the next :data:`SORT_SLOTS` peaks behind the last one blended. It ends where no later entry can
+    have a peak in front of those, and the next one begins at the first entry that found no slot: a walk sees a short
+    part of the list, and any number of Gaussians in any order comes out right. Equal depths keep the list's order.
+    """
+    lists, start, stop, far = rays.lists, rays.start, rays.stop, rays.far
+    near, cut, end = rays.near, rays.cut, rays.end
+    width = dr.width(start)
+    none = 0xFFFFFFFF
+
+    def insert(slots: _Slots, left: Any, z: Any, alpha: Any, i: Any) -> tuple[_Slots, Any]:
+        """Slots in order of depth with one more peak, and the first entry that was left without."""
+        result: _Slots = []
+        behind = mi.Bool(False)
+        for slot_z, slot_alpha, slot_i in slots:
+            # Whatever lies behind the new peak moves on by one, also among equals: they keep their order.
+            behind |= z < slot_z
+            result.append((dr.minimum(z, slot_z), dr.select(behind, alpha, slot_alpha), dr.select(behind, i, slot_i)))
+            z, alpha, i = dr.maximum(z, slot_z), dr.select(behind, slot_alpha, alpha), dr.select(behind, slot_i, i)
+        return result, dr.select(z < dr.inf, dr.minimum(left, i), left)
+
+    def collect(begin: Any, limit: Any, seen: Any, last: list[tuple[Any, Any]]) -> tuple[Any, list[_Slots], list[Any]]:
+        def unfilled(i: Any, slots: list[_Slots], left: list[Any]) -> Any:
+            nearest = dr.gather(mi.Float, lists.nearest, i, i < limit)
+            wanted = mi.Bool(False)
+            for own in slots:
+                wanted |= nearest <= own[-1][0]
+            return (i < limit) & wanted
+
+        def body(i: Any, slots: list[_Slots], left: list[Any]) -> tuple[Any, list[_Slots], list[Any]]:
+            record = dr.gather(mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, width))
+            new_slots, new_left = [], []
+            responses = rays.respond(record)
+            for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
+                responses, slots, left, far, last, strict=True
+            ):
+                # An entry that no walk has seen counts wherever it lies: rounding may put it in front of its bound.
+                new = (z > last_z) | ((z == last_z) & (i > last_i)) | (i >= seen)
+                hit = (log_alpha > cut) & (z > near) & (z < z_far) & new
+                own, first_left = dr.if_stmt(
+                    (own, first_left, z, exp2(log_alpha), mi.UInt32(i)),
+                    hit,
+                    insert,
+                    lambda own, first_left, *_: (own, first_left),
+                    label="insert",
+                )
+                new_slots.append(own)
+                new_left.append(first_left)
+            return i + 1, new_slots, new_left
+
+        def empty() -> _Slots:
+            return [(mi.Float(dr.inf), mi.Float(0), mi.UInt32(0)) for _ in range(SORT_SLOTS)]
+
+        state = mi.UInt32(begin), [empty() for _ in far], [mi.UInt32(none) for _ in far]
+        i, slots, left = dr.while_loop(state, unfilled, body, label="collect")
+        return i, slots, left
+
+    def body(
+        pixels: list[Pixel], last: list[tuple[Any, Any]], begin: Any, seen: Any, active: Any
+    ) -> tuple[list[Pixel], list[tuple[Any, Any]], Any, Any, Any]:
+        reached, slots, left = collect(begin, dr.select(active, stop, begin), seen, last)
+        blended, new_last, unfinished, next_begin = [], [], mi.Bool(False), mi.UInt32(reached)
+        for pixel, own, first_left, (last_z, last_i) in zip(pixels, slots, left, last, strict=True):
+            for z, alpha, i in own:
+                found = active & (z < dr.inf) & (pixel[0] > end)
+                number = dr.gather(mi.UInt32, lists.entries, i, found)
+                record = _Fields(lists.records, number, found)
+                z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, which no weight makes 0
+                pixel = blend(pixel, dr.select(found, alpha, 0.0), record, z)
+            # A ray that has ended takes nothing more: no peak lies behind infinity.
+            open_ray = pixel[0] > end
+            z, _, i = own[-1]
+            last_i = dr.select(z < last_z, last_i, i)
+            blended.append(pixel)
+            new_last.append((dr.select(open_ray, dr.maximum(z, last_z), dr.inf), last_i))
+            next_begin = dr.select(open_ray, dr.minimum(next_begin, first_left), next_begin)
+            unfinished |= open_ray & ((first_left != none) | (reached < stop))
+        return blended, new_last, next_begin, dr.maximum(seen, reached), active & unfinished
+
+    state = (
+        [fresh() for _ in far],
+        [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in far],
+        mi.UInt32(start),
+        mi.UInt32(start),
+        start < stop,
+    )
+    pixels, *_ = dr.while_loop(state, lambda *state: state[-1], body, label="march by ray")
+    return pixels
+
+
+_Slots = list[tuple[Any, Any, Any]]
+"""Peaks in order of depth: depth, opacity and entry."""

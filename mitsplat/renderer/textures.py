@@ -1,0 +1,205 @@
+"""What visible shapes are made of, as Mitsuba's materials: patterns are images that repeat without a seam."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import ByteImage, Float64Array
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.renderer.rays.device_arrays import plain_mesh, wrapped
+from mitsplat.scene.planning.layout_surroundings import Finish
+from mitsplat.scene.spec.shape_spec import Shape
+from mitsplat.scene.walls import stated_pose
+
+SIZE = 1024
+"""Edge of a pattern's image [px]."""
+
+FEATURES = 12
+"""Largest features across the image; lines of grain, twice as many."""
+
+
+def texture_image(finish: Finish, images: Mapping[str, Path]) -> ByteImage | None:
+    """The image (H, W, 3) that a finish repeats, sRGB-encoded; None for one colour.
+
+    Args:
+        finish: The finish.
+        images: Files by the names that finishes have for them.
+    """
+    if finish.image is not None:
+        return with_gain(read_image(images[finish.image]), finish.gain or 1.0)
+    if finish.kind == "colour":
+        return None
+    share = _PATTERNS[finish.kind](np.random.default_rng(finish.seed))[..., None]
+    first, second = np.array(finish.colours)
+    encoded: ByteImage = np.rint(255 * (first + share * (second - first))).astype(np.uint8)
+    return encoded
+
+
+def repeat_width(finish: Finish) -> float:
+    """Width of a finish's image on a surface [m]."""
+    repeats = {"image": 1, "checker": 2, "wood": 2 * FEATURES, "brushed_metal": 2}
+    return finish.scale * repeats.get(finish.kind, FEATURES)
+
+
+def read_image(path: Path) -> ByteImage:
+    """An image file as sRGB-encoded bytes, shape (H, W, 3)."""
+    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    return np.array(bitmap)
+
+
+def with_gain(image: ByteImage, gain: float) -> ByteImage:
+    """An sRGB-encoded image with a factor on its linear colours, clipped at white."""
+    if gain == 1.0:
+        return image
+    table = encode_srgb(np.minimum(gain * decode_srgb(np.arange(256) / 255), 1.0))
+    return np.rint(255 * table).astype(np.uint8)[image]
+
+
+def material(finish: Finish, texture: dict[str, Any] | None) -> dict[str, Any]:
+    """Mitsuba's material of a finish.
+
+    Args:
+        finish: The finish.
+        texture: Mitsuba's texture of :func:`texture_image`; None for one colour.
+    """
+    colour = texture or {"type": "rgb", "value": decode_srgb(np.array(finish.colours[0])).tolist()}
+    if finish.roughness is None:
+        return {"type": "diffuse", "reflectance": colour}
+    # Scratches run along u, along which slopes are less.
+    return {
+        "type": "roughconductor",
+        "distribution": "ggx",
+        "material": "none",
+        "specular_reflectance": colour,
+        "alpha_u": finish.roughness / 3,
+        "alpha_v": finish.roughness,
+    }
+
+
+def bitmap_texture(image: ByteImage) -> dict[str, Any]:
+    """Mitsuba's texture of an sRGB-encoded image (H, W, 3)."""
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "wrap_mode": "repeat"}
+
+
+def finished_mesh(
+    mesh: trimesh.Trimesh,
+    shape: Shape,
+    finish: Finish,
+    image: ByteImage | None,
+    bsdf: Any = None,
+    travel: float = 0.0,
+) -> Any:
+    """Mitsuba's shape of a mesh with texture coordinates.
+
+    Args:
+        mesh: Mesh of ``shape`` in world space [m].
+        shape: What the scene file says of it.
+        finish: Its finish.
+        image: The finish's image.
+        bsdf: Mitsuba's material, loaded; its own default if None.
+        travel: How far its surface has run along the shape's own x axis [m], as a belt's does.
+    """
+    props = mi.Properties()
+    if bsdf is not None:
+        props["bsdf"] = bsdf
+    if image is None:
+        return plain_mesh(mesh, props)
+    corners = np.asarray(mesh.triangles).reshape(-1, 3)
+    split = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    uv = box_projection(mesh, pattern_axes(shape), finish, image.shape[0] / image.shape[1], travel)
+    made = mi.Mesh("mesh", len(corners), len(split.faces), has_vertex_texcoords=True, props=props)
+    params = mi.traverse(made)
+    params["vertex_positions"] = wrapped(mi.Float, np.asarray(split.vertices, dtype=np.float32))
+    params["vertex_texcoords"] = wrapped(mi.Float, uv.astype(np.float32))
+    params["faces"] = wrapped(mi.UInt32, np.asarray(split.faces, dtype=np.uint32))
+    params.update()
+    return made
+
+
+def pattern_axes(shape: Shape) -> Float64Array:
+    """Axes of the box that a pattern is projected from, as columns (3, 3): a box's or bin's own, else the world's."""
+    if shape.box is not None:
+        return stated_pose(shape.box)[:3, :3]
+    if shape.bin is not None:
+        turn = np.radians(shape.bin.rotate_z)
+        return np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+    return np.eye(3)
+
+
+def box_projection(
+    mesh: trimesh.Trimesh, axes: Float64Array, finish: Finish, aspect: float, travel: float = 0.0
+) -> Float64Array:
+    """Texture coordinates of each corner of each triangle (3 F, 2): every face sees the image along its nearest axis.
+
+    Args:
+        mesh: In world space [m], F triangles.
+        axes: Columns (3, 3), along which the image is projected.
+        finish: Whose ``repeat_width``, rotation and offset count.
+        aspect: Height of the image over its width.
+        travel: How far the image has moved along the first axis [m].
+    """
+    local = np.asarray(mesh.triangles) @ axes - [travel, 0.0, 0.0]
+    normals = np.asarray(mesh.face_normals) @ axes
+    along = np.argmax(np.abs(normals), axis=1)
+    # Seen along x the image lies in y and z, along y in x and z, along z in x and y; its rows go down, and from no side
+    # is it a mirror image.
+    plane = np.array([[1, 2], [0, 2], [0, 1]])[along]
+    facing = np.where(np.take_along_axis(normals, along[:, None], axis=1) < 0, -1.0, 1.0)
+    right = facing * np.array([1.0, -1.0, 1.0])[along][:, None]
+    uv = np.take_along_axis(local, plane[:, None], axis=2) * np.stack([right, -np.ones_like(right)], axis=2)
+    uv = uv.reshape(-1, 2)
+    turn = np.radians(finish.rotate)
+    uv = uv @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return np.asarray(uv / (repeat_width(finish) * np.array([1.0, aspect])) + finish.offset)
+
+
+def _clouds(rng: np.random.Generator, x: float, y: float, fall: float = 1.6) -> Float64Array:
+    """Periodic noise in [0, 1], by spectral synthesis: amplitudes fall as 1/f^``fall`` from ``x`` and ``y`` periods on.
+
+    Peitgen and Saupe (1988), The Science of Fractal Images, section 2.6; stretched where ``x`` and ``y`` differ.
+    """
+    fy, fx = np.meshgrid(np.fft.fftfreq(SIZE, 1 / SIZE), np.fft.rfftfreq(SIZE, 1 / SIZE), indexing="ij")
+    frequency = np.hypot(fx / x, fy / y)
+    amplitude = np.where(frequency > 0, np.maximum(frequency, 1.0) ** -fall, 0.0)
+    amplitude *= np.minimum(frequency, 1.0)
+    phase = np.exp(2j * np.pi * rng.random(amplitude.shape))
+    waves = np.fft.irfft2(amplitude * phase, s=(SIZE, SIZE))
+    return np.asarray(np.clip(0.5 + waves / (5 * waves.std()), 0.0, 1.0))
+
+
+def _noise(rng: np.random.Generator) -> Float64Array:
+    return _clouds(rng, FEATURES, FEATURES)
+
+
+def _wood(rng: np.random.Generator) -> Float64Array:
+    """Lines along x, bent by noise that is long in x: early wood fades in, late wood ends at once. Fibres over it."""
+    height = np.arange(SIZE)[:, None] / SIZE
+    bend = 6.0 * (_clouds(rng, 1, 3, 2.5) - 0.5)
+    rings = (2 * FEATURES * height + bend) % 1.0
+    edge = 0.12  # of a ring, in which late wood ends
+    lines = np.where(rings < 1 - edge, (rings / (1 - edge)) ** 2, (1 - rings) / edge)
+    return np.asarray(np.clip(0.75 * lines + 0.5 * (_clouds(rng, 6, 200, 1.0) - 0.25), 0.0, 1.0))
+
+
+def _brushed(rng: np.random.Generator) -> Float64Array:
+    return _clouds(rng, 2, 300, 0.8)
+
+
+def _checks(rng: np.random.Generator) -> Float64Array:
+    half = np.arange(SIZE) < SIZE // 2
+    return np.asarray((half[:, None] ^ half), dtype=np.float64)
+
+
+def _stripes(_: np.random.Generator) -> Float64Array:
+    """Each band fades as the side of a slat that is turned away from the light, and the next begins at once."""
+    across = (FEATURES * np.arange(SIZE) / SIZE) % 1.0
+    return np.repeat(across[:, None] ** 3, SIZE, axis=1)
+
+
+_PATTERNS = {"noise": _noise, "wood": _wood, "brushed_metal": _brushed, "checker": _checks, "stripes": _stripes}

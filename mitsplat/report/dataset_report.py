@@ -1,0 +1,303 @@
+"""One page to look at a dataset by: a single HTML file that needs no network, no server and no other file."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
+from mitsplat.dataset.manifest import read_lines
+from mitsplat.dataset.schema import Records, read_content
+from mitsplat.formats.coco import image_file
+from mitsplat.images.masks import Silhouette
+from mitsplat.images.picture_files import read_picture
+from mitsplat.labels.labels import Labels
+from mitsplat.labels.overlay import class_colour
+from mitsplat.pages.html import inline_image, make_page, mask_path
+from mitsplat.pages.svg_charts import HeatMap, Histogram, bars, columns
+from mitsplat.report.variety import Variety
+from mitsplat.storage.files import Record, open_regular, parse_json, write_text
+
+SAMPLES = 12
+"""Images that are shown, evenly spread over the dataset."""
+BRIGHTNESS_IMAGES = 200
+"""Images, evenly spread, that the brightness is read from."""
+
+_THUMBNAIL = 640
+_OVERLAYS = {"mask": "Masks", "box": "Boxes", "name": "Names", "alone": "Silhouettes, hidden parts included"}
+_SHOWN_FIRST = ("mask", "name")
+
+
+_SHARES = ("visible_fraction", "truncation", "agreement", "boundary_f1")
+
+
+class _Statistics:
+    """What is counted while the manifest is read once, for images of a size [px]."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.images, self.classes, self.per_image = Counter[str](), Counter[str](), Counter[int]()
+        self.shares = {key: Histogram((0, 1)) for key in _SHARES}
+        self.order_errors: list[tuple[float, float]] = []
+        self.left_out: dict[int, list[str]] = {}
+        cells = 24, max(2, round(24 * size[1] / size[0]))
+        self.places, self.sizes = HeatMap(size, cells), HeatMap(size, cells)
+
+    def add(self, record: Record) -> None:
+        labels = record["labels"]
+        self.images[record["split"]] += 1
+        self.per_image[len(labels["instances"])] += 1
+        self.classes.update(label["class"] for label in labels["instances"])
+        if error := record.get("order_error"):
+            self.order_errors.append((error["largest"], error["mean"]))
+        if record.get("left_out"):
+            self.left_out[record["layout"]] = [f"{one['name']} ({one['reason']})" for one in record["left_out"]]
+        boxes = np.array([label["box"] for label in labels["instances"]], dtype=np.float64).reshape(-1, 4)
+        self.places.add((boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2)
+        self.sizes.add(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
+        for key, counted in self.shares.items():
+            counted.add([label[key] for label in labels["instances"]])
+
+
+def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit, list[str]]:
+    """Write the page of a dataset, ``report.html`` in it by default.
+
+    Returns:
+        Its path, the audit that it shows, and its warnings of what a detector cannot learn from the images.
+
+    Raises:
+        InputError: If the folder is no dataset of mitsplat.
+        OSError: If the page cannot be written.
+    """
+    root = Path(root)
+    out = root / "report.html" if out is None else Path(out)
+    content = read_content(root)
+    records = Records(root, content)
+    output = content["scene"]["output"]
+    counted = _Statistics((output["width"], output["height"]))
+    variety = Variety(content)
+
+    def hear(record: Record) -> None:
+        counted.add(record)
+        variety.add(record)
+
+    audit = audit_dataset(root, hear)
+    name = str(content["scene"]["name"])
+    parts = [
+        f"<h1>{html.escape(name)}</h1>",
+        _summary(content, counted, audit, root),
+        _audit(audit),
+        _samples(root, records.some(SAMPLES)),
+        variety.sections(),
+        _charts(counted, _brightness(root, records.some(BRIGHTNESS_IMAGES)), _seconds(root)),
+        _details(content),
+    ]
+    write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
+    return out, audit, variety.warnings()
+
+
+def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: Path) -> str:
+    runs = _lines(root / "runs.jsonl")
+    rows = {
+        "Images": ", ".join(f"{count} {split}" for split, count in sorted(counted.images.items())),
+        "Size": f"{counted.size[0]} x {counted.size[1]} px",
+        "Instances": str(sum(counted.classes.values())),
+        "Not labelled": _counts(audit.dropped),
+        "Marked": _counts(audit.marked),
+        **({"Left out": _left_out(counted)} if counted.left_out else {}),
+        "Error of the order of blending, estimated": _order_error(counted),
+        "Labels from": content["scene"]["labels"]["source"],
+        "Formats": ", ".join(content["scene"]["output"]["formats"]),
+        "Seed": str(content["scene"]["seed"]),
+        "Command": " ; ".join(str(run.get("command", "unknown")) for run in runs) or "unknown",
+        "Device": content.get("device", "cpu"),
+        "mitsplat": content["mitsplat"],
+    }
+    lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
+    return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2><table>{lines}</table></section>'
+
+
+def _left_out(counted: _Statistics) -> str:
+    """What did not come to rest, most frequent first."""
+    told = Counter(text for objects in counted.left_out.values() for text in objects).most_common(5)
+    often = ", ".join(f"{count} {text}" for text, count in told)
+    return f"{len(counted.left_out)} layouts lack objects that did not come to rest: {often}"
+
+
+def _order_error(counted: _Statistics) -> str:
+    """Of display-encoded colours, over the images that know theirs."""
+    found, images = counted.order_errors, sum(counted.images.values())
+    if not found:
+        return "not estimated by this preset"
+    largest, mean = max(e for e, _ in found), sum(e for _, e in found) / len(found)
+    some = "" if len(found) == images else f", in {len(found)} of {images} images"
+    return f"{mean:.1e} of the range on average, {largest:.4f} at most{some}"
+
+
+def _audit(audit: Audit) -> str:
+    verdict = "No violations" if not audit.violations else f"{len(audit.violations)} violations"
+    found = "".join(
+        f"<li><code>{html.escape(file)}</code>: {html.escape(text)}</li>" for file, text in audit.violations[:100]
+    )
+    more = f"<p>and {len(audit.violations) - 100} more</p>" if len(audit.violations) > 100 else ""
+    return (
+        f'<section aria-labelledby="audit"><h2 id="audit">Audit</h2>'
+        f'<p class="{"good" if not audit.violations else "bad"}">{verdict} in {audit.files} files, '
+        f"{audit.instances} instances.</p>"
+        f"<p>Masks of more than {POLYGON_AREA} px in several parts whose YOLO polygon has an IoU below {POLYGON_IOU}, "
+        f"because bridges join the parts: {audit.low_polygons}.</p>"
+        f"{f'<ul>{found}</ul>' if found else ''}{more}</section>"
+    )
+
+
+def _samples(root: Path, records: Iterable[Record]) -> str:
+    boxes = "".join(
+        f'<label><input type="checkbox" data-overlay="{key}"{" checked" if key in _SHOWN_FIRST else ""}> {text}</label>'
+        for key, text in _OVERLAYS.items()
+    )
+    figures = "".join(_sample(root, record) for record in records)
+    return (
+        f'<section aria-labelledby="samples"><h2 id="samples">Samples</h2>'
+        f"<fieldset><legend>Show</legend>{boxes}</fieldset>"
+        f'<div class="samples {" ".join(f"show-{key}" for key in _SHOWN_FIRST)}" id="sheet">{figures}</div></section>'
+    )
+
+
+def _sample(root: Path, record: Record) -> str:
+    image = read_picture(root / image_file(record))
+    if image is None:
+        return f"<figure><figcaption>Frame {record['index']}: its image cannot be read</figcaption></figure>"
+    labels = Labels.from_json(record["labels"])
+    height, width = image.shape[:2]
+    scale = min(1.0, _THUMBNAIL / width)
+    small = cv2.resize(
+        image, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
+    )
+    source = inline_image(small)
+    unit = width / 640
+    marks, names = [], []
+    for label in labels.instances:
+        colour = "rgb({},{},{})".format(*class_colour(label.class_index))
+        x0, y0, x1, y1 = label.box
+        title = (
+            f"{label.class_name} {label.id}: {label.visible_fraction:.0%} visible, {label.truncation:.0%} cut off"
+            f"{''.join(f', {mark}' for mark in label.marks)}"
+        )
+        marks.append(
+            f"<g><title>{html.escape(title)}</title>"
+            f'<path class="alone" d="{mask_path(label.amodal)}" stroke="{colour}"/>'
+            f'<path class="mask" d="{mask_path(Silhouette(label.box, label.mask))}" fill="{colour}" stroke="{colour}"/>'
+            f'<rect class="box" x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}" stroke="{colour}"/></g>'
+        )
+        names.append(
+            f'<text class="name" x="{x0}" y="{max(y0 - 3 * unit, 11 * unit):.0f}" font-size="{12 * unit:.1f}">'
+            f"{html.escape(label.class_name)}</text>"
+        )
+    classes = _counts(Counter(label.class_name for label in labels.instances))
+    caption = f"Frame {record['index']}, {record['split']}: {classes}"
+    text = html.escape(caption, quote=True)
+    return (
+        f'<figure><div class="picture"><img alt="{text}" src="{source}">'
+        f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks + names)}</svg></div>'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
+
+
+def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, Histogram]:
+    """Counts of pixels by luma in 32 bins, and of images by their mean luma."""
+    counts, means = np.zeros(32, dtype=np.int64), Histogram((0, 255))
+    for record in records:
+        grey = read_picture(root / image_file(record), cv2.IMREAD_GRAYSCALE)
+        if grey is not None:
+            counts += np.histogram(grey, bins=32, range=(0, 256))[0]
+            means.add(grey.mean())
+    return counts, means
+
+
+def _seconds(root: Path) -> dict[str, float]:
+    """Median seconds of every stage over the frames."""
+    stages: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
+    for line in _lines(root / "timings.jsonl"):
+        for stage, seconds in line.items():
+            if stage != "index" and isinstance(seconds, int | float) and math.isfinite(seconds):
+                stages[stage].append(seconds)
+    return {stage: round(float(np.median(values)), 4) for stage, values in stages.items()}
+
+
+def _charts(counted: _Statistics, brightness: tuple[np.ndarray, Histogram], seconds: dict[str, float]) -> str:
+    share = counted.shares
+    most = max([1, *counted.per_image])
+    charts = [
+        bars("Instances by class", dict(sorted(counted.classes.items()))),
+        columns(
+            "Instances per image",
+            [counted.per_image[number] for number in range(most + 1)],
+            [str(number) for number in range(most + 1)],
+            "instances",
+        ),
+        counted.places.draw("Where boxes lie", "middle of the box [px]"),
+        counted.sizes.draw("How large boxes are", "width to the right, height down [px]"),
+        share["visible_fraction"].draw("Visible fraction of instances", "visible fraction"),
+        share["truncation"].draw("Truncation of instances", "share beyond the border"),
+        share["agreement"].draw("Agreement of splats and proxies", "IoU"),
+        share["boundary_f1"].draw("Agreement of their boundaries", "boundary F1"),
+        columns(
+            "Brightness of pixels",
+            brightness[0],
+            [f"{8 * i} to {8 * i + 7}" for i in range(len(brightness[0]))],
+            "luma",
+        ),
+        brightness[1].draw("Brightness of images", "mean luma"),
+        bars("Seconds per frame by stage, median", seconds, unit=" s"),
+    ]
+    return (
+        f'<section aria-labelledby="charts"><h2 id="charts">Statistics</h2>'
+        f'<div class="charts">{"".join(charts)}</div></section>'
+    )
+
+
+def _details(content: dict[str, Any]) -> str:
+    libraries = "".join(
+        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(version)}</td></tr>'
+        for name, version in content["libraries"].items()
+    )
+    scene = html.escape(json.dumps(content["scene"], indent=1))
+    return (
+        f'<section aria-labelledby="origin"><h2 id="origin">Origin</h2>'
+        f"<details><summary>Libraries</summary><table>{libraries}</table></details>"
+        f'<details><summary>Scene in effect</summary><pre tabindex="0">{scene}</pre></details></section>'
+    )
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The objects that lines of a file hold, which may be missing or torn."""
+    with suppress(FileNotFoundError), open_regular(path) as file:
+        for line in read_lines(file):
+            with suppress(ValueError):
+                if isinstance(found := parse_json(line), dict):
+                    yield found
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()) if count) or "none"
+
+
+_SCRIPT = """
+"use strict";
+const sheet = document.getElementById("sheet");
+for (const box of document.querySelectorAll("input[data-overlay]")) {
+  const show = () => sheet.classList.toggle("show-" + box.dataset.overlay, box.checked);
+  box.addEventListener("change", show);
+  show();
+}
+"""

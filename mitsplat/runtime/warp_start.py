@@ -1,0 +1,63 @@
+"""Warp without its greeting, and without what it says of machines that have no GPU."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mitsplat.errors import FULL
+from mitsplat.storage.cache import prepare_caches
+
+_started = False
+_NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
+
+
+@contextmanager
+def quiet_warp() -> Iterator[None]:
+    """Warp, started, telling of nothing but errors; a function may be decorated by this.
+
+    That a machine has no GPU is no news: the warning, which no setting mutes, is left out. An error that a disk is full
+    names the folder of Warp's kernels, because nothing else is written here.
+    """
+    import warp as wp  # takes a third of a second, which only physics needs
+
+    global _started
+    kept = wp.config.log_level
+    wp.config.log_level = wp.LOG_ERROR
+    try:
+        if not _started:
+            prepare_caches()
+            with _stderr_without(_NO_GPU):
+                wp.init()  # type: ignore[no-untyped-call]
+            _started = True
+        yield
+    except OSError as error:
+        if error.errno in FULL and error.filename is None:
+            error.filename = wp.config.kernel_cache_dir
+        raise
+    finally:
+        wp.config.log_level = kept
+
+
+@contextmanager
+def _stderr_without(phrase: bytes) -> Iterator[None]:
+    """Leave out lines with a phrase from what native code writes to stderr."""
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    with tempfile.TemporaryFile() as written:
+        os.dup2(written.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            written.seek(0)
+            os.write(2, b"".join(line for line in written if phrase not in line))

@@ -1,0 +1,106 @@
+"""Images that a scene file names as a file, a folder, a pattern or a list: which ones they are."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+from mitsplat.errors import InputError
+from mitsplat.images.untrusted_images import IMAGES
+
+WILDCARDS = frozenset("*?[")
+
+
+MAX_ENTRIES = 1_000_000
+"""Entries of folders that a pattern may look at."""
+MAX_PARTS = 64
+
+
+def glob_below(folder: Path, pattern: str) -> list[Path]:
+    """Paths that a pattern matches, relative to a folder, by name.
+
+    The pattern is that of :meth:`pathlib.Path.glob`. A folder is read once however often ``**`` occurs, so the time
+    grows with the entries that are there.
+
+    Raises:
+        InputError: If it is no pattern, or has to look at more than :data:`MAX_ENTRIES` entries.
+    """
+    absolute = Path(pattern).is_absolute()
+    parts = [part for part in pattern.split("/") if part not in ("", ".")]
+    parts = [part for number, part in enumerate(parts) if part != "**" or parts[number - 1 : number] != ["**"]]
+    wrong = next((part for part in parts if "**" in part and part != "**"), None)
+    if not parts or wrong or "\0" in pattern or len(parts) > MAX_PARTS:
+        rule = f"'**' must be a whole part in {wrong!r}" if wrong else f"of 1 to {MAX_PARTS} parts"
+        raise InputError(f"must be a pattern of files or folders ({rule}; got {pattern!r})")
+    found = _matches("/" if absolute else str(folder), parts, pattern)
+    return sorted(Path(path) for path in found if not pattern.endswith("/") or Path(path).is_dir())
+
+
+def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
+    """Paths below a folder that match the parts of a pattern.
+
+    Every folder is visited with the numbers of all parts that may come next in it.
+    """
+    wild = {i: re.compile(fnmatch.translate(part)).match for i, part in enumerate(parts) if WILDCARDS & set(part)}
+    found, looked_at = set[str](), 0
+    waiting = [(root, {0})]
+    while waiting:
+        place, numbers = waiting.pop()
+        numbers |= {i + 1 for i in numbers if i < len(parts) and parts[i] == "**"}  # which may stand for no folder
+        if len(parts) in numbers:
+            found.add(place)
+        below = defaultdict[str, set[int]](set)
+        for i in numbers - {len(parts)} - wild.keys():
+            if os.path.lexists(path := f"{place}/{parts[i]}") and Path(path).exists():
+                below[parts[i]].add(i + 1)
+        try:
+            entries = os.scandir(place) if numbers & wild.keys() else nullcontext(())
+        except OSError:  # not a folder, or one of somebody else
+            entries = nullcontext(())
+        with entries as inside:
+            for entry in inside:
+                looked_at += 1
+                if looked_at > MAX_ENTRIES:
+                    raise InputError(f"must look at {MAX_ENTRIES} files and folders at most (got {pattern!r})")
+                for i in numbers & wild.keys():
+                    if parts[i] == "**":
+                        if entry.is_dir(follow_symlinks=False):
+                            below[entry.name].add(i)
+                    elif wild[i](entry.name) and (i + 1 == len(parts) or entry.is_dir()):
+                        below[entry.name].add(i + 1)
+        waiting += [(f"{place.rstrip('/')}/{name}", after) for name, after in below.items()]
+    return found
+
+
+def names_below(folder: Path, pattern: str, paths: Iterable[Path]) -> tuple[str, ...]:
+    """The names of what a pattern matched, as a scene file in a folder would state them."""
+    absolute = Path(pattern).is_absolute()
+    return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in paths)
+
+
+def image_names(folder: Path, images: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the image files, relative to a folder, in order.
+
+    Raises:
+        InputError: If there are none, or one does not exist.
+    """
+    if isinstance(images, tuple):
+        names = images
+    elif (folder / images).is_file():
+        names = (images,)
+    else:
+        pattern = f"{images.rstrip('/')}/*" if (folder / images).is_dir() else images
+        found = glob_below(folder, pattern) if WILDCARDS & set(pattern) else []
+        wanted = [path for path in found if path.suffix.lower() in IMAGES and not path.name.startswith(".")]
+        names = names_below(folder, pattern, wanted)
+    if not names:
+        raise InputError(f"must name at least one image (got {images!r}, where there is none)")
+    for name in names:
+        if not (folder / name).is_file():
+            raise InputError(f"{folder / name}: no such file")
+    return names

@@ -1,0 +1,97 @@
+"""Things that no folder holds, for distractors: convex solids of random proportions in random materials, as splats.
+
+A material is two colours in stripes, checks or spots of an object's own coordinates, or one, with a roughness and a
+specular reflectance. Nothing is traced: uniform light shows what hides nothing of itself in its own colours.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.asset import Asset
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.surfels import Surfels, place_surfels
+
+_KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
+_EXTENT = (0.025, 0.06)  # longest [m]
+_SURFELS = 1200
+_LINING = 0.97  # size of the second layer
+
+
+def make_primitives(streams: Iterable[np.random.Generator]) -> tuple[Asset, ...]:
+    """The primitives that random numbers decide, one each, the kinds in turn; 15 take a second or two."""
+    return tuple(_make(number, rng) for number, rng in enumerate(streams))
+
+
+def _make(number: int, rng: np.random.Generator) -> Asset:
+    kind = _KINDS[number % len(_KINDS)]
+    mesh = _solid(kind, rng)
+    mesh.apply_translation(-mesh.center_mass)
+    mesh.apply_scale(rng.uniform(*_EXTENT) / mesh.extents.max())
+    surfels = _lined(place_surfels(mesh, 1.0, _SURFELS, rng))
+    colours = [colorsys.hsv_to_rgb(rng.random(), rng.random(), rng.uniform(0.25, 0.95)) for _ in range(2)]
+    second = _pattern(surfels.points / mesh.extents.max(), rng)
+    polished = rng.random() < 0.3
+    return Asset(
+        name=f"{kind}_{number}",
+        class_name=kind,
+        splats=surfels.splats((np.array(colours)[second.astype(int)][:, None] - 0.5) / SH_C0),
+        mesh=mesh,
+        pieces=(mesh,),
+        friction=float(rng.uniform(0.3, 0.7)),
+        roughness=float(rng.uniform(0.1, 0.8)),
+        specular=float(rng.uniform(0.2, 0.5)) if polished else 0.04,
+    )
+
+
+def _solid(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
+    """A closed, convex mesh of any size, round ones fine enough for silhouettes of some hundred pixels."""
+    slim = rng.uniform(0.3, 1.0)
+    if kind == "box":
+        return trimesh.creation.box(extents=(1.0, slim, rng.uniform(0.2, 1.0)))
+    if kind == "cylinder":
+        return trimesh.creation.cylinder(radius=0.5, height=rng.uniform(0.3, 2.5), sections=32)
+    if kind == "sphere":
+        return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    if kind == "capsule":
+        ends = trimesh.creation.icosphere(subdivisions=3, radius=0.5).vertices
+        lift = np.array([0.0, 0.0, slim])
+        return trimesh.convex.convex_hull(np.concatenate([ends - lift, ends + lift]))
+    return trimesh.creation.cone(radius=0.5, height=0.5 + slim, sections=32)
+
+
+def _lined(surfels: Surfels) -> Surfels:
+    """Surfels and a second layer of them a little inside, through whose gaps nothing of the far side is seen.
+
+    Half a turn about z, which takes every solid to itself, puts other surfels behind the gaps.
+    """
+    turn = np.diag([-1.0, -1.0, 1.0])
+    return replace(
+        surfels,
+        points=np.concatenate([surfels.points, _LINING * surfels.points @ turn]),
+        frames=np.concatenate([surfels.frames, turn @ surfels.frames]),
+        scales=np.tile(surfels.scales, (2, 1)),
+        faces=np.tile(surfels.faces, 2),
+        barycentric=np.tile(surfels.barycentric, (2, 1)),
+    )
+
+
+def _pattern(points: Float64Array, rng: np.random.Generator) -> BoolArray:
+    """Which points (N, 3), of an object of size 1, have the second colour."""
+    style = rng.choice(["plain", "stripes", "checks", "spots"])
+    turned = Rotation.random(rng=rng).apply(points) * rng.uniform(2.0, 5.0)
+    if style == "plain":
+        return np.zeros(len(points), dtype=bool)
+    if style == "spots":
+        distance, _ = KDTree(rng.uniform(-3.0, 3.0, (80, 3))).query(turned)
+        return np.asarray(distance < 0.5)
+    cells = np.floor(turned[:, :1] if style == "stripes" else turned).astype(int)
+    return np.asarray(cells.sum(axis=1) % 2 == 1)

@@ -1,0 +1,214 @@
+"""What a scene file names: folders of assets, meshes, images, and patterns of them, which become what they match.
+
+Whatever is wrong with one is told by the key that names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import trimesh
+
+from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
+from mitsplat.errors import InputError
+from mitsplat.images.untrusted_images import check_images
+from mitsplat.scene.loading.image_lists import WILDCARDS, glob_below, image_names, names_below
+from mitsplat.scene.loading.primitives import make_primitives
+from mitsplat.scene.spec.light_spec import EnvironmentLight
+from mitsplat.scene.spec.material_spec import Material
+from mitsplat.scene.spec.named_files import environments, image_lists, named_images, object_assets
+from mitsplat.scene.spec.object_spec import PRIMITIVES
+from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.spec.shape_spec import Shape
+from mitsplat.scene.streams import random_stream
+from mitsplat.scene.walls import bin_walls, stated_pose
+from mitsplat.storage.files import is_inside
+from mitsplat.storage.yaml_input import FieldError, KeyPath, key_place
+
+_MOST_IMAGES = 500
+"""Tried in one process, which is given their names as arguments."""
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """What a scene file names, as it is on disk; assets and images by their names in the file."""
+
+    environments: tuple[Asset, ...]
+    assets: Mapping[str, Asset]
+    shape_meshes: tuple[trimesh.Trimesh, ...]
+    images: Mapping[str, Path]
+
+
+@contextmanager
+def blaming(path: Path, *keys: str | int) -> Iterator[None]:
+    """Begin the sentence of an error with the key of the scene file that led to it."""
+    try:
+        yield
+    except FieldError as error:
+        raise InputError(f"{key_place(path, (*keys, *error.key))}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{key_place(path, keys)}: {error}") from error
+
+
+def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
+    """The specification with patterns replaced by what they match, by name: folders of assets, and images.
+
+    Raises:
+        InputError: If there are none or not as many as weights, or what is named is where none may be.
+    """
+    if not allow_outside:
+        _confine(spec, path)
+    spec = _matched_images(_matched_environments(spec, path, allow_outside), path, allow_outside)
+    objects, lights = list(spec.objects), list(spec.lights)
+    for position, entry in enumerate(objects):
+        if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
+            with blaming(path, "objects", position, "pool"):
+                names = _matches(path.parent, entry.pool, "object", allow_outside=allow_outside)
+            with blaming(path, "objects", position):
+                entry.check_weights(len(names))
+            objects[position] = entry.model_copy(update={"pool": names})
+    for position, light in enumerate(lights):
+        if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
+            with blaming(path, "lights", position, "pool"):
+                names = _inside(path.parent, image_names(path.parent, light.pool), allow_outside)
+            with blaming(path, "lights", position):
+                light.check_weights(len(names))
+            lights[position] = light.model_copy(update={"pool": names})
+    return spec.model_copy(update={"objects": tuple(objects), "lights": tuple(lights)})
+
+
+def _inside(folder: Path, names: tuple[str, ...], allow_outside: bool) -> tuple[str, ...]:
+    """These names, refused if one leads to where none may be."""
+    for name in () if allow_outside else names:
+        _refuse_outside(folder, name)
+    return names
+
+
+def _matched_environments(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
+    pattern = spec.environment
+    if not isinstance(pattern, str):
+        return spec
+    if WILDCARDS & set(pattern) and not (path.parent / pattern / ASSET_FILE).is_file():
+        with blaming(path, "environment"):
+            names = _matches(path.parent, pattern, "environment", allow_outside=allow_outside)
+        spec = spec.model_copy(update={"environment": names})
+    with blaming(path):
+        spec.check_environment_weights()
+    return spec
+
+
+def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
+    found = {}
+    for keys, images in image_lists(spec):
+        with blaming(path, *keys):
+            found[keys] = _inside(path.parent, image_names(path.parent, images), allow_outside)
+    if not found:
+        return spec
+
+    def materials_of(*keys: str | int, among: Sequence[Material]) -> tuple[Material, ...]:
+        lists = (found.get((*keys, number, "images")) for number in range(len(among)))
+        return tuple(
+            material if images is None else material.model_copy(update={"images": images})
+            for material, images in zip(among, lists, strict=True)
+        )
+
+    shapes = tuple(
+        shape.model_copy(update={"materials": materials_of("shapes", number, "materials", among=shape.materials)})
+        for number, shape in enumerate(spec.shapes)
+    )
+    spec = spec.model_copy(update={"shapes": shapes})
+    if spec.backdrop is not None:
+        both = {key: materials_of("backdrop", key, among=getattr(spec.backdrop, key)) for key in ("floor", "walls")}
+        spec = spec.model_copy(update={"backdrop": spec.backdrop.model_copy(update=both)})
+    if spec.background is None:
+        return spec
+    background = spec.background.model_copy(update={"images": found["background", "images"]})
+    return spec.model_copy(update={"background": background})
+
+
+def _matches(
+    folder: Path, pattern: str, kind: Literal["object", "environment"], *, allow_outside: bool
+) -> tuple[str, ...]:
+    """Asset folders of a kind that a pattern matches, relative to a folder."""
+    found = [path for path in glob_below(folder, pattern) if (path / ASSET_FILE).is_file()]
+    named = _inside(folder, names_below(folder, pattern, found), allow_outside)
+    names = tuple(name for name in named if read_spec(folder / name).kind == kind)
+    if not names:
+        raise InputError(f"must match at least one folder of an {kind}'s asset (got {pattern!r}, which matches none)")
+    return names
+
+
+def _confine(spec: SceneSpec, path: Path) -> None:
+    """Refuse what is named outside of the scene's folder."""
+    named: list[tuple[KeyPath, str | None]] = [*environments(spec)]
+    named += [(keys, name) for keys, name, _ in object_assets(spec)]
+    patterns = ((i, entry.pool) for i, entry in enumerate(spec.objects))
+    named += [(("objects", i, "pool"), pattern) for i, pattern in patterns if isinstance(pattern, str)]
+    named += [(("shapes", position, "mesh"), shape.mesh) for position, shape in enumerate(spec.shapes)]
+    named += named_images(spec)
+    skies = ((i, getattr(light, "pool", None)) for i, light in enumerate(spec.lights))
+    named += [(("lights", i, "pool"), pattern) for i, pattern in skies if isinstance(pattern, str)]
+    for keys, name in named:
+        if name is not None:
+            with blaming(path, *keys):
+                _refuse_outside(path.parent, name)
+
+
+def _refuse_outside(folder: Path, name: str) -> None:
+    if not is_inside(folder, name):
+        raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
+
+
+def read_named(spec: SceneSpec, path: Path) -> Named:
+    """Read every asset and mesh that a scene file names, each once, and try its images, which Mitsuba reads.
+
+    Raises:
+        InputError: If one is missing or broken.
+    """
+    folder = path.parent
+    places, assets, shape_meshes = list[Asset](), dict[str, Asset](), []
+    for keys, name in environments(spec):
+        with blaming(path, *keys):
+            places.append(Asset.load(folder / name))
+    for keys, name, entry in object_assets(spec):
+        if entry.pool == PRIMITIVES:
+            streams = (random_stream(spec.seed, "primitive", number) for number in range(len(entry.names)))
+            assets |= {} if name in assets else dict(zip(entry.names, make_primitives(streams), strict=True))
+        elif name not in assets:
+            with blaming(path, *keys):
+                assets[name] = Asset.load(folder / name)
+    for position, shape in enumerate(spec.shapes):
+        with blaming(path, "shapes", position, "mesh"):
+            shape_meshes.append(shape_mesh(shape, folder))
+    images = {name: folder / name for _, name in named_images(spec)}
+    _check_images(spec, path, images)
+    return Named(tuple(places), assets, tuple(shape_meshes), images)
+
+
+def _check_images(spec: SceneSpec, path: Path, images: Mapping[str, Path]) -> None:
+    """Refuse images that are absent, or that Mitsuba should not be given."""
+    asked = list(named_images(spec))
+    for keys, name in asked:
+        with blaming(path, *keys):
+            if not images[name].is_file():
+                raise InputError(f"{images[name]}: no such file")
+    for start in range(0, len(asked), _MOST_IMAGES):
+        some = asked[start : start + _MOST_IMAGES]
+        for (keys, _), reason in zip(some, check_images([images[name] for _, name in some]), strict=True):
+            if reason is not None:
+                raise InputError(f"{key_place(path, keys)}: {reason}")
+
+
+def shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
+    """A shape in world space [m]; what it names is relative to a folder."""
+    if shape.bin is not None:
+        walls: trimesh.Trimesh = trimesh.boolean.union(list(bin_walls(shape.bin)))
+        return walls
+    if shape.box is None:
+        return read_mesh(folder / str(shape.mesh))
+    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=stated_pose(shape.box))
+    return box

@@ -1,0 +1,192 @@
+"""Loading of scene files: from YAML or Python to a checked :class:`~mitsplat.scene.scene.Scene`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import trimesh
+
+from mitsplat.asset import Asset
+from mitsplat.errors import InputError
+from mitsplat.scene.loading.references import Named, blaming, matched, read_named, shape_mesh
+from mitsplat.scene.planning.conveyor import check_belt
+from mitsplat.scene.planning.frame_lights import written_out
+from mitsplat.scene.planning.viewpoints import camera_at
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.named_files import environments, object_assets
+from mitsplat.scene.spec.object_spec import MAIN
+from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION, SceneSpec
+from mitsplat.scene.spec.shape_spec import Region
+from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
+from mitsplat.storage.file_kinds import refuse_others
+from mitsplat.storage.yaml_input import key_place, load_yaml
+
+_MADE_IN_PYTHON = "<python>.yaml"
+"""Name of the scene file that a scene made in Python has not: errors begin with it, datasets keep such a file."""
+
+
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
+    """Read a scene file, then every asset and mesh that it names, and then judge what was read.
+
+    Args:
+        path: The YAML file.
+        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+        allow_outside: Whether it may name assets, meshes and images outside of its folder.
+
+    Raises:
+        InputError: If the file or something that it names is missing or breaks a rule.
+    """
+    path = Path(path)
+    refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
+    return _scene_of(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
+
+
+def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
+    """A scene of a specification that was made in Python; no file is read but what it names.
+
+    Args:
+        spec: The scene, as ``ms.SceneSpec(name=..., region={"min": ...}, ...)`` makes it: its keys are those of scene
+            files, and a mapping stands for each part that is not made of its own model. It may name files anywhere.
+        folder: What its paths are relative to [the working directory].
+
+    Raises:
+        InputError: If something that it names is missing or breaks a rule.
+    """
+    return _scene_of(spec, Path(folder) / _MADE_IN_PYTHON, allow_outside=True)
+
+
+def _scene_of(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
+    """The scene of what a file says, or of what stands for one."""
+    spec = matched(spec, path, allow_outside=allow_outside)
+    _check_lens(spec, path)
+    _check_held_out(spec, path)
+    with blaming(path, "conveyor", "belt"):
+        check_belt(spec)
+    if spec.backdrop is not None:
+        spec = spec.model_copy(update={"shapes": (*spec.shapes, *backdrop_shapes(spec.backdrop)), "backdrop": None})
+    named = read_named(spec, path)
+    with blaming(path, "environment"):
+        surroundings = tuple(map(_metric, named.environments))
+    assets = _sized_objects(spec, path, named)
+    spec, shape_meshes = _walled(spec, named, assets)
+    if (lights := written_out(spec)) != spec.lights:
+        spec = spec.model_copy(update={"lights": lights})
+    return Scene(
+        spec=spec,
+        path=path,
+        environments=surroundings,
+        assets=assets,
+        shape_meshes=shape_meshes,
+        class_names=_class_names(spec, assets),
+        images=named.images,
+    )
+
+
+def _sized_objects(spec: SceneSpec, path: Path, named: Named) -> tuple[Asset, ...]:
+    """Asset of each entry, in its size; entries that differ in nothing but count and class share its arrays.
+
+    Raises:
+        InputError: If one is of unknown size, cannot be dropped, or does not fit into the region.
+    """
+    sized: dict[tuple[str, float | None, float], Asset] = {}
+    assets = []
+    for keys, name, entry in object_assets(spec):
+        for scale in entry.scales:
+            key = (name, entry.size, scale)
+            if key not in sized:
+                with blaming(path, *keys):
+                    asset = named.assets[name]
+                    asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
+                    sized[key] = asset if scale == 1.0 else asset.scaled(scale)
+                    _check_object(sized[key])
+            with blaming(path, *keys):
+                for number in spec.regions_of(entry) if not entry.poses or not spec.regions else ():
+                    _check_fit(sized[key], spec.all_regions[number][0], spec.region_names[number])
+            assets.append(replace(sized[key], class_name=entry.class_name or sized[key].class_name))
+    return tuple(assets)
+
+
+def _class_names(spec: SceneSpec, assets: Sequence[Asset]) -> tuple[str, ...]:
+    """Classes of what is labelled."""
+    entries = [entry for _, _, entry in object_assets(spec) for _ in entry.scales]
+    return tuple(sorted({asset.class_name for entry, asset in zip(entries, assets, strict=True) if entry.label}))
+
+
+def _walled(spec: SceneSpec, named: Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
+    """The specification with its enclosures written out as shapes, and the mesh of every shape."""
+    enclosures = (spec.enclosure, *(region.enclosure for region in spec.regions))
+    if not any(enclosures):
+        return spec, named.shape_meshes
+    supports = [mesh for shape, mesh in zip(spec.shapes, named.shape_meshes, strict=True) if shape.collider]
+    if spec.environment_collides:
+        supports += [environment.mesh for environment in named.environments if environment.mesh is not None]
+    around = [enclosure_walls(one, spec, assets, supports, i) for i, one in enumerate(enclosures) if one is not None]
+    walls = [wall for some in around for wall in some]
+    meshes = tuple(shape_mesh(wall, Path()) for wall in walls)  # boxes, which no file holds
+    regions = tuple(region.model_copy(update={"enclosure": None}) for region in spec.regions)
+    update = {"shapes": (*spec.shapes, *walls), "enclosure": None, "regions": regions}
+    return spec.model_copy(update=update), (*named.shape_meshes, *meshes)
+
+
+def _check_lens(spec: SceneSpec, path: Path) -> None:
+    """Refuse intrinsics that no camera of the image's size can have, such as a fisheye's that sees behind itself."""
+    for keys, camera in spec.camera_entries:
+        with blaming(path, *keys, "intrinsics"):
+            try:
+                camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # which shows most
+            except ValueError as error:
+                raise InputError(str(error)) from error
+
+
+def _check_held_out(spec: SceneSpec, path: Path) -> None:
+    """Refuse to hold out what is not named, and all environments."""
+    named = {
+        "assets": {name for _, name, _ in object_assets(spec)},
+        "environments": {name for _, name in environments(spec)},
+    }
+    for kind, known in named.items():
+        held_out = getattr(spec.hold_out, kind)
+        for number, name in enumerate(held_out):
+            if name not in known:
+                place, listed = key_place(path, ("hold_out", kind, number)), ", ".join(sorted(known)) or "none"
+                raise InputError(f"{place}: must be among the {kind} of the scene, {listed} (got {name})")
+    if spec.hold_out.environments and named["environments"] <= set(spec.hold_out.environments):
+        place = key_place(path, ("hold_out", "environments"))
+        raise InputError(f"{place}: must leave an environment to training (got all {len(named['environments'])})")
+
+
+def scene_json_schema() -> dict[str, Any]:
+    """JSON Schema of a scene file, for editors."""
+    named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:mitsplat:scene:{SCHEMA_VERSION}"}
+    return {**named, **SceneSpec.model_json_schema()}
+
+
+def _metric(asset: Asset) -> Asset:
+    """The asset, unless nothing says how large it is."""
+    if asset.units == "unknown":
+        raise InputError(
+            f"asset {asset.name!r} is of unknown units: give its longest extent [m] as size, here or in asset.yaml"
+        )
+    return asset
+
+
+def _check_object(asset: Asset) -> None:
+    """Refuse an object that physics cannot move."""
+    if asset.kind != "object" or asset.mesh is None:
+        raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh to be dropped")
+
+
+def _check_fit(asset: Asset, region: Region, name: str) -> None:
+    """Refuse an object that could not lie in a region on its largest side."""
+    where = "the region" if name == MAIN else f"region {name!r}"
+    footprint = np.sort(cast(trimesh.Trimesh, asset.mesh).extents)[1:]  # no object is without
+    space = np.sort(np.subtract(region.max, region.min)[:2])
+    if (footprint > space).any():
+        raise InputError(
+            f"asset {asset.name!r} must fit into {where} of {space[0]:.3g} x {space[1]:.3g} m "
+            f"(it measures {footprint[0]:.3g} x {footprint[1]:.3g} m)"
+        )

@@ -1,0 +1,112 @@
+"""What a layout holds, before anything says where it lies: its split, whether it is empty, and which objects are drawn.
+
+The seed and the layout's index decide it: any worker may ask for any layout in any order.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.streams import random_stream, weighted_choice
+from mitsplat.scene.walls import stated_pose
+from mitsplat.storage.files import SPLITS
+
+if TYPE_CHECKING:
+    from mitsplat.scene.scene import Scene
+from mitsplat.scene.splits import is_empty, split_of
+
+
+def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
+    """Which of the scene's assets each object of a layout is of, and the pose that the file gives it, if any."""
+    assets: list[int] = []
+    given: list[Float64Array | None] = []
+    for position, (entry, count) in enumerate(zip(scene.spec.objects, _counts(scene.spec, layout), strict=True)):
+        poses: list[Float64Array | None] = [stated_pose(pose) for pose in entry.poses]
+        drawn = _draw_entry(scene, position, layout, count)
+        assets += drawn
+        given += (poses or [None] * count)[: len(drawn)]
+    return tuple(assets), tuple(given)
+
+
+def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
+    """Which of the regions each object of a layout starts in, drawn by floor area among those of its entry."""
+    areas = np.array([np.prod(np.subtract(region.max, region.min)[:2]) for region, _ in spec.all_regions])
+    found: list[int] = []
+    for position, (entry, count) in enumerate(zip(spec.objects, _counts(spec, layout), strict=True)):
+        among = list(spec.regions_of(entry))
+        rng = random_stream(spec.seed, f"object region {position}", layout)
+        found += [among[i] for i in weighted_choice(rng, areas[among], count)]
+    return tuple(found)
+
+
+def _counts(spec: SceneSpec, layout: int) -> list[int]:
+    """How many objects of each entry a layout has."""
+    counts = random_stream(spec.seed, "object counts", layout)
+    drawn = [(len(entry.poses), int(counts.integers(*entry.count, endpoint=True))) for entry in spec.objects]
+    empty, held_out = is_empty(spec, layout), _held_out(spec, layout)
+    return [
+        0 if (empty and entry.label) or held_out.issuperset(entry.names) else given or count
+        for entry, (given, count) in zip(spec.objects, drawn, strict=True)
+    ]
+
+
+def _held_out(spec: SceneSpec, layout: int) -> frozenset[str]:
+    """Names of assets that a layout must not have, because they are for the test split alone."""
+    if not spec.hold_out.assets or split_of(layout, spec.output.validation, spec.output.test) == "test":
+        return frozenset()
+    return frozenset(spec.hold_out.assets)
+
+
+def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[int]:
+    """Assets of the objects of one entry."""
+    spec, entry, pool = scene.spec, scene.spec.objects[position], scene.pools[position]
+    if len(pool) == 1:
+        return [pool[0]] * count
+    if not count:
+        return []
+    held_out = _held_out(spec, layout)
+    allowed = [name not in held_out for name in entry.names]
+    weights = np.repeat(np.multiply(entry.weights or np.ones(len(allowed)), allowed), len(entry.scales))
+    rng = random_stream(spec.seed, f"object pool {position}", layout)
+    if not entry.balance:
+        return [pool[i] for i in weighted_choice(rng, weights, count)]
+    members = defaultdict[str, list[int]](list)
+    for i, asset in enumerate(pool):
+        if weights[i]:
+            members[scene.assets[asset].class_name].append(i)
+    names = sorted(members)
+    drawn = []
+    for kind in _dealt(spec, position, layout, count, len(names)):
+        among = members[names[kind]]
+        drawn.append(pool[among[weighted_choice(rng, weights[among])[0]]])
+    return drawn
+
+
+def _dealt(spec: SceneSpec, position: int, layout: int, count: int, kinds: int) -> list[int]:
+    """Classes of a layout's objects, from decks of one card for each class that are dealt out to a split's layouts."""
+    split = split_of(layout, spec.output.validation, spec.output.test)
+    known = max(layout + 1, min(1 << layout.bit_length(), spec.output.layouts))
+    first = int(_dealt_before(spec, position, known)[layout])
+    decks = {
+        deck: random_stream(spec.seed, f"deck {position} {split}", deck).permutation(kinds)
+        for deck in range(first // kinds, (first + count) // kinds + 1)
+    }
+    return [int(decks[card // kinds][card % kinds]) for card in range(first, first + count)]
+
+
+@lru_cache(maxsize=8)
+def _dealt_before(spec: SceneSpec, position: int, layouts: int) -> Int64Array:
+    """How many objects of an entry the earlier layouts of its split have, for each of the first layouts."""
+    totals = dict.fromkeys(SPLITS, 0)
+    before = np.zeros(layouts, dtype=np.int64)
+    for layout in range(layouts):
+        split = split_of(layout, spec.output.validation, spec.output.test)
+        before[layout] = totals[split]
+        totals[split] += _counts(spec, layout)[position]
+    return before

@@ -1,0 +1,100 @@
+"""The lights of a frame: what their entries in the scene file leave open is drawn, and their paths are followed.
+
+The seed decides it with the layout's index, or with the frame's where a light varies from frame to frame. Every value
+has a stream of its own, named by the light's entry, which of its copies it is, and the key.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mitsplat.geometry.camera import direction
+from mitsplat.scene.spec.light_spec import EnvironmentLight, LightDraw, LightSpec, PointLight, RoomLight, SpotLight
+from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.streams import random_stream, weighted_choice
+
+_UNIFORM = ("position", "target", "size", "cone", "radiance", "intensity", "rotate_z")
+"""Keys whose values, or components, are uniform between two bounds."""
+
+
+def written_out(spec: SceneSpec) -> tuple[LightSpec, ...]:
+    """The lights of a scene file, with what its rooms stand for in their place."""
+    found: list[LightSpec] = []
+    for light in spec.lights:
+        found += light.written_out() if isinstance(light, RoomLight) else (light,)
+    return tuple(found)
+
+
+def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[LightSpec, ...]:
+    """Lights of frame ``index``, which is at ``time`` in [0, 1] of its layout's paths."""
+    found = []
+    for position, light in enumerate(written_out(spec)):
+        number, copies = layout, 1
+        if light.draw is not None:
+            number = index if light.draw.vary == "frame" else layout
+            counts = random_stream(spec.seed, f"light {position} count", number)
+            copies = int(counts.integers(*light.draw.count, endpoint=True))
+        if isinstance(light, EnvironmentLight):
+            light = _with_image(light, random_stream(spec.seed, f"light {position} image", layout))
+        for copy in range(copies):
+            one = light if light.draw is None else _drawn(light, light.draw, spec.seed, f"{position}.{copy}", number)
+            name = f"{position}" if not copy else f"{position}.{copy}"
+            factors = random_stream(spec.seed, f"light intensity {name}", layout)
+            found.append(_on_path(one, time, float(factors.uniform(*spec.randomise.light_intensity))))
+    return tuple(found)
+
+
+def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentLight:
+    """A sky with one image of its pool."""
+    if sky.pool is None:
+        return sky
+    image = sky.names[weighted_choice(rng, sky.weights or np.ones(len(sky.names)))[0]]
+    return sky.model_copy(update={"image": image, "pool": None, "weights": ()})
+
+
+def _drawn(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
+    """A light with values in place of its ranges."""
+
+    def uniform(key: str, low: Any, high: Any) -> Any:
+        value = random_stream(seed, f"light {name} {key}", number).uniform(low, high)
+        return tuple(value.tolist()) if isinstance(value, np.ndarray) else float(value)
+
+    state: dict[str, Any] = {"draw": None}
+    for key in _UNIFORM:
+        if (bounds := getattr(draw, key)) is not None:
+            state[key] = uniform(key, *bounds)
+    if draw.temperature is not None:
+        state["temperature"] = 1.0 / uniform("temperature", *(1.0 / kelvin for kelvin in reversed(draw.temperature)))
+    if draw.colour is not None:
+        one, other = np.array(draw.colour)
+        state["colour"] = tuple((one + uniform("colour", 0.0, 1.0) * (other - one)).tolist())
+    if draw.distance is not None:
+        around: Any = draw.around or state.get("target") or getattr(light, "target", (0.0, 0.0, 0.0))
+        azimuth = np.radians(uniform("azimuth", *draw.azimuth))
+        # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
+        sine = uniform("elevation", *np.sin(np.radians(draw.elevation)))
+        offset = uniform("distance", *draw.distance) * direction(azimuth, sine)
+        state["position"] = tuple(np.add(around, offset).tolist())
+    return light.model_copy(update=state)
+
+
+def _on_path(light: LightSpec, time: float, factor: float) -> LightSpec:
+    """A light at ``time`` in [0, 1] of its path, times a factor."""
+    strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
+    state: dict[str, Any] = {strength: getattr(light, strength)}
+    if not isinstance(light, EnvironmentLight) and light.path:
+        times = np.linspace(0.0, 1.0, len(light.path))
+        strengths = [key.intensity or state[strength] for key in light.path]
+        positions = np.array([key.position or light.position for key in light.path])
+        state = {
+            strength: float(np.interp(time, times, strengths)),
+            "position": tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3)),
+            "path": (),
+        }
+        if light.temperature is not None:
+            warmth = [1.0 / (key.temperature or light.temperature) for key in light.path]
+            state["temperature"] = float(1.0 / np.interp(time, times, warmth))
+    state[strength] *= factor
+    return light.model_copy(update=state)

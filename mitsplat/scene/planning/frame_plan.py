@@ -1,0 +1,154 @@
+"""Plans of frames: camera, lights and random draws, decided by the seed and the index of the frame.
+
+Every random value has a stream of its own, named by its purpose. Adding a value therefore shifts no other value, and
+any worker can plan any frame in any order.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, SupportsIndex
+
+from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.planning.conveyor import Belt, belt_of
+from mitsplat.scene.planning.frame_lights import lights_at
+from mitsplat.scene.planning.viewpoints import View, view_of
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.image_spec import Randomise
+from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
+from mitsplat.scene.spec.named_files import light_images
+from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.splits import Split, split_of
+from mitsplat.scene.streams import random_stream
+
+_DRAWN = (
+    *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
+    *("white_balance", "hue", "saturation", "chroma_stretch", "chroma_angle", "sharpening", "jpeg"),
+)
+"""What is drawn anew for every frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlan:
+    """Everything about a frame but where its objects came to rest.
+
+    Attributes:
+        index: Index of the frame.
+        layout, view: Index of its layout, and of the view in it.
+        split: Split that the whole layout belongs to.
+        camera: Where the image is taken from.
+        next_camera: Where the layout's next image is taken from, None for its last.
+        lights: Lights as they are in this frame: paths and random factors applied.
+        draws: Random values by name, see :func:`mitsplat.frames.camera_response.develop`.
+        seed: Seed of the pixel noise.
+        viewpoint: What the camera was drawn or chosen by, see :class:`mitsplat.scene.planning.viewpoints.View`.
+        belt: The conveyor at the moment of the frame, if the scene has one.
+    """
+
+    index: int
+    layout: int
+    view: int
+    split: Split
+    camera: Camera
+    next_camera: Camera | None
+    lights: tuple[LightSpec, ...]
+    draws: dict[str, float]
+    seed: int
+    viewpoint: Mapping[str, Any] = field(default_factory=dict)
+    belt: Belt | None = None
+
+
+def whole(index: SupportsIndex, name: str) -> int:
+    """An index that an integer of any kind gives.
+
+    Raises:
+        InputError: If it is something else, such as text.
+    """
+    try:
+        return operator.index(index)
+    except TypeError:
+        raise InputError(f"{name} must be a whole number (got {index!r})") from None
+
+
+def layout_of(scene: Scene, index: int) -> int:
+    """Layout that frame ``index`` shows."""
+    index = whole(index, "frame")
+    if not 0 <= index < scene.num_frames:
+        raise InputError(f"{scene.path}: frame must be in 0 to {scene.num_frames - 1} (got {index})")
+    return index // scene.spec.output.views
+
+
+def plan_frame(
+    scene: Scene,
+    index: int,
+    layout: Layout | None = None,
+    *,
+    camera: Camera | None = None,
+    next_layout: Layout | None = None,
+    next_camera: Camera | None = None,
+    lights: Sequence[LightEntry] | None = None,
+) -> FramePlan:
+    """The plan of frame ``index``, from the seed and the index alone, which decide its layout as well.
+
+    Args:
+        scene: The scene.
+        index: Index of the frame.
+        layout: Where its objects lie. Without it, cameras that are chosen by what lies there are ones that may be.
+        camera: In place of the scene's; nothing is then drawn or chosen of it.
+        next_layout: Where its objects lie in the next image, if they move.
+        next_camera: Where the next image is taken from. Without it that is the scene's next view of the layout, or
+            ``camera`` if that is given and objects move.
+        lights: Entries in place of the scene's, drawn and moved as those would be.
+
+    Raises:
+        InputError: If there is no such frame, none of its views is as the scene file says that they must be, or the
+            lights break a rule.
+    """
+    index = whole(index, "frame")
+    spec, number = scene.spec, layout_of(scene, index)
+    if lights is not None:
+        spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # by which they are checked
+        if unknown := {name for _, name in light_images(spec)} - set(scene.images):
+            raise InputError(f"images of lights must be among those of the scene's own (got {min(unknown)!r})")
+        for light in spec.lights:
+            if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
+                raise InputError(f"pools of lights must be lists of the scene's own images (got {light.pool!r})")
+    view = index - number * spec.output.views
+    time = view / max(1, spec.output.views - 1)
+    ranges = spec.randomise
+    here = view_of(scene, index, layout) if camera is None else View(camera)
+    if next_camera is None and camera is not None:
+        next_camera = None if next_layout is None else camera
+    elif next_camera is None and view + 1 < spec.output.views:
+        next_camera = view_of(scene, index + 1, layout if next_layout is None else next_layout).camera
+    return FramePlan(
+        index=index,
+        layout=number,
+        view=view,
+        split=split_of(number, spec.output.validation, spec.output.test),
+        camera=here.camera,
+        next_camera=next_camera,
+        lights=lights_at(spec, number, index, time),
+        draws={
+            name: float(random_stream(spec.seed, name, index).uniform(*bounds))
+            for name in _DRAWN
+            if (bounds := _drawn_from(ranges, name)) is not None
+        },
+        seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
+        viewpoint=here.drawn,
+        belt=belt_of(spec, view),
+    )
+
+
+def _drawn_from(ranges: Randomise, name: str) -> tuple[float, float] | None:
+    """The range of what is drawn for a frame, None if the scene has none of it."""
+    if name in ("chromatic_aberration", "sharpening") and not any(getattr(ranges, name)):
+        return None
+    if name in ("chroma_stretch", "chroma_angle") and ranges.chroma_stretch == (1.0, 1.0):
+        return None
+    bounds: tuple[float, float] | None = (0.0, 360.0) if name == "motion_angle" else getattr(ranges, name)
+    return bounds

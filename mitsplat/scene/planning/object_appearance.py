@@ -1,0 +1,98 @@
+"""How one object of a layout looks other than the next one of its asset.
+
+The seed, the layout's index and the object's id decide it; every value has a stream of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mitsplat.images.colour import hue_matrix, saturation_matrix
+from mitsplat.scene.layout import Instance, Layout
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.streams import random_stream
+
+WEAR_SEEDS = 1 << 23
+"""Patterns of dirt, whose numbers are exact in 32 bits of floating point."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What was drawn of an object's appearance.
+
+    Attributes:
+        id: Instance id.
+        entry: Which of the scene file's objects it is of.
+        hue: Rotation about the grey axis [degrees].
+        saturation: Factor on the distance from grey.
+        value: Factor on the reflectance.
+        gain: Factors on red, green and blue.
+        roughness: GGX roughness of the highlight.
+        specular: Specular reflectance at normal incidence.
+        wear: Share of light that dirt takes where it is thickest.
+        wear_seed: Where dirt lies.
+    """
+
+    id: int
+    entry: int
+    hue: float
+    saturation: float
+    value: float
+    gain: tuple[float, float, float]
+    roughness: float
+    specular: float
+    wear: float
+    wear_seed: int
+
+    def to_json(self) -> dict[str, Any]:
+        """As the manifest states it."""
+        return {**vars(self), "gain": list(self.gain)}
+
+    def properties(self) -> dict[str, Any]:
+        """Properties of the shape plugin ``splats``; of colours that stay as they are, none."""
+        matrix = np.diag(np.multiply(self.gain, self.value)) @ saturation_matrix(self.saturation) @ hue_matrix(self.hue)
+        found: dict[str, Any] = {"roughness": self.roughness, "specular": self.specular}
+        if (self.hue, self.saturation, self.value, *self.gain) != (0.0, 1.0, 1.0, 1.0, 1.0, 1.0):
+            found["colours"] = " ".join(repr(float(number)) for number in matrix.ravel())
+        if self.wear:
+            found |= {"wear": self.wear, "wear_seed": self.wear_seed}
+        return found
+
+
+def draw_appearances(scene: Scene, layout: Layout) -> dict[int, Appearance]:
+    """Appearances of the objects of a layout whose entries leave them open, by instance id."""
+    if not any(entry.appearance for entry in scene.spec.objects):
+        return {}
+    entries = {asset: entry for entry, pool in enumerate(scene.pools) for asset in pool}
+    found = (_draw(scene, layout.index, one, entries[one.asset]) for one in layout.instances)
+    return {one.id: one for one in found if one is not None}
+
+
+def _draw(scene: Scene, layout: int, instance: Instance, entry: int) -> Appearance | None:
+    """Appearance of one object of an entry."""
+    ranges, asset = scene.spec.objects[entry].appearance, scene.assets[instance.asset]
+    if ranges is None:
+        return None
+
+    def stream(name: str) -> np.random.Generator:
+        return random_stream(scene.spec.seed, f"appearance {name}", layout, instance.id)
+
+    def uniform(name: str, bounds: tuple[float, float] | None, own: float) -> float:
+        return own if bounds is None else float(stream(name).uniform(*bounds))
+
+    red, green, blue = stream("gain").uniform(*ranges.gain, 3).tolist()
+    return Appearance(
+        id=instance.id,
+        entry=entry,
+        hue=uniform("hue", ranges.hue, 0.0),
+        saturation=uniform("saturation", ranges.saturation, 1.0),
+        value=uniform("value", ranges.value, 1.0),
+        gain=(red, green, blue),
+        roughness=uniform("roughness", ranges.roughness, float(asset.roughness)),
+        specular=uniform("specular", ranges.specular, float(asset.specular)),
+        wear=uniform("wear", ranges.wear, 0.0),
+        wear_seed=int(stream("wear seed").integers(WEAR_SEEDS)),
+    )

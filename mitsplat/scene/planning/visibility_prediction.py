@@ -1,0 +1,346 @@
+"""What a camera would see of a layout, before anything is rendered: a cheap prediction to choose views by.
+
+Surfaces are points, spread evenly over the proxy meshes. An object's visible fraction is predicted from a raster as
+coarse as the points are dense: of its cells in the image, those in which no point of another object is nearer. What
+visible shapes hide is found by rays from the points to the camera. The environment hides nothing here. All of it is
+worked out by NumPy on the CPU, so that views do not depend on the device that renders them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_points import points_inside
+
+if TYPE_CHECKING:
+    from mitsplat.scene.layout import Instance, Layout
+    from mitsplat.scene.scene import Scene
+    from mitsplat.scene.spec.camera_spec import Acceptance, Occlusion, Truncation
+
+_POINTS = 40_000
+"""Of all objects of a layout together, at most."""
+_FINEST = 800
+"""Of the object with the largest surface, at most."""
+_FEWEST = 100
+_CELL = 1.25
+"""Size of a raster's cells, in spacings of the points."""
+_TESTS = 2_000_000
+"""Pairs of a ray and a triangle that are looked at together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Framed:
+    """Where the surfaces of a layout are in a camera's image.
+
+    Attributes:
+        camera: The camera.
+        x, y, depth: Pixel positions [px] and depths [m] of the points, shape (P,).
+        raster: Which of them are in front of the camera and in the image or as far around it as it is wide and high.
+        edge: Size of the raster's cells [px].
+        within: Share of the surface of each object that is in front of the camera and in the image, shape (N,).
+        extents: Longer side of the box around each in the image [px], 0 for what is not in it, shape (N,).
+        lost: Share of each that is not in the raster, shape (N,).
+    """
+
+    camera: Camera
+    x: Float64Array
+    y: Float64Array
+    depth: Float64Array
+    raster: BoolArray
+    edge: float
+    within: Float64Array
+    extents: Float64Array
+    lost: Float64Array
+
+
+@dataclass(frozen=True, eq=False)
+class Prospect:
+    """What a view is predicted to show of the labelled objects of a layout.
+
+    Attributes:
+        visible: Visible fraction of each, 0 for what is not in the image, shape (N,).
+        beyond: Share of each beyond the image's border, shape (N,).
+        in_view: How many have enough visible pixels to be labelled.
+        hidden, cut: How many of those are partly hidden, and cut by the border, as the scene file says.
+    """
+
+    visible: Float64Array
+    beyond: Float64Array
+    in_view: int
+    hidden: int
+    cut: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The counts, as a dataset states them."""
+        return {"in_view": self.in_view, "hidden": self.hidden, "cut": self.cut}
+
+
+class Sight:
+    """The surfaces of a layout.
+
+    Attributes:
+        ids: Instance ids, shape (N,).
+        labelled: Which of the instances are labelled, shape (N,).
+        centres: Middle of the box around each [m], shape (N, 3).
+    """
+
+    def __init__(self, scene: Scene, layout: Layout) -> None:
+        self._scene, self._layout = scene, layout
+        instances = layout.instances
+        self.ids = np.array([one.id for one in instances], dtype=np.int64)
+        self.labelled = np.array([one.class_index is not None for one in instances], dtype=bool)
+        samples = [_surface_points(scene)[one.asset] for one in instances]
+        step = 1 + sum(map(len, samples)) // _POINTS
+        samples = [points[::step] for points in samples]
+        poses = [one.world_from_object for one in instances]
+        placed = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(samples, poses, strict=True)]
+        meshes = [_mesh(scene, one.asset) for one in instances]
+        middles = [
+            mesh.bounds.mean(axis=0) @ pose[:3, :3].T + pose[:3, 3] for mesh, pose in zip(meshes, poses, strict=True)
+        ]
+        self.centres: Float64Array = np.array(middles, dtype=np.float64).reshape(-1, 3)
+        self._points: Float64Array = np.concatenate(placed) if placed else np.zeros((0, 3))
+        self._counts = np.array([len(points) for points in placed], dtype=np.int64)
+        self._owner = np.repeat(np.arange(len(instances)), self._counts)
+        self._spacing = _spacing(scene) * float(np.sqrt(step))
+        self._radii = np.array([np.linalg.norm(mesh.extents) / 2 for mesh in meshes])
+        shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
+        self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
+        here = scene.environment_of(layout.index)
+        around = [] if here is None or here.mesh is None else [here.mesh]
+        self._still = _Triangles(np.concatenate([self._triangles, *(mesh.triangles for mesh in around)]))
+
+    @staticmethod
+    @lru_cache(maxsize=2)
+    def of(scene: Scene, layout: Layout) -> Sight:
+        """The surfaces of a layout, kept for its next frame."""
+        return Sight(scene, layout)
+
+    def framed(self, camera: Camera) -> Framed:
+        """Where the surfaces are in a camera's image."""
+        count, owner = len(self.ids), self._owner
+        pixel, depth = camera.project(self._points)
+        x, y = np.ascontiguousarray(pixel.T)
+        front = depth > camera.near
+        with np.errstate(invalid="ignore"):
+            inside = front & _within(x, y, camera, 0)
+            # Distortion of what is far outside is anybody's guess, and the raster needs an end.
+            raster = front & _within(x, y, camera, 1)
+        within, in_raster = (np.bincount(owner[some], minlength=count) / self._counts for some in (inside, raster))
+        extents, edge = np.zeros(count), 1.0
+        if count:  # points are in the order of their owners, who all have some
+            starts = np.cumsum(self._counts) - self._counts
+            for at in (x, y):
+                high = np.maximum.reduceat(np.where(inside, at, -np.inf), starts)
+                low = np.minimum.reduceat(np.where(inside, at, np.inf), starts)
+                extents = np.maximum(extents, np.where(within > 0, high - low, 0.0))
+        if front.any():
+            away = max(float(np.median(depth[front])), camera.near)
+            edge = _CELL * self._spacing * max(camera.fx, camera.fy) / away
+        return Framed(camera, x, y, depth, raster, edge, within, extents, 1.0 - in_raster)
+
+    def prospect(
+        self, framed: Framed, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
+    ) -> Prospect:
+        """What a view would show of the labelled objects."""
+        visible, beyond, seen = self._cells(framed)
+        beyond = framed.lost + (1.0 - framed.lost) * beyond
+        shown = self.labelled & (seen * framed.edge**2 >= min_pixels)
+        hidden = cut = 0
+        if occlusion is not None:
+            hidden = int(np.count_nonzero(shown & _among(visible, occlusion.visible)))
+        if truncation is not None:
+            cut = int(np.count_nonzero(shown & _among(beyond, truncation.cut)))
+        ours = self.labelled
+        return Prospect(visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut)
+
+    def _cells(self, framed: Framed) -> tuple[Float64Array, Float64Array, Int64Array]:
+        """Visible fraction and share beyond the border of each object, by cells of the raster; its seen cells."""
+        count, camera, edge, depth = len(self.ids), framed.camera, framed.edge, framed.depth
+        across = int(3 * camera.width / edge) + 2
+        left, above = across // 3 + 1, int(camera.height / edge) + 2
+        among = np.flatnonzero(framed.raster)
+        column, row = (np.floor(at[among] / edge).astype(np.int64) for at in (framed.x, framed.y))
+        key = (column + left + across * (row + above)) * count + self._owner[among]
+        order = np.argsort(key)
+        among, key = among[order], key[order]
+        # Of each cell, every object in it once, by its nearest point there, and the one in front of the others.
+        first = _starts(key)
+        nearest = among[_least(depth[among], first)]
+        owner, cell = self._owner[nearest], key[first] // count
+        seen = np.zeros(len(first), dtype=bool)
+        seen[_least(depth[nearest], _starts(cell))] = True
+        x, y = (np.asarray((n + 0.5) * edge, np.float64) for n in (cell % across - left, cell // across - above))
+        shown = _within(x, y, camera, 0)
+        seen &= shown
+        triangles = _between(self._triangles, camera.centre, self._points)
+        if len(triangles):
+            seen[seen] = ~_crossed(camera.centre, self._points[nearest[seen]], triangles)
+        seen_cells, own = (np.bincount(owner[some], minlength=count) for some in (seen, shown))
+        everywhere = np.bincount(owner, minlength=count)
+        beyond = np.where(everywhere > 0, 1.0 - own / np.maximum(everywhere, 1), 1.0)
+        return seen_cells / np.maximum(own, 1), beyond, seen_cells
+
+    def faults(self, framed: Framed, rules: Acceptance) -> list[tuple[float, str]]:
+        """By what share a view misses each rule that it does not fulfil, and the same in words."""
+        found, eye = [], framed.camera.centre
+        within, extents = framed.within[self.labelled], framed.extents[self.labelled]
+        share = float(np.mean(within >= 0.5)) if len(within) else 1.0
+        if share < rules.in_view:
+            text = f"shows {share:.3g} of the labelled objects, where in_view is {rules.in_view:g}"
+            found.append((1 - share / rules.in_view, text))
+        least = float(extents[within > 0].min(initial=np.inf))
+        if least < rules.extent:
+            found.append((1 - least / rules.extent, f"shows one of {least:.3g} px, where extent is {rules.extent:g}"))
+        away = self._clearance(eye, rules.clearance)
+        if name := self._around(eye):
+            found.append((1.0, f"is from inside of {name}"))
+        elif away < rules.clearance:
+            text = f"is {away:.3g} m from what is nearest, where clearance is {rules.clearance:g}"
+            found.append((1 - away / rules.clearance, text))
+        return found
+
+    def _around(self, eye: Float64Array) -> str:
+        """What a point is inside of, or empty."""
+        if name := solid_around(self._scene, eye):
+            return f"shape {name!r}"
+        for one in self._near(eye, 0.0):
+            mesh = _mesh(self._scene, one.asset)
+            if points_inside(mesh, _local(eye, one.world_from_object)[None])[0]:
+                return f"object {one.id}"
+        return ""
+
+    def _clearance(self, eye: Float64Array, reach: float) -> float:
+        """Distance of a point to the surface that is nearest [m], or ``reach`` if none is as near."""
+        distance = self._still.distance(eye, reach)
+        for one in self._near(eye, distance):
+            triangles = _Triangles(np.asarray(_mesh(self._scene, one.asset).triangles))
+            distance = triangles.distance(_local(eye, one.world_from_object), distance)
+        return distance
+
+    def _near(self, eye: Float64Array, reach: float) -> list[Instance]:
+        """Instances that a part of may be as near to a point."""
+        near = np.linalg.norm(self.centres - eye, axis=1) < self._radii + reach
+        return [one for one, is_near in zip(self._layout.instances, near, strict=True) if is_near]
+
+
+def solid_around(scene: Scene, point: Float64Array) -> str:
+    """Name of a visible shape that a point [m] is in and the region is not, or empty."""
+    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
+    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+        if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
+            return shape.name
+    return ""
+
+
+@lru_cache(maxsize=2)
+def _surface_points(scene: Scene) -> tuple[Float64Array, ...]:
+    """Points on the surface of each asset, in its frame [m], as dense on all of them."""
+    spacing = _spacing(scene)
+    points = []
+    for asset in range(len(scene.assets)):
+        mesh = _mesh(scene, asset)
+        samples, _ = trimesh.sample.sample_surface(mesh, max(_FEWEST, round(mesh.area / spacing**2)), seed=0)
+        points.append(np.asarray(samples, dtype=np.float64))
+    return tuple(points)
+
+
+def _spacing(scene: Scene) -> float:
+    """About how far apart points on surfaces are [m]."""
+    return float(np.sqrt(max(asset.mesh.area for asset in scene.assets if asset.mesh is not None) / _FINEST))
+
+
+def _mesh(scene: Scene, asset: int) -> trimesh.Trimesh:
+    return cast(trimesh.Trimesh, scene.assets[asset].mesh)  # no object is loaded without, for it must be dropped
+
+
+def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
+    return np.asarray((point - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
+
+
+def _within(x: Float64Array, y: Float64Array, camera: Camera, margin: int) -> BoolArray:
+    """Whether pixels lie in a camera's image, with a margin of so many images on each side."""
+    width, height = camera.width, camera.height
+    inside = (x >= -margin * width) & (x < (1 + margin) * width)
+    return np.asarray(inside & (y >= -margin * height) & (y < (1 + margin) * height))
+
+
+def _starts(key: Int64Array) -> Int64Array:
+    """Where runs of equal numbers begin."""
+    begins = np.ones(len(key), dtype=bool)
+    begins[1:] = key[1:] != key[:-1]
+    return np.flatnonzero(begins)
+
+
+def _least(values: Float64Array, starts: Int64Array) -> Int64Array:
+    """Place of the first of the least values of each run, of those that begin at ``starts``."""
+    if not len(starts):
+        return starts
+    least = np.minimum.reduceat(values, starts)
+    equals = np.flatnonzero(values == np.repeat(least, np.diff(starts, append=len(values))))
+    return equals[np.searchsorted(equals, starts)]
+
+
+def _among(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
+    return np.asarray((values >= bounds[0]) & (values <= bounds[1]))
+
+
+class _Triangles:
+    """Triangles (T, 3, 3) [m] and the boxes around them, which tell most to be too far away."""
+
+    def __init__(self, triangles: Float64Array) -> None:
+        self._triangles = triangles
+        by_axis = np.ascontiguousarray(np.moveaxis(triangles, 2, 0))
+        self._boxes = list(zip(by_axis.min(axis=2), by_axis.max(axis=2), strict=True))
+
+    def distance(self, point: Float64Array, reach: float) -> float:
+        """Distance of a point to the nearest triangle, or ``reach`` if none is as near."""
+        touched = np.ones(len(self._triangles), dtype=bool)
+        for (low, high), place in zip(self._boxes, point, strict=True):
+            touched &= (low < place + reach) & (high > place - reach)
+        near = self._triangles[touched]
+        if not len(near):
+            return reach
+        closest = trimesh.triangles.closest_point(near, np.broadcast_to(point, (len(near), 3)))
+        return min(reach, float(np.linalg.norm(closest - point, axis=1).min()))
+
+
+def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:
+    """Triangles that can cross a line of sight: in whose plane, or on whose other side, some point's box is."""
+    if not len(triangles) or not len(points):
+        return triangles[:0]
+    low, high = points.min(axis=0), points.max(axis=0)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    corners = np.stack(np.meshgrid(*np.stack([low, high]).T, indexing="ij"), axis=-1).reshape(-1, 3)
+    here = np.einsum("ti,ti->t", normals, eye - triangles[:, 0])
+    there = np.einsum("ti,tci->tc", normals, corners - triangles[:, :1])
+    # Objects sink into what they lie on by less than a tenth of a millimetre.
+    slack = 1e-4 * np.linalg.norm(normals, axis=1)
+    other = there * np.sign(here)[:, None] < -slack[:, None]
+    return np.asarray(triangles[other.any(axis=1) & (np.abs(here) > 0)])
+
+
+def _crossed(eye: Float64Array, points: Float64Array, triangles: Float64Array) -> BoolArray:
+    """Which lines of sight from an eye to points (N, 3) cross a triangle on their way (Möller and Trumbore 1997)."""
+    crossed = np.zeros(len(points), dtype=bool)
+    one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    start = eye - triangles[:, 0]
+    turned = np.cross(start, one)
+    height = np.einsum("ti,ti->t", two, turned)
+    for part in np.array_split(np.arange(len(points)), 1 + len(points) * len(triangles) // _TESTS):
+        ray = points[part] - eye
+        across = np.cross(ray[:, None], two[None])
+        volume = np.einsum("pti,ti->pt", across, one)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("pti,ti->pt", across, start) / volume
+            v = ray @ turned.T / volume
+            along = height / volume
+        crossed[part] = ((u >= 0) & (v >= 0) & (u + v <= 1) & (along > 0) & (along < 1 - 1e-3)).any(axis=1)
+    return crossed

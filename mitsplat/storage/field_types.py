@@ -1,0 +1,132 @@
+"""What the models of a scene file are made of: values with their units and rules."""
+
+from __future__ import annotations
+
+import json
+import unicodedata
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, ValidationError
+
+from mitsplat.errors import InputError
+from mitsplat.storage.yaml_input import FieldError, sentence_of_model
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+Vector = TypeVar("Vector", bound=tuple[float, ...])
+
+
+class _TellsInOneSentence(ModelMetaclass):
+    """Values that a model is made of in Python are refused in the words that a file's would be."""
+
+    if not TYPE_CHECKING:  # editors complete the keys of models that their fields declare
+
+        def __call__(cls, **values: Any) -> Any:
+            try:
+                return super().__call__(**values)
+            except ValidationError as error:
+                raise InputError(sentence_of_model(error, cls, values)) from None
+
+
+class StrictModel(BaseModel, metaclass=_TellsInOneSentence):
+    """Immutable, without unknown keys, infinities or NaN."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+    """Refuse a range whose ends are swapped."""
+    if bounds[0] > bounds[1]:
+        raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
+    return bounds
+
+
+def plain(name: str) -> str:
+    """Refuse a name that files of labels cannot hold on a line: XML has no control characters, and text has lines."""
+    for character in name:
+        if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or ord(character) & 0xFFFE == 0xFFFE:
+            raise ValueError(
+                f"must have no control characters or line breaks (got U+{ord(character):04X} in {name[:60]!a})"
+            )
+    return name
+
+
+Name = Annotated[str, Field(min_length=1), AfterValidator(plain)]
+"""A name in files of labels: of a class, an asset or a keypoint."""
+
+
+def _each_ordered(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """Refuse a range of vectors that any component of has its ends swapped."""
+    if any(low > high for low, high in zip(*bounds, strict=True)):
+        raise ValueError(f"must be [low, high] with low <= high in each component (got {json.dumps(bounds)})")
+    return bounds
+
+
+def check_weights(weights: tuple[float, ...], members: int, what: str) -> None:
+    """Refuse weights of another number than the members of the pool that they are of."""
+    if weights and len(weights) != members:
+        raise FieldError("weights", f"must be as many as the pool has {what}, {members} (got {len(weights)})")
+
+
+def _count_range(count: Any) -> Any:
+    """One number n as (n, n); a list as a tuple, since strict mode takes nothing else from here on."""
+    if isinstance(count, int) and not isinstance(count, bool):
+        if count < 1:
+            raise ValueError(f"must be >= 1 (got {count})")
+        return (count, count)
+    if not isinstance(count, list | tuple) or len(count) != 2:
+        shown = "nothing" if count is None else json.dumps(count, default=str)
+        raise ValueError(f"must be a whole number, or [least, most] of them (got {shown})")
+    return tuple(count)
+
+
+def _scale_range(scale: Any) -> Any:
+    """A list as a tuple, once it is known for a range: of a union, the error would be that of its other half."""
+    if not isinstance(scale, list | tuple):
+        return scale
+    if len(scale) != 2 or not all(isinstance(n, int | float) and not isinstance(n, bool) and n > 0 for n in scale):
+        raise ValueError(f"must be a number > 0, or [least, most] of them (got {json.dumps(scale, default=str)})")
+    return ordered((float(scale[0]), float(scale[1])))
+
+
+def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(colour):
+        raise ValueError("must not be black (got [0, 0, 0])")
+    return colour
+
+
+Vec3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
+Range = Annotated[tuple[float, float], AfterValidator(ordered)]
+Stops = Annotated[float, Field(ge=-20, le=20)]
+StopsRange = Annotated[tuple[Stops, Stops], AfterValidator(ordered)]
+Blur = Annotated[float, Field(ge=0, le=1000)]
+BlurRange = Annotated[tuple[Blur, Blur], AfterValidator(ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_each_ordered)]
+SizeRange = Annotated[tuple[tuple[Positive, Positive], tuple[Positive, Positive]], AfterValidator(_each_ordered)]
+NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(ordered)]
+CountRange = Annotated[
+    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
+    AfterValidator(ordered),
+    BeforeValidator(_count_range, json_schema_input_type=int | tuple[int, int]),
+]
+Scale = Annotated[
+    Positive | tuple[Positive, Positive],
+    BeforeValidator(_scale_range, json_schema_input_type=Positive | tuple[Positive, Positive]),
+]
+Elevation = Annotated[float, Field(ge=-90, le=90)]
+ElevationRange = Annotated[tuple[Elevation, Elevation], AfterValidator(ordered)]
+Kelvin = Annotated[float, Field(ge=1667, le=25000)]
+KelvinRange = Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)]
+JpegQuality = Annotated[float, Field(ge=1, le=100)]
+EmittedColour = Annotated[
+    tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
+    AfterValidator(_some_colour),
+    Field(description="Linear RGB factor on the emission."),
+]

@@ -1,0 +1,332 @@
+"""YAML files to pydantic models, with errors of one sentence: file, line, key path, rule and value received."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq, TaggedScalar
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.scanner import RoundTripScanner
+
+from mitsplat.errors import InputError
+from mitsplat.storage.format_version import FORMAT_VERSION, check_format_version
+
+Validated = TypeVar("Validated", bound=BaseModel)
+KeyPath = tuple[str | int, ...]
+
+MAX_DEPTH = 32
+"""What nests deeper is hostile, or an alias that contains itself."""
+MAX_BYTES = 8 << 20
+MAX_VALUES = 200_000
+"""What has more values than this is hostile: aliases of aliases multiply."""
+
+RULES = {
+    "missing": "is required",
+    "greater_than": "must be > {gt:g}",
+    "greater_than_equal": "must be >= {ge:g}",
+    "less_than": "must be < {lt:g}",
+    "less_than_equal": "must be <= {le:g}",
+    "finite_number": "must be finite",
+    "literal_error": "must be {expected}",
+    "union_tag_invalid": "must be one of {expected_tags}",
+    "union_tag_not_found": "is required",
+    "model_type": "must be a mapping of keys to values",
+    "model_attributes_type": "must be a mapping of keys to values",
+    "dict_type": "must be a mapping of keys to values",
+    "tuple_type": "must be a list",
+    "list_type": "must be a list",
+    "too_short": "must have at least {min_length} items",
+    "too_long": "must have at most {max_length} items",
+    "string_type": "must be text",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "bool_type": "must be true or false",
+}
+"""Our wording of pydantic's error types; any other type keeps pydantic's message."""
+
+
+class FieldError(ValueError):
+    """A rule between several fields of one model is broken; ``key`` is the field to point the user at.
+
+    Raise it in a model validator, where pydantic alone would only know the model.
+    """
+
+    def __init__(self, key: str | KeyPath, rule: str) -> None:
+        super().__init__(rule)
+        self.key: KeyPath = (key,) if isinstance(key, str) else key
+
+
+class _Scanner(RoundTripScanner):
+    """Ends at what nests too deep, on which it otherwise spends time with the square of the depth."""
+
+    def fetch_flow_collection_start(self, *args: Any, **kwargs: Any) -> None:
+        """Begin a list or mapping in brackets."""
+        if len(self.flow_context) > MAX_DEPTH:
+            raise RecursionError
+        super().fetch_flow_collection_start(*args, **kwargs)
+
+
+class _Finding(NamedTuple):
+    """One broken rule, ready to be told."""
+
+    path: KeyPath
+    rule: str
+    line: int | None
+    missing: bool
+
+
+def load_yaml(
+    path: str | Path, model: type[Validated], *, overrides: Mapping[str, Any] | None = None, newest: int | None = None
+) -> Validated:
+    """Read a YAML 1.2 file into ``model``; types are checked strictly (no text for numbers) and no code is run.
+
+    Args:
+        path: The file.
+        model: The pydantic model that states its rules.
+        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
+        newest: Newest version of the file's format that is read; None for files without versions.
+
+    Raises:
+        InputError: If the file cannot be read, is not YAML, repeats a key, is of a newer version or breaks a rule of
+            ``model``.
+    """
+    path = Path(path)
+    tree = _parse(path)
+    overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
+    data = _plain(tree, (), tree, path, count())
+    for keys, value in overridden.items():
+        _set(data, keys, _as_written(value))
+    if newest is not None:  # first: whatever else is wrong with a newer file may be right for newer code
+        check_format_version(data, newest, _place(path, _line(tree, (FORMAT_VERSION,)), ()))
+    try:
+        # Strict JSON mode is what YAML means: lists fill tuples, whole numbers fill floats, nothing else is converted.
+        return model.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        findings = [_finding(details, model, data, tree, overridden) for details in error.errors()]
+    first = min(findings, key=lambda finding: (_follows(finding, findings), finding.line or 0))
+    raise InputError(_sentence(path, first.line, first.path, first.rule))
+
+
+def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
+    """The sentence that tells of ``values`` that break a rule of a model, which Python code and no file gave."""
+    data = _as_written(values)
+    findings = [_finding(details, model, data, None, {}) for details in error.errors()]
+    first = min(findings, key=lambda finding: _follows(finding, findings))
+    return _sentence(Path(model.__name__), None, first.path, first.rule)
+
+
+def key_place(path: str | Path, keys: KeyPath) -> str:
+    """Where a file says ``keys``, as errors begin: ``scene.yaml:41: objects[2].asset``; no line if there is no file."""
+    path = Path(path)
+    return _place(path, _line(_parse(path), keys) if path.exists() else None, keys)
+
+
+def _as_written(value: Any) -> Any:
+    """What a file would have said: mappings and lists, down to what is neither."""
+    if isinstance(value, BaseModel):
+        return _as_written(dict(value))
+    if isinstance(value, Mapping):
+        return {str(key): _as_written(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_written(inner) for inner in value]
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def _parse(path: Path) -> CommentedMap:
+    """The file's mapping, still with line numbers."""
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: must be a file")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise InputError(f"{path}: must have at most {MAX_BYTES >> 20} MiB (got {size} bytes)")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: must be YAML, hence UTF-8 text ({error.reason} at byte {error.start})") from None
+    try:
+        reader = YAML(typ="rt", pure=True)
+        reader.Scanner = _Scanner
+        tree = reader.load(text)
+    except DuplicateKeyError as error:
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
+        problem = str(error.problem).partition(" with value")[0]
+        raise InputError(_sentence(path, line, (), f"keys must be unique ({problem})")) from None
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise InputError(_sentence(path, mark.line + 1 if mark else None, (), f"not YAML: {error.problem}")) from None
+    except (YAMLError, ValueError) as error:  # ValueError: a date or number that cannot be
+        raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
+    except RecursionError:
+        raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels") from None
+    if not isinstance(tree, CommentedMap):
+        raise InputError(f"{path}: must be a mapping of keys to values (got {_shown(tree)})")
+    return tree
+
+
+def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Iterator[int]) -> Any:
+    """The node as built-in dicts, lists and scalars; refuses what JSON cannot hold."""
+    if len(keys) > MAX_DEPTH:
+        raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels")
+    if next(values) > MAX_VALUES:
+        raise InputError(f"{path}: must not hold more than {MAX_VALUES} values")
+    tag = getattr(node, "tag", None)
+    if isinstance(node, TaggedScalar) or (tag is not None and tag.value is not None):
+        raise InputError(_sentence(path, _line(tree, keys), keys, f"must not have a YAML tag (got {tag})"))
+    if isinstance(node, Mapping):
+        for key in node:
+            if not isinstance(key, str):
+                raise InputError(_sentence(path, _line(tree, keys), keys, f"keys must be text (got {_shown(key)})"))
+        return {str(key): _plain(value, (*keys, key), tree, path, values) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_plain(value, (*keys, position), tree, path, values) for position, value in enumerate(node)]
+    if node is None or isinstance(node, bool):
+        return node
+    for scalar in (int, float, str):
+        if isinstance(node, scalar):
+            return scalar(node)
+    return str(node)
+
+
+def _set(data: dict[str, Any], keys: tuple[str, ...], value: Any) -> None:
+    """Replace one value of nested mappings, making those that are absent."""
+    for key in keys[:-1]:
+        inner = data.get(key)
+        if not isinstance(inner, dict):
+            inner = data[key] = {}
+        data = inner
+    data[keys[-1]] = value
+
+
+def _finding(
+    details: ErrorDetails,
+    model: type[BaseModel],
+    data: dict[str, Any],
+    tree: CommentedMap | None,
+    overridden: Mapping[tuple[str, ...], Any],
+) -> _Finding:
+    """Pydantic's account of one error in terms of the file, if there is one."""
+    kind, context, location = details["type"], details.get("ctx", {}), details["loc"]
+    keys = _file_path(location, data, keep_last=kind == "missing")
+    value: Any = details["input"]
+    cause = context.get("error")
+    if isinstance(cause, FieldError):
+        keys += cause.key
+    if kind.startswith("union_tag"):
+        keys += (str(context["discriminator"]).strip("'"),)
+        value = context.get("tag")
+    rule = RULES[kind].format(**context) if kind in RULES else str(details["msg"])
+    if kind == "value_error":
+        rule = str(cause)
+    elif kind == "extra_forbidden":
+        rule = _unknown_key(str(keys[-1]), list(_schema_at(model, location[:-1]).get("properties", {})))
+    elif kind == "union_tag_not_found":
+        rule += f", one of {', '.join(_schema_at(model, location)['discriminator']['mapping'])}"
+    elif kind == "missing" and isinstance(location[-1], int):
+        rule = f"must have {_schema_at(model, location[:-1])['minItems']} items (got {location[-1]})"
+    elif kind != "missing":
+        if kind == "tuple_type" and "prefixItems" in (form := _schema_at(model, location)):
+            rule += f" of {len(form['prefixItems'])}"
+        rule = f"{rule.replace('Input should', 'must')} (got {_shown(value)})"
+    overlaps = [min(len(keys), len(override)) for override in overridden]
+    from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))
+    line = _line(tree, keys) if tree is not None and from_file else None
+    return _Finding(keys, rule, line, kind == "missing" and isinstance(location[-1], str))
+
+
+def _follows(finding: _Finding, findings: Sequence[_Finding]) -> bool:
+    """Whether it may be the mere consequence of another: a misspelt key, or an item too few for a bad one in a list."""
+    return finding.missing or any(
+        len(finding.path) < len(other.path) and other.path[: len(finding.path)] == finding.path for other in findings
+    )
+
+
+def _file_path(location: KeyPath, data: Any, *, keep_last: bool) -> KeyPath:
+    """Pydantic's location less the names of union members, which the user never wrote."""
+    keys: list[str | int] = []
+    for position, part in enumerate(location):
+        last = position == len(location) - 1
+        if isinstance(data, dict):
+            if part == data.get("kind") and not last:
+                continue
+            if part in data:
+                keys, data = [*keys, part], data[str(part)]
+            elif last and keep_last:
+                keys.append(part)
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            keys, data = [*keys, part], data[part]
+    return tuple(keys)
+
+
+def _line(tree: Any, keys: KeyPath) -> int:
+    """Line (from 1) of the deepest part of ``keys`` that the file has."""
+    line = int(tree.lc.line)
+    for key in keys:
+        try:
+            if isinstance(tree, CommentedMap):
+                line = tree.lc.key(key)[0]
+            elif isinstance(tree, CommentedSeq):
+                line = tree.lc.item(key)[0]
+            tree = tree[key]
+        except (KeyError, IndexError, TypeError):
+            break
+    return line + 1
+
+
+def _schema_at(model: type[BaseModel], location: KeyPath) -> dict[str, Any]:
+    """The part of the model's JSON Schema that pydantic's ``location`` points at, or {}."""
+    root = model.model_json_schema()
+
+    def resolved(schema: dict[str, Any]) -> dict[str, Any]:
+        while "$ref" in schema or "anyOf" in schema:
+            # The options of anyOf are an optional value and null, in this order.
+            schema = root["$defs"][schema["$ref"].rpartition("/")[2]] if "$ref" in schema else schema["anyOf"][0]
+        return schema
+
+    schema = resolved(root)
+    for part in location:
+        members = schema.get("discriminator", {}).get("mapping", {})
+        if part in members:
+            schema = {"$ref": members[part]}
+        elif isinstance(part, int):
+            items = schema.get("prefixItems", [])
+            schema = items[part] if part < len(items) else schema.get("items", {})
+        else:
+            schema = schema.get("properties", {}).get(part, {})
+        schema = resolved(schema)
+    return schema
+
+
+def _unknown_key(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
+    return f"is not a known key ({hint})"
+
+
+def _place(path: Path, line: int | None, keys: KeyPath) -> str:
+    place = str(path) if line is None else f"{path}:{line}"
+    shown = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).lstrip(".")
+    return f"{place}: {shown}" if shown else place
+
+
+def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
+    return f"{_place(path, line, keys)}: {rule}"
+
+
+def _shown(value: Any) -> str:
+    """The value as the file would write it, shortened."""
+    text = "nothing" if value is None else json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."

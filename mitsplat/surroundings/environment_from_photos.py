@@ -1,0 +1,391 @@
+"""From a capture and a fit of a whole place to an environment: cleaned, level, with supports, a verdict and a scene."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.ndimage import binary_erosion
+
+from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.capture_photos import CaptureSettings
+from mitsplat.fit.image_metrics import psnr_of
+from mitsplat.fit.trainer import FitSettings
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.triangulation import meeting_point
+from mitsplat.images.colour import decode_srgb
+from mitsplat.pages.html import rgb_image
+from mitsplat.progress import Progress
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, HeldOutView, show_held_out, sized_photo
+from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult, make_asset, make_photo_asset
+from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
+from mitsplat.reconstruct.surface import reconstruct_surface
+from mitsplat.storage.files import write_text
+from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL, Coverage, Hole, find_coverage, find_holes, free_rectangle
+from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
+from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
+from mitsplat.surroundings.ground import Ground
+from mitsplat.surroundings.ready_scene import Region, scene_text
+from mitsplat.surroundings.removal import RemovedThing, remove_things
+from mitsplat.surroundings.shading import ShadingLight, light_of_shading
+from mitsplat.surroundings.supports import Support, find_supports, flattened
+
+_NEAR = 3.0
+"""Distance from what the cameras look at, in their own, beyond which is background: shown, but no part of the mesh."""
+_TURNED = 30.0
+"""Angle to the capture's vertical up to which a surface may be the support [degrees]."""
+_ANYHOW = 55.0
+"""The same to one of the six axes, by which every direction is looked in, where nothing says where up is [degrees]."""
+_LEVEL = 2.0
+"""Angle to the support up to which other surfaces are level [degrees]."""
+_ROUGH = 0.03
+"""Height of the mesh over a support that is flattened, as a share of the typical depth."""
+_HIDDEN = 0.1
+"""Largest share of the support that too few photos may show."""
+_SAME = 1.5 / 255
+"""Difference up to which a pixel shows nothing of what was removed."""
+_ACROSS = 256
+"""Most cells along a support by which its light is told."""
+_SMALLEST_REGION = 0.1
+"""Least edge of a place that things can be dropped on [m]."""
+
+
+def make_surroundings(
+    capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
+) -> AssetResult:
+    """Write an environment and a scene; see :func:`~mitsplat.reconstruct.asset_from_photos.make_asset`.
+
+    The scene file lies beside the asset's folder and has its name; one that was changed by hand is kept.
+    """
+    before = _recorded_scene(out)
+    return _with_scene(
+        make_asset(capture_folder, fit, out, job, make=reconstruct_surroundings, progress=progress), before
+    )
+
+
+def make_photo_surroundings(
+    photos: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    capture: CaptureSettings,
+    fit: FitSettings,
+    progress: Progress | None = None,
+) -> AssetResult:
+    """Make an environment from photographs; see :func:`mitsplat.reconstruct.asset_from_photos.make_photo_asset`."""
+    before = _recorded_scene(out)
+    done = make_photo_asset(
+        photos, out, job, capture=capture, fit=fit, make=reconstruct_surroundings, progress=progress
+    )
+    return _with_scene(done, before)
+
+
+def reconstruct_surroundings(
+    capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
+) -> Reconstruction:
+    """Make an environment of splats that were fitted to a capture.
+
+    Args:
+        capture: Photos with cameras.
+        splats: In the capture's frame.
+        job: What to make.
+        psnr: Held-out PSNR that the fit reported [dB].
+        source: What the capture's scale and gravity are by.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: As :func:`mitsplat.reconstruct.reconstruct.reconstruct_asset`.
+    """
+    if progress is not None:
+        progress(0, 1, "removing floaters and finding supports")
+    cameras = [photo.camera for photo in capture.training]
+    scale = _typical_depth(capture)
+    splats, removed = remove_floaters(splats, capture.training, scale)
+    views = depth_views(splats, cameras)
+    points = surface_points(views)
+    found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_TURNED)
+    if not found and capture.up == "unknown":
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        anyhow = (find_supports(points, axis, scale, within=_ANYHOW) for axis in axes)
+        found = max(anyhow, key=lambda supports: supports[0].looked_at if supports else 0.0)
+    motion: Float64Array = np.eye(4)
+    if found:
+        motion = np.asarray(np.linalg.inv(found[0].pose))
+        capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
+        points, views = points.transformed(motion), [view.transformed(motion) for view in views]
+        found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
+    cameras = [photo.camera for photo in capture.training]
+    fitted, standing, things = splats, points, list[RemovedThing]()
+    if job.remove:
+        splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
+        views = depth_views(splats, cameras)
+        points = surface_points(views)
+    beyond = _beyond(splats, cameras)
+    imported = job.imported
+    if imported is None:
+        mesh = _mesh(splats.select(~beyond), capture.training, job, found, scale, progress)
+        imported = ImportedMesh(mesh, np.eye(4))
+    made = reconstruct_asset(
+        capture, splats, name=job.name, class_name=job.class_name, kind="environment", settings=job.settings,
+        imported=imported, psnr=psnr, progress=progress,
+    )  # fmt: skip
+    # A size squares the asset with its mesh: that turn is taken back, as the support lies along the axes.
+    factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
+    back = np.eye(4)
+    back[:3, :3] = made.asset_from_capture[:3, :3].T / factor
+    larger = np.diag([factor, factor, factor, 1.0])
+    made = replace(made, asset=made.asset.transformed(back), asset_from_capture=larger @ motion)
+    error = "" if capture.scale_error is None else f" ± {capture.scale_error:.2%}"
+    rows = {
+        "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
+        + (f", by {source}" if source else ""),
+        "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
+        "Background": f"{int(beyond.sum())} Gaussians far beyond what the cameras look at, which are kept",
+    }
+    findings, sections, record = list[str](), list[str](), dict[str, Any]()
+    if found:
+        coverage = find_coverage(found[0], views, points, scale)
+        named = [(photo.name, photo.camera) for photo in capture.training]
+        holes = find_holes(found[0], coverage, splats, named)
+        supports = [support.transformed(larger) for support in found]
+        filled = coverage.holding(np.concatenate([np.zeros((0, 2)), *(t.filled for t in things if t.support == 0)]))
+        region = _region(coverage, found[0], factor)
+        unit = "m" if made.asset.units == "metre" else "units"
+        rows |= _rows(supports, coverage, holes, region, factor, unit)
+        findings += _findings(coverage, holes, region, factor, unit, metric=made.asset.units == "metre")
+        if things:
+            rows["Removed things"] = "; ".join(_missing(thing, factor, unit) for thing in things)
+            record["removed_things"] = [
+                {
+                    "pick": t.pick,
+                    "gaussians": t.gaussians,
+                    "filled": factor**2 * t.area,
+                    "behind": factor**2 * t.behind,
+                    "copied": t.copied,
+                }
+                for t in things
+            ]
+        sections.append(_map(coverage, filled))
+        record["supports"] = [
+            {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
+        ]
+        if region is not None and made.asset.units == "metre":
+            light = _light(found[0], fitted, capture, standing, scale, factor)
+            rows["Light"] = "not told by shadows" if light is None else _lit(light)
+            seen = [photo.camera for photo in capture.transformed(larger).photos]
+            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen, light)
+    else:
+        findings.append(
+            "no level surface was found for things to stand on (one is wanted): photograph the table from above as "
+            "well, and put texture on it"
+        )
+    if made.asset.units != "metre":
+        findings.append(
+            "how large it is is unknown, so that there is no scene file: lay a board of `mitsplat board` on the table, "
+            "or give --scale-from"
+        )
+    # As the asset is rendered, not as the fit saw it.
+    shown = mean_psnr(made.held_out) if made.held_out else psnr
+    if made.held_out and things:
+        shown = _psnr_beside(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
+    verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
+    return replace(made, verdict=verdict, sections=tuple(sections), record=record)
+
+
+def _light(
+    support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float, factor: float
+) -> ShadingLight | None:
+    """What light the shadows on a support tell, relative to its middle [m], ``factor`` metres to a unit."""
+    ground = Ground.of(support, splats, capture, scale)
+    places = points.transformed(np.asarray(np.linalg.inv(support.pose))).places
+    heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
+    linear, bare = decode_srgb(np.clip(ground.texture, 0, 1)), np.asarray(binary_erosion(ground.seen))
+    block = -(-max(heights.shape) // _ACROSS)
+
+    def blocks(values: Float64Array | BoolArray) -> Any:
+        x, y = (count // block for count in values.shape[:2])
+        return values[: x * block, : y * block].reshape(x, block, y, block, *values.shape[2:])
+
+    return light_of_shading(
+        blocks(linear).mean(axis=(1, 3)),
+        factor * blocks(heights).max(axis=(1, 3)),
+        blocks(bare).all(axis=(1, 3)),
+        factor * block * ground.grid.cell,
+    )
+
+
+def _lit(light: ShadingLight) -> str:
+    """Lamps by their directions from the middle of the support, and the rest, a clause."""
+    told = []
+    for lamp in light.lamps:
+        x, y, z = lamp.position
+        turn, rise = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
+        told.append(f"a lamp at azimuth {turn:.0f}°, elevation {rise:.0f}°")
+    return f"{', '.join(told)}; {light.ambient_share:.0%} from all sides, as shadows on the support tell"
+
+
+def _typical_depth(capture: Capture) -> float:
+    """Median over the photos of the median depth of the points that they see."""
+    depths = [photo.camera.project(capture.points[photo.seen])[1] for photo in capture.training]
+    known = [float(np.median(depth)) for depth in depths if len(depth)]
+    return float(np.median(known)) if known else 1.0
+
+
+def _beyond(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
+    """Which Gaussians (N,) are far beyond what the cameras look at."""
+    centres = np.array([camera.centre for camera in cameras])
+    focus = meeting_point(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
+    away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
+    return np.asarray(np.linalg.norm(splats.means - focus, axis=1) > _NEAR * away)
+
+
+def _mesh(
+    splats: Splats,
+    photos: Sequence[Photo],
+    job: AssetJob,
+    supports: Sequence[Support],
+    scale: float,
+    progress: Progress | None,
+) -> trimesh.Trimesh:
+    cameras = [sized_photo(photo, job.settings.view_size)[0] for photo in photos]
+    mesh = reconstruct_surface(splats, cameras, settings=job.settings.surface, progress=progress)
+    return flattened(mesh, supports, _ROUGH * scale)
+
+
+def _region(coverage: Coverage, support: Support, factor: float) -> Region | None:
+    """The largest free rectangle of the support [m or units], in its frame."""
+    cells = free_rectangle(coverage.free)
+    if cells is None:
+        return None
+    low = coverage.middle(np.array([[cells[0] - 0.5, cells[2] - 0.5]]))[0] * factor
+    high = coverage.middle(np.array([[cells[1] - 0.5, cells[3] - 0.5]]))[0] * factor
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+
+def _rows(
+    supports: Sequence[Support],
+    coverage: Coverage,
+    holes: Sequence[Hole],
+    region: Region | None,
+    factor: float,
+    unit: str,
+) -> dict[str, str]:
+    first = supports[0]
+    rows = {
+        "Support": f"{first.size[0]:.3g} x {first.size[1]:.3g} {unit}, {first.filled:.0%} of it seen as flat, rough by "
+        f"{first.roughness:.2g} {unit}; {first.looked_at:.0%} of the photos' middles show it"
+    }
+    if len(supports) > 1:
+        rows["Other level surfaces"] = "; ".join(
+            f"{s.size[0]:.3g} x {s.size[1]:.3g} {unit} at z = {s.height:.3g} {unit}" for s in supports[1:]
+        )
+    if region is not None:
+        rows["Free to drop on"] = (
+            f"{region[1] - region[0]:.3g} x {region[3] - region[2]:.3g} {unit}, x {region[0]:.3g} to {region[1]:.3g}, "
+            f"y {region[2]:.3g} to {region[3]:.3g}"
+        )
+    rows["Hardly seen"] = f"{coverage.hidden.mean():.1%} of the support is in fewer than {ENOUGH} photos"
+    if holes:
+        rows["Holes"] = "; ".join(_told(hole, factor, unit) for hole in holes)
+    return rows
+
+
+def _told(hole: Hole, factor: float, unit: str) -> str:
+    """A hole, and from where it would be seen, a clause."""
+    x, y = (factor * value for value in hole.middle)
+    place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
+    if hole.near is None:
+        return f"{place}, which things hide from everywhere: move them"
+    return f"{place}: photograph it from near {hole.near}, {hole.height:.0f} degrees above it (shows {hole.shown:.0%})"
+
+
+def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
+    """What was removed and filled in, a clause."""
+    size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
+    x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
+    copied = "copies of what is around" if thing.copied > 0.99 else f"copies of what is around ({thing.copied:.0%})"
+    behind = f" and {factor**2 * thing.behind:.2g} {unit}² of a wall behind it" if thing.behind else ""
+    return (
+        f"{size} {unit} around x {x:.2f}, y {y:.2f} of surface {thing.support} ({thing.pick}), {thing.gaussians} "
+        f"Gaussians; {factor**2 * thing.area:.2g} {unit}²{behind} that it hid are invented, of {copied}"
+    )
+
+
+def _psnr_beside(after: Sequence[HeldOutView], before: Sequence[HeldOutView]) -> float:
+    """Mean PSNR [dB] of held-out photos where they show nothing that was removed."""
+    errors = []
+    for view, old in zip(after, before, strict=True):
+        same = np.abs(view.render - old.render).max(axis=2) < _SAME
+        if same.any():
+            errors.append(psnr_of(float(((view.render - view.photo)[same] ** 2).mean())))
+    return float(np.mean(errors))
+
+
+def _findings(
+    coverage: Coverage, holes: Sequence[Hole], region: Region | None, factor: float, unit: str, *, metric: bool
+) -> list[str]:
+    found = []
+    if coverage.hidden.mean() > _HIDDEN:
+        places = "; ".join(_told(hole, factor, unit) for hole in holes) or "it is in many small parts: add photos"
+        found.append(
+            f"{coverage.hidden.mean():.0%} of the support is in fewer than {ENOUGH} photos (at most {_HIDDEN:.0%} is "
+            f"wanted): {places}"
+        )
+    if region is None or (metric and min(region[1] - region[0], region[3] - region[2]) < _SMALLEST_REGION):
+        found.append(
+            f"no free place of {_SMALLEST_REGION:g} x {_SMALLEST_REGION:g} m is left on the support: clear it, or "
+            "write the scene's region by hand"
+        )
+    return found
+
+
+def _map(coverage: Coverage, filled: BoolArray) -> str:
+    """The support from above, with what is covered, free, hardly seen and filled in."""
+    tint = np.full((*coverage.photos.shape, 3), 0.85)
+    tint[coverage.free] = (0.55, 0.8, 0.55)
+    tint[coverage.covered] = (0.35, 0.4, 0.5)
+    tint[coverage.hidden] = (0.85, 0.3, 0.25)
+    tint[filled] = (0.9, 0.75, 0.3)
+    picture = np.repeat(np.repeat(tint.transpose(1, 0, 2)[::-1], 5, axis=0), 5, axis=1)
+    invented = ", yellow was hidden by things that were removed and is invented" if filled.any() else ""
+    note = (
+        "The surface that things stand on, from above, x to the right and y up: green is free, dark is covered, red is "
+        f"in fewer than {ENOUGH} photos{invented}."
+    )
+    return (
+        f'<section aria-labelledby="support"><h2 id="support">Support</h2><p>{html.escape(note)}</p><figure>'
+        f'<img alt="support from above" src="{rgb_image(picture, 420)}"></figure></section>'
+    )
+
+
+def _scene_file(out: Path) -> Path:
+    return out.resolve().parent / f"{out.resolve().name}.yaml"
+
+
+def _recorded_scene(out: Path) -> str | None:
+    """The scene that the asset's verdict holds, if any."""
+    try:
+        scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return scene.replace("{folder}", out.resolve().name) if isinstance(scene, str) else None
+
+
+def _with_scene(done: AssetResult, before: str | None) -> AssetResult:
+    """The result, with its scene file on disk; one that neither this run nor the last one wrote is kept."""
+    text, path = _recorded_scene(done.folder), _scene_file(done.folder)
+    if text is None:
+        return done
+    if path.exists() and path.read_text() not in (text, before):
+        changed = f"{path}: holds another scene and is kept as it is; remove it to have it written anew"
+        return replace(done, scene=path, warnings=(*done.warnings, changed))
+    write_text(path, text)
+    return replace(done, scene=path)

@@ -1,0 +1,309 @@
+"""What is shown, as plain values: splats, surfaces, lines, points and cameras at their places.
+
+A part's name is a path, ``/group/name``; a group is shown or hidden as a whole. Parts of one name that differ in their
+pose alone are the same thing moved, which costs a browser nothing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.asset import Asset
+from mitsplat.capture.capture import Capture
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.labels.overlay import class_colour
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.planning.conveyor import carried
+from mitsplat.scene.planning.viewpoints import view_of
+from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, RoomLight, SpotLight
+from mitsplat.scene.spec.shape_spec import Region
+from mitsplat.scene.walls import ENCLOSURE
+
+Colour = tuple[int, int, int]
+
+HIDDEN_FIRST = frozenset({"meshes", "pieces", "colliders", "enclosure", "other cameras"})
+"""Groups that are not shown until they are asked for."""
+
+MOST_CAMERAS = 200
+"""Frusta of a scene that are shown; of more frames those of evenly spaced ones, and of the layout that is shown."""
+
+_GREY, _WALL, _REGION, _LIGHT, _CAMERA, _OTHER = (
+    (150, 150, 150),
+    (90, 140, 220),
+    (60, 180, 90),
+    (255, 190, 40),
+    (220, 70, 60),
+    (120, 120, 120),
+)
+_RING = np.linspace(0, 2 * np.pi, 25)
+_EDGES = np.array([[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]])
+"""Of a box, whose corner ``i`` is low or high along x, y, z by the bits of ``i``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Gaussians, drawn in the colour that they have from all sides on average."""
+
+    splats: Splats
+
+    def thinned(self, most: int) -> Splats:
+        """At most so many Gaussians: every n-th, larger by the root of n, so that surfaces stay covered."""
+        count = len(self.splats)
+        if count <= most:
+            return self.splats
+        sample = self.splats.select(np.linspace(0, count - 1, most).astype(int))
+        return replace(sample, scales=sample.scales * np.float32(np.sqrt(count / most)))
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh in one colour, opaque or see-through."""
+
+    mesh: trimesh.Trimesh
+    colour: Colour
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Segments, shape (N, 2, 3) [m]."""
+
+    segments: Float64Array
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points, shape (N, 3), with 8-bit colours of the same shape, drawn with an edge of ``size``."""
+
+    points: Float64Array
+    colours: npt.NDArray[np.uint8]
+    size: float | None = None
+
+    @property
+    def edge(self) -> float:
+        """Of a point that is drawn."""
+        if self.size is not None:
+            return self.size
+        return 0.002 * float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self.points) else 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Frustum:
+    """A camera, drawn ``depth`` [m] deep; clicking it looks through frame or photo ``index``."""
+
+    camera: Camera
+    depth: float
+    colour: Colour
+    index: int
+
+
+Thing = Cloud | Surface | Lines | Points | Frustum
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A thing at its place.
+
+    Attributes:
+        name: Where it is in the tree of what is shown, ``/group/name``.
+        thing: What is shown.
+        pose: ``world_from_thing``, rotation and translation [m], shape (4, 4).
+    """
+
+    name: str
+    thing: Thing
+    pose: Float64Array = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def group(self) -> str:
+        """What it is shown or hidden with."""
+        return self.name.split("/")[1]
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two things, or what they hold, look the same: then nothing of them is sent again."""
+    if one is other:
+        return True
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, trimesh.Trimesh):
+        return same(np.asarray(one.vertices), np.asarray(other.vertices)) and same(
+            np.asarray(one.faces), np.asarray(other.faces)
+        )
+    if is_dataclass(one):
+        return all(same(getattr(one, entry.name), getattr(other, entry.name)) for entry in fields(one))
+    return np.array_equal(one, other)
+
+
+def base_colours(splats: Splats) -> Float32Array:
+    """Display-encoded colours without what depends on the direction, in [0, 1], shape (N, 3)."""
+    return np.asarray(np.clip(0.5 + SH_C0 * splats.sh[:, 0], 0.0, 1.0), dtype=np.float32)
+
+
+def scene_parts(
+    scene: Scene, index: int, layout: Layout | None = None, lights: Sequence[LightSpec] = ()
+) -> Iterator[Part]:
+    """What a scene is made of as frame ``index`` shows it; objects only once their layout is known.
+
+    Args:
+        scene: The scene.
+        index: Index of the frame.
+        layout: Where the frame's objects lie, or how they move there.
+        lights: The frame's lights.
+    """
+    number = index // scene.spec.output.views
+    environment = scene.environment_of(number)
+    if environment is not None:
+        yield Part("/splats/environment", Cloud(environment.splats))
+        if environment.mesh is not None:
+            yield Part("/meshes/environment", Surface(environment.mesh, _GREY, 0.6))
+    if layout is not None:
+        yield from _object_parts(scene, layout)
+    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+        if shape.visible:
+            red, green, blue = (round(255 * value) for value in shape.colour)
+            yield Part(f"/shapes/{shape.name}", Surface(mesh, (red, green, blue)))
+        else:
+            walls = shape.name.startswith(ENCLOSURE)
+            colour, opacity = (_WALL, 0.15) if walls else (_GREY, 0.5)
+            yield Part(f"/{'enclosure' if walls else 'colliders'}/{shape.name}", Surface(mesh, colour, opacity))
+    for name, (region, _) in zip(scene.spec.region_names, scene.spec.all_regions, strict=True):
+        yield Part(f"/regions/{name}", Lines(_box_edges(region), _REGION))
+    yield from light_parts(lights, scene)
+
+
+def _object_parts(scene: Scene, layout: Layout) -> Iterator[Part]:
+    """Splats, proxy mesh and convex pieces of every object, numbered by asset, so that a drop moves what is there."""
+    counts = Counter[int]()
+    for instance in layout.instances:
+        asset = scene.assets[instance.asset]
+        name = f"{instance.asset}-{asset.name}-{counts[instance.asset]}".replace("/", "_")
+        counts[instance.asset] += 1
+        yield from _asset_parts(asset, name, instance.world_from_object)
+
+
+def _asset_parts(asset: Asset, name: str, pose: Float64Array) -> Iterator[Part]:
+    yield Part(f"/splats/{name}", Cloud(asset.splats), pose)
+    if asset.mesh is not None:
+        yield Part(f"/meshes/{name}", Surface(asset.mesh, _GREY), pose)
+    for number, piece in enumerate(asset.pieces):
+        yield Part(f"/pieces/{name}/{number}", Surface(piece, class_colour(number), 0.7), pose)
+
+
+def asset_parts(asset: Asset) -> Iterator[Part]:
+    """An asset as it lies in its own frame."""
+    yield from _asset_parts(asset, asset.name.replace("/", "_"), np.eye(4))
+    if asset.keypoints:
+        points = asset.keypoint_array
+        yield Part("/keypoints/all", Points(points, np.full(points.shape, (255, 60, 60), dtype=np.uint8)))
+
+
+def capture_parts(capture: Capture) -> Iterator[Part]:
+    """The points of a capture, and its cameras."""
+    yield Part("/points/all", Points(capture.points, capture.colours))
+    centres = np.array([photo.camera.centre for photo in capture.photos]).reshape(-1, 3)
+    around = centres if not len(capture.points) else np.vstack([centres, np.median(capture.points, axis=0)])
+    depth = 0.06 * float(np.linalg.norm(np.ptp(around, axis=0))) if len(around) > 1 else 0.1
+    for index, photo in enumerate(capture.photos):
+        yield Part(f"/cameras/{index}", Frustum(photo.camera, depth, _CAMERA, index), photo.camera.world_from_camera)
+
+
+def light_parts(lights: Sequence[LightSpec], scene: Scene | None = None) -> Iterator[Part]:
+    """Lights at their places and in their sizes, and the paths that a scene's lights move on."""
+    for number, light in enumerate(lights):
+        if isinstance(light, EnvironmentLight):
+            continue
+        if not isinstance(light, AreaLight | SpotLight):
+            yield Part(
+                f"/lights/{number}", Surface(trimesh.creation.icosphere(2, 0.02), _LIGHT), _moved(light.position)
+            )
+            continue
+        pose = look_at_pose(light.position, light.target)
+        if isinstance(light, AreaLight):
+            width, height = light.size
+            yield Part(f"/lights/{number}", Surface(_rectangle(width, height), _LIGHT, 0.85), pose)
+        else:
+            yield Part(f"/lights/{number}", Lines(_cone(light.cone), _LIGHT), pose)
+        aim = np.array([[light.position, light.target]], dtype=np.float64)
+        yield Part(f"/lights/{number}-aim", Lines(aim, _LIGHT))
+    for number, entry in enumerate(() if scene is None else scene.spec.lights):
+        if isinstance(entry, EnvironmentLight | RoomLight) or not entry.path:
+            continue
+        stops = np.array([key.position or entry.position for key in entry.path], dtype=np.float64)
+        if len(stops) > 1:
+            yield Part(f"/lights/path-{number}", Lines(np.stack([stops[:-1], stops[1:]], axis=1), _LIGHT))
+
+
+def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Part]:
+    """The cameras of frames: of those that show the layout of frame ``index``, and of others evenly spread."""
+    views = scene.spec.output.views
+    own = range(index // views * views, (index // views + 1) * views)
+    spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MOST_CAMERAS)).astype(int)
+    size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
+    for frame in sorted({*own[:MOST_CAMERAS], *spread.tolist()}):
+        there = None if layout is None or frame not in own else carried(scene.spec, layout, frame % views)
+        camera = view_of(scene, frame, there).camera
+        group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
+        yield Part(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)
+
+
+def bounds_of(parts: Iterable[Part]) -> Float64Array:
+    """Lowest and highest coordinates [m] of what lies in the middle of splats and points, shape (2, 3)."""
+    found = []
+    for part in parts:
+        if isinstance(part.thing, Cloud | Points):
+            points = part.thing.splats.means if isinstance(part.thing, Cloud) else part.thing.points
+            if len(points):
+                low, high = np.percentile(points, (2, 98), axis=0)
+                corners = _corners(low, high) @ part.pose[:3, :3].T + part.pose[:3, 3]
+                found += [corners.min(axis=0), corners.max(axis=0)]
+    return np.array([np.min(found, axis=0), np.max(found, axis=0)]) if found else np.array([[-0.5] * 3, [0.5] * 3])
+
+
+def changes(shown: Mapping[str, Part], wanted: Mapping[str, Part]) -> tuple[list[str], list[Part], list[Part]]:
+    """What leads from what is shown to what is wanted: names to remove, parts to add, parts that only moved."""
+    kept = {name for name, part in wanted.items() if name in shown and same(shown[name].thing, part.thing)}
+    moved = [wanted[name] for name in kept if not np.array_equal(shown[name].pose, wanted[name].pose)]
+    return [name for name in shown if name not in kept], [wanted[n] for n in wanted if n not in kept], moved
+
+
+def _corners(low: npt.ArrayLike, high: npt.ArrayLike) -> Float64Array:
+    bits = np.arange(8)[:, None] >> np.arange(3) & 1
+    return np.asarray(np.where(bits, np.asarray(high), np.asarray(low)), dtype=np.float64)
+
+
+def _box_edges(region: Region) -> Float64Array:
+    edges: Float64Array = _corners(region.min, region.max)[_EDGES]
+    return edges
+
+
+def _moved(position: npt.ArrayLike) -> Float64Array:
+    pose = np.eye(4)
+    pose[:3, 3] = position
+    return pose
+
+
+def _rectangle(width: float, height: float) -> trimesh.Trimesh:
+    x, y = width / 2, height / 2
+    corners = [(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)]
+    return trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+
+
+def _cone(half_angle: float, length: float = 0.15) -> Float64Array:
+    """A cone that opens along +z from the origin, shape (N, 2, 3) [m]."""
+    along, across = length * np.cos(np.radians(half_angle)), length * np.sin(np.radians(half_angle))
+    rim = np.stack([across * np.cos(_RING), across * np.sin(_RING), np.full_like(_RING, along)], axis=1)
+    rays = np.stack([np.zeros((4, 3)), rim[:-1:6]], axis=1)
+    return np.concatenate([np.stack([rim[:-1], rim[1:]], axis=1), rays])

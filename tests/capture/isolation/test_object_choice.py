@@ -1,0 +1,78 @@
+"""The object among points of a cluttered place: what the cameras look at, or what a hint says, on uneven ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.capture.isolation import Pick, View, choose_object
+from mitsplat.capture.isolation.object_choice import focus_of
+from mitsplat.capture.isolation.support import find_support
+from mitsplat.errors import InputError
+from tests.capture.isolation.balls import THINGS, ground, three_balls
+
+
+@pytest.fixture(scope="module")
+def place() -> tuple[Float64Array, Int64Array, list[View]]:
+    """Points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
+    return three_balls()
+
+
+def ball_of(points: Float64Array, place: tuple[Float64Array, Int64Array, list[View]]) -> set[int]:
+    """Labels of the points that were chosen."""
+    every, labels, _ = place
+    row = {tuple(point): int(label) for point, label in zip(every.tolist(), labels, strict=True)}
+    return {row[tuple(point)] for point in points.tolist()}
+
+
+def pick(place: tuple[Float64Array, Int64Array, list[View]], thing: int) -> Pick:
+    """A pixel of the first photo on the top of a ball."""
+    view = place[2][0]
+    x, y = THINGS[thing - 1]
+    top = np.array([[x, y, 0.08 + float(ground(np.array([[x, y]]))[0])]])
+    u, v = view.camera.project(top)[0][0]
+    return Pick("one.jpg:1,2", view, (float(u), float(v)))
+
+
+def test_uneven_ground_is_found_under_things(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+    points, labels, views = place
+    support = find_support(points, focus_of([view.camera for view in views])[0], 0.28)
+    near = (labels == 0) & (np.abs(points[:, :2]) < 0.2).all(axis=1)
+    gap = support.under(points[near]) - ground(points[near])
+    assert np.sqrt(np.mean(gap**2)) < 0.002
+    assert support.roughness < 0.002
+
+
+def test_what_the_cameras_look_at_is_chosen(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+    points, labels, views = place
+    found = choose_object(points, views)
+    assert sorted(sorted(ball_of(other, place)) for other in found.others) == [[2], [3]]
+    assert ball_of(found.above, place) == {1}
+    assert len(found.above) > 0.85 * np.count_nonzero(labels == 1)
+    feet = found.points[len(found.above) :]
+    assert np.abs(feet[:, 2] - ground(feet)).max() < 0.006
+
+
+def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+    points, _, views = place
+    assert ball_of(choose_object(points, views, picks=[pick(place, 3)]).above, place) == {3}
+    both = choose_object(points, views, picks=[pick(place, 1), pick(place, 2)])
+    assert ball_of(both.above, place) == {1, 2}
+    assert ball_of(choose_object(points, views, picks_not=[pick(place, 1)]).above, place) <= {2, 3}
+    boxed = choose_object(points, views, box=(0.1, -0.05, -0.02, 0.25, 0.1, 0.15))
+    assert ball_of(boxed.above, place) == {2}
+
+
+def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+    points, labels, views = place
+    one = pick(place, 1)
+    with pytest.raises(InputError, match=r"also said not to be the object \(one.jpg:1,2\)"):
+        choose_object(points, views, picks=[one], picks_not=[one])
+    with pytest.raises(InputError, match="no point of a thing within 32 px"):
+        choose_object(points, views, picks=[Pick("one.jpg:0,0", views[0], (0.0, 0.0))])
+    bare = np.flatnonzero(labels == 0)
+    place_of = {int(old): new for new, old in enumerate(bare)}
+    fewer = [View(v.camera, np.array([place_of[i] for i in v.seen.tolist() if i in place_of], np.int32)) for v in views]
+    with pytest.raises(InputError, match="no object stands out of its support"):
+        choose_object(points[bare], fewer)

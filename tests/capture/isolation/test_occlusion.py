@@ -1,0 +1,73 @@
+"""What stands before the object in a photo, against areas of discs that overlap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsplat.arrays import Float64Array
+from mitsplat.capture.isolation.occluding_points import hidden_part
+from mitsplat.geometry.camera import Camera
+
+
+def ball(middle: tuple[float, float, float], radius: float = 0.04, count: int = 800) -> Float64Array:
+    """Points on a ball [m], shape (N, 3)."""
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    return points * radius / np.linalg.norm(points, axis=1, keepdims=True) + middle
+
+
+def hidden_share(camera: Camera, own: Float64Array, others: list[Float64Array]) -> float:
+    hides, may_hide, pixels = hidden_part(camera, own, others)
+    assert hides <= may_hide and pixels.shape == (480, 640) and (pixels.any() or may_hide == 0)
+    return hides
+
+
+CAMERA = Camera.look_at((0, -5, 0), (0, 0, 0), width=640, height=480, fov_x=3)
+"""From so far that balls are discs."""
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.02, 0.04, 0.06, 0.1])
+def test_a_ball_hides_as_much_of_another_as_their_discs_share(aside: float) -> None:
+    own, before, behind = ball((0, 0, 0)), ball((aside, -0.2, 0)), ball((aside, 0.2, 0))
+    # Two discs of radius r whose middles are d apart share 2 r^2 acos(d / 2r) - d sqrt(r^2 - d^2 / 4).
+    half = min(aside / 0.08, 1.0)
+    shared = (2 * np.arccos(half) - 2 * half * np.sqrt(1 - half**2)) / np.pi
+    assert hidden_share(CAMERA, own, [before]) == pytest.approx(shared, abs=0.05)
+    assert hidden_share(CAMERA, own, [behind]) == 0
+    assert hidden_share(CAMERA, own, [before, behind, before]) == pytest.approx(shared, abs=0.05)
+
+
+def test_a_ring_around_the_object_hides_only_what_stands_before_it() -> None:
+    turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    ring = np.column_stack([0.07 * np.cos(turns), 0.07 * np.sin(turns), np.full(400, -0.035)])
+    camera = Camera.look_at((0, -0.4, 0.25), (0, 0, 0), width=640, height=480, fov_x=40)
+    assert hidden_share(camera, ball((0, 0, 0)), [ring]) < 0.1
+
+
+def test_too_few_points_hide_nothing() -> None:
+    assert hidden_share(CAMERA, ball((0, 0, 0)), []) == 0
+    assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0, -0.2, 0))[:3]]) == 0
+    assert hidden_share(CAMERA, ball((0, -6, 0)), [ball((0, -0.2, 0))]) == 0
+
+
+def test_a_few_points_are_enough_of_a_small_thing() -> None:
+    """Thirty points, as plain things have, are sparse: the thing lies between them nevertheless."""
+    assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0.02, -0.2, 0), 0.03, count=30)]) > 0.2
+
+
+def test_pixels_are_those_of_what_stands_before_the_object_and_a_rim_of_them() -> None:
+    _, may_hide, pixels = hidden_part(CAMERA, ball((0, 0, 0)), [ball((0.05, -0.2, 0)), ball((-0.05, 0.2, 0))])
+    assert 0.3 < may_hide < 0.6
+    y, x = np.mgrid[0:480, 0:640] + 0.5
+    (middle,), _ = CAMERA.project(np.array([[0.05, -0.2, 0]]))
+    away = np.hypot(x - middle[0], y - middle[1]) / (0.04 / 4.8 * CAMERA.fx)
+    near = np.abs(x - 320) < 0.04 / 5 * CAMERA.fx  # where the object is
+    assert pixels[near & (away < 0.97)].all() and not pixels[near & (away > 1.3)].any()
+
+
+def test_a_plain_side_between_points_may_hide_the_object() -> None:
+    """A can whose points are on its rims alone."""
+    turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    rims = [np.column_stack([0.04 * np.cos(turns), 0.04 * np.sin(turns) - 0.2, np.full(60, z)]) for z in (-0.04, 0.04)]
+    hides, may_hide, _ = hidden_part(CAMERA, ball((0, 0, 0)), [np.concatenate(rims)])
+    assert hides < 0.7 and may_hide > 0.95

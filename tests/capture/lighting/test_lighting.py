@@ -1,0 +1,556 @@
+"""Captured light: closed forms, a mirror ball in a sky that is known, and in a path-traced room with known lamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from pydantic import TypeAdapter
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.capture.lighting import (
+    BallView,
+    LightEstimate,
+    LightSettings,
+    estimate_light,
+    panorama,
+    read_ball,
+    write_light,
+)
+from mitsplat.capture.lighting.brackets import merge_exposures, read_photograph
+from mitsplat.capture.lighting.lamps import rectangle_axes, rectangle_irradiance
+from mitsplat.capture.lighting.mirror_ball import find_ball, unwrap_ball
+from mitsplat.capture.lighting.panorama import directions, level_irradiance, level_weights, solid_angles, unit_vector
+from mitsplat.cli import main
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
+from mitsplat.renderer.scene_emitters import emitter_dict, y_up_to_z_up
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec
+from tests.capture.lighting import room
+from tests.conftest import WriteScene
+
+HEIGHT, WIDTH = 256, 512
+ASIDE = (0.012, -0.01, 0.006)
+"""Where a camera looks that does not look at the ball [m]."""
+
+
+def run(*args: object) -> int:
+    with pytest.raises(SystemExit) as exited:
+        main([str(arg) for arg in args])
+    return int(exited.value.code or 0)
+
+
+def between(a: Float64Array, b: Float64Array) -> float:
+    """Angle between two unit vectors [degrees]."""
+    return float(np.degrees(2 * np.arcsin(min(1.0, 0.5 * float(np.linalg.norm(np.subtract(a, b)))))))
+
+
+def painted(*discs: tuple[float, float, float, Any], rest: Any = 0.2, turn: float = 0.0) -> Float32Array:
+    """A sky of one radiance with discs: azimuth, elevation, angular radius [degrees], radiance; edges cross pixels."""
+    sky = np.broadcast_to(np.float32(rest), (HEIGHT, WIDTH, 3))
+    sight = directions(HEIGHT, WIDTH, turn)
+    for azimuth, elevation, radius, radiance in discs:
+        inside = radius - np.degrees(np.arccos(np.clip(sight @ np.float32(unit_vector(azimuth, elevation)), -1, 1)))
+        share = np.clip(0.5 + inside * HEIGHT / 180, 0, 1)[..., None]
+        sky = (1 - share) * sky + share * np.float32(radiance)
+    return sky
+
+
+def estimated(sky: Float32Array, **settings: Any) -> LightEstimate:
+    return estimate_light(sky, LightSettings(**settings))
+
+
+class TestPanoramas:
+    def test_weights_are_exact(self) -> None:
+        assert solid_angles(16, 32).sum() * 32 == pytest.approx(4 * np.pi)
+        assert level_weights(16, 32).sum() * 32 == pytest.approx(np.pi)
+        assert level_weights(15, 30).sum() * 30 == pytest.approx(np.pi)  # the horizon is inside of a row
+        sky = directions(64, 128)[..., 2:].clip(0).repeat(3, axis=2)  # L = cos(theta): E = 2 pi / 3
+        np.testing.assert_allclose(level_irradiance(sky), 2 * np.pi / 3, rtol=1e-3)
+
+    @pytest.mark.parametrize("turn", [0.0, 130.0])
+    def test_directions_are_those_that_the_renderer_shows(self, tmp_path: Path, turn: float) -> None:
+        sky = np.zeros((32, 64, 3), np.float32)
+        sky[7, 50] = 1.0
+        panorama.write_exr(tmp_path / "sky.exr", sky)
+        emitter = mi.load_dict(emitter_dict(EnvironmentLight(image="sky.exr", rotate_z=turn), tmp_path))
+        sight = directions(128, 256).reshape(-1, 3)
+        seen = dr.zeros(mi.SurfaceInteraction3f, len(sight))
+        seen.wi = -mi.Vector3f(sight.T)
+        mean = np.array(emitter.eval(seen))[0] @ sight
+        assert between(mean / np.linalg.norm(mean), directions(32, 64, turn)[7, 50]) < 2.0  # a pixel is 5.6
+
+
+class TestLamps:
+    @pytest.mark.parametrize(
+        ("azimuth", "elevation", "radius", "turn"),
+        [
+            (30, 40, 6, 0),
+            (90, 25, 5, 0),  # across the seam
+            (90 - 77, 25, 5, -77),  # the same of a panorama that is turned
+            (0, 90, 8, 0),  # at the pole
+            (200, 87, 6, 0),  # around the pole
+            (300, 15, 2, 0),
+        ],
+    )
+    def test_a_disc(self, azimuth: float, elevation: float, radius: float, turn: float) -> None:
+        """Irradiance by a disc of angular radius r and elevation e: pi L sin(r)^2 sin(e)."""
+        bright, rest = np.array([30.0, 20.0, 10.0]), np.array([0.2, 0.25, 0.3])
+        sky = painted((azimuth, elevation, radius, bright), rest=rest, turn=turn)
+        found = estimated(sky, rotate_z=turn)
+        (lamp,) = found.lamps
+        assert between(lamp.direction, unit_vector(azimuth, elevation)) < 0.15
+        r = np.radians(radius)
+        expected = np.pi * np.sin(r) ** 2 * np.sin(np.radians(elevation)) * (bright - rest)
+        np.testing.assert_allclose(lamp.irradiance, expected, rtol=0.02)
+        np.testing.assert_allclose(found.ambient, np.pi * rest, rtol=0.01)
+        assert lamp.extents[0] * lamp.extents[1] == pytest.approx(np.pi * np.tan(r) ** 2, rel=0.12)
+        assert lamp.extents[0] == pytest.approx(lamp.extents[1], rel=0.05)
+        np.testing.assert_allclose(lamp.radiance, bright - rest, rtol=0.12)
+        np.testing.assert_allclose(lamp.colour, (bright - rest) / ((bright - rest) @ LUMINANCE), rtol=0.01)
+
+    @pytest.mark.parametrize(("azimuth", "elevation"), [(40, 45), (90, 30), (200, 80)])
+    def test_a_large_rectangle(self, azimuth: float, elevation: float) -> None:
+        """As wide as 60 degrees: what its edges cover is larger in the panorama than in its plane."""
+        direction, extents = unit_vector(azimuth, elevation), np.array([1.15, 0.8])
+        sight = directions(HEIGHT, WIDTH)
+        plane = np.abs(sight @ rectangle_axes(direction).T / np.maximum(sight @ direction, 1e-3)[..., None])
+        sky = np.where((plane < extents / 2).all(axis=2)[..., None], np.float32(20), np.float32(0.2)).repeat(3, axis=2)
+        (lamp,) = estimated(sky).lamps
+        assert between(lamp.direction, direction) < 0.5
+        np.testing.assert_allclose(lamp.extents, extents, rtol=0.03)
+        np.testing.assert_allclose(lamp.radiance, 19.8, rtol=0.03)
+
+    def test_several_by_their_share(self) -> None:
+        discs = ((20, 50, 4, 20.0), (140, 30, 8, 5.0), (250, 60, 6, 20.0), (330, 20, 1, 10.0), (0, -40, 9, 40.0))
+        sky = painted(*discs)
+        found = estimated(sky)
+        order = [2, 0, 1]  # the fourth sends 1 % of the light, the last one comes from below the horizon
+        for lamp, index in zip(found.lamps, order, strict=True):
+            assert between(lamp.direction, unit_vector(*discs[index][:2])) < 0.2
+        assert [found.share(lamp.irradiance) for lamp in found.lamps] == sorted(
+            (found.share(lamp.irradiance) for lamp in found.lamps), reverse=True
+        )
+        two = estimated(sky, lamps=2)
+        assert [lamp.angles for lamp in two.lamps] == [lamp.angles for lamp in found.lamps[:2]]
+        none = estimated(sky, lamps=0)
+        assert none.lamps == [] and (none.rest == sky).all()
+
+    @pytest.mark.parametrize(("gap", "lamps"), [(2.5, 1), (5.0, 2)])
+    @pytest.mark.parametrize("azimuth", [10.0, 90.0])
+    def test_what_is_close_is_one(self, gap: float, lamps: int, azimuth: float) -> None:
+        tilt = 4.0 + gap / 2
+        tubes = painted((azimuth, 30 - tilt, 4, 20.0), (azimuth, 30 + tilt, 4, 20.0))
+        found = estimated(tubes)
+        assert len(found.lamps) == lamps
+        if lamps == 1:
+            width, height = found.lamps[0].angular_size
+            assert height > 1.8 * width and between(found.lamps[0].direction, unit_vector(azimuth, 30)) < 0.5
+
+    def test_skies_without_lamps(self) -> None:
+        height = directions(HEIGHT, WIDTH)[..., 2:].repeat(3, axis=2)
+        overcast = (1 + 2 * height.clip(0)) / 3  # CIE 1955
+        assert estimated(overcast).lamps == []
+        windows = np.where((height > 0.2) & (height < 0.4), 30.0, 1.0).astype(np.float32)
+        assert estimated(windows).lamps == []  # all around
+
+    def test_energy_is_kept_whatever_is_there(self) -> None:
+        random = np.random.default_rng(5)
+        for _ in range(6):
+            discs = [
+                (random.uniform(0, 360), random.uniform(-10, 90), random.uniform(1, 15), random.uniform(0, 30, 3))
+                for _ in range(8)
+            ]
+            sky = painted(*discs) * random.uniform(0.5, 1.5, (HEIGHT, WIDTH, 1)).astype(np.float32)
+            found = estimated(sky)
+            assert found.lamps
+            lamps = sum(lamp.radiance * rectangle_irradiance(lamp.direction, lamp.extents) for lamp in found.lamps)
+            np.testing.assert_allclose(lamps + found.ambient, level_irradiance(sky), rtol=1e-4)
+            assert all((lamp.radiance >= 0).all() for lamp in found.lamps)
+
+    @pytest.mark.parametrize("azimuth", [0.0, 77.0])
+    @pytest.mark.parametrize(("elevation", "extents"), [(90, (0.3, 0.6)), (50, (0.5, 0.2)), (20, (0.2, 0.3))])
+    def test_a_rectangle_sends_what_lambert_says(
+        self, azimuth: float, elevation: float, extents: tuple[float, float]
+    ) -> None:
+        direction = unit_vector(azimuth, elevation)
+        sides = 0.5 * np.array(extents)[:, None] * rectangle_axes(direction)
+        corners = np.array([direction + a * sides[0] + b * sides[1] for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+        assert rectangle_irradiance(direction, extents) == pytest.approx(room.lambert_irradiance(corners), rel=1e-4)
+
+
+class TestLines:
+    @pytest.mark.parametrize("rest", ["image", "constant"])
+    def test_they_are_those_of_a_scene(
+        self, tmp_path: Path, write_scene: WriteScene, scene_data: Any, rest: Any
+    ) -> None:
+        """Read by the scene file's own reader, they send the panorama's light onto a table."""
+        sky = painted((10, 60, 6, (20.0, 15.0, 10.0)), (100, 20, 9, (4.0, 5.0, 6.0)), rest=(0.2, 0.2, 0.25), turn=40)
+        around = (0.2, -0.1, 0.3)
+        found = estimated(sky, rest=rest, rotate_z=40.0, distance=2.0, around=around)
+        write_light(found, tmp_path / "cell, one.yaml")
+        lines = YAML(typ="safe").load(tmp_path / "cell, one.yaml")
+        scene = load_scene(write_scene(scene_data | lines))
+        *areas, environment = scene.spec.lights
+        assert len(areas) == 2
+        sent = np.zeros(3)
+        for area, expected in zip(areas, ((10, 60), (100, 20)), strict=True):
+            away = np.subtract(area.position, around)
+            assert area.target == around and np.linalg.norm(away) == pytest.approx(2.0, rel=1e-3)
+            direction = away / np.linalg.norm(away)
+            assert between(direction, unit_vector(*expected)) < 0.2
+            extents = (area.size[0] / 2.0, area.size[1] / 2.0)
+            sent += area.radiance * np.array(area.colour) * rectangle_irradiance(direction, extents)
+        if rest == "constant":
+            assert environment.image is None
+            sent += np.pi * environment.radiance * np.array(environment.colour)
+        else:
+            assert environment.rotate_z == 40.0
+            sent += level_irradiance(panorama.read_radiance(scene.images[environment.image]))
+        np.testing.assert_allclose(sent, level_irradiance(sky), rtol=1e-3)
+
+    def test_irradiance_may_be_stated(self) -> None:
+        sky = painted((10, 60, 6, 20.0))
+        found = estimated(sky, irradiance=2.0)
+        assert found.irradiance @ LUMINANCE == pytest.approx(2.0, rel=1e-4)
+        assert found.share(found.ambient) == pytest.approx(estimated(sky).share(estimated(sky).ambient), rel=1e-4)
+
+
+class TestBrackets:
+    curve = staticmethod(lambda linear: encode_srgb(linear) ** 2 * (3 - 2 * encode_srgb(linear)))
+
+    def shot(self, radiance: Float64Array, times: list[float]) -> list[Any]:
+        random = np.random.default_rng(1)
+        return [
+            np.rint(255 * self.curve(np.clip(radiance * t + random.normal(0, 2e-3, radiance.shape), 0, 1))).astype(
+                np.uint8
+            )
+            for t in times
+        ]
+
+    def test_three_recover_the_curve(self) -> None:
+        radiance = np.geomspace(0.02, 25, 120 * 120).reshape(120, 120, 1) * np.array([1.0, 0.9, 0.7])
+        times = [2.0, 0.25, 0.03]
+        shown, clipped = merge_exposures(self.shot(radiance, times), times)
+        ratio = shown / radiance
+        ratio /= np.median(ratio)
+        lit = radiance > 0.05
+        assert np.percentile(ratio[lit], [2, 98]) == pytest.approx([1, 1], abs=0.12)
+        assert np.abs(np.median(ratio, axis=(0, 1)) - 1).max() < 0.03  # no tint
+        assert not clipped.any()
+        # What only the shortest exposure does not clip is as bright as it is.
+        assert ratio[radiance > 10].mean() == pytest.approx(1, abs=0.06)
+
+    def test_white_in_the_shortest_is_a_lower_bound(self) -> None:
+        levels = np.full((8, 8, 3), 255, np.uint8)
+        shown, clipped = merge_exposures([levels, levels], [0.5, 0.02])
+        assert clipped.all() and shown == pytest.approx(1 / 0.02)
+        (single, _) = merge_exposures([np.full((8, 8, 3), 100, np.uint8)], [1.0])
+        assert single == pytest.approx(float(decode_srgb(100 / 255)), rel=1e-6)
+
+    def test_exif(self, tmp_path: Path) -> None:
+        image = Image.new("RGB", (300, 200))
+        exif = image.getexif()
+        exif.get_ifd(0x8769).update({0x829A: 0.02, 0x829D: 4.0, 0x8827: 400, 0xA405: 50})
+        exif[0x0112] = 6  # stored on its side
+        image.save(tmp_path / "a.jpg", exif=exif)
+        found = read_photograph(tmp_path / "a.jpg")
+        assert found.pixels.shape == (300, 200, 3)
+        assert found.exposure == pytest.approx(0.02 * 4 / 16)
+        assert found.focal == pytest.approx(50 / 43.2666 * np.hypot(300, 200), rel=1e-4)
+
+
+def seen_ball(width: int) -> tuple[float, float, float]:
+    """The room's ball in a square picture of :data:`ASIDE`."""
+    eye = room.CENTRE + room.AWAY * unit_vector(room.AZIMUTH, room.ELEVATION)
+    camera = Camera.look_at(eye, room.CENTRE + ASIDE, width=width, height=width, fov_x=room.FOV)
+    x, y = camera.project(room.CENTRE)[0][0].tolist()
+    return x, y, camera.fx * float(np.tan(np.arcsin(room.RADIUS / room.AWAY)))
+
+
+@pytest.fixture(scope="module")
+def mirrored() -> tuple[Float32Array, Float32Array]:
+    """A smooth sky, and what a camera sees of it in a ball that is beside its axis."""
+    sight = directions(128, 256)
+    sky = np.stack([1 + np.sin(3 * sight[..., i] + 2 * sight[..., (i + 1) % 3]) for i in range(3)], axis=-1)
+    emitter = {"type": "envmap", "bitmap": mi.Bitmap(sky.astype(np.float32)), "to_world": y_up_to_z_up(0)}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "thing": room.ball(type="conductor", material="none"),
+        "sky": emitter,
+    }
+    return sky.astype(np.float32), room.render(scene, (240, 240), 16, aside=ASIDE)
+
+
+class TestBall:
+    """Below a sky that is far away, as the geometry has it."""
+
+    def test_it_is_unwrapped(self, mirrored: Any) -> None:
+        sky, image = mirrored
+        ball = seen_ball(240)
+        focal = 120 / np.tan(np.radians(room.FOV) / 2)
+        nothing = np.zeros(image.shape[:2], bool)
+        true = (
+            np.asarray(
+                Image.fromarray(np.rint(60 * sky).astype(np.uint8)).resize((1024, 512), Image.Resampling.BILINEAR)
+            )
+            / 60
+        )
+
+        def error(focal: float | None, turn: float) -> float:
+            found = unwrap_ball(image, ball, focal, room.AZIMUTH + turn, room.ELEVATION, nothing)
+            seen = directions(512, 1024) @ unit_vector(room.AZIMUTH + 180, -room.ELEVATION) < np.cos(
+                np.radians(found.blind + 2)
+            )
+            return float(np.abs(found.radiance - true)[seen].mean())
+
+        assert error(focal, 0) < 0.015
+        assert error(None, 0) > 3 * error(focal, 0)  # parallel rays are a coarser model
+        assert error(focal, 3) > 2 * error(focal, 0)  # so that three degrees would be found out
+
+    def test_the_blind_spot(self, mirrored: Any) -> None:
+        """sin(a) = radius / distance, and the rim of 1.5 px: of 80 px, 11 degrees of parallel rays."""
+        image = np.zeros((200, 200, 3), np.float32)
+        nothing = np.zeros((200, 200), bool)
+        found = unwrap_ball(image, (100.0, 100.0, 80.0), None, 0.0, 0.0, nothing)
+        rim = np.degrees(np.pi - 2 * np.arcsin(1 - 1.5 / 80))
+        assert found.blind == pytest.approx(rim, abs=0.2)
+
+    def test_it_is_found(self, mirrored: Any) -> None:
+        _, image = mirrored
+        clutter = np.random.default_rng(2).uniform(0, 255, (16, 16, 3)).astype(np.uint8)
+        behind = np.asarray(Image.fromarray(clutter).resize((240, 240), Image.Resampling.NEAREST))
+        x, y, radius = seen_ball(240)
+        columns, rows = np.meshgrid(np.arange(240) + 0.5, np.arange(240) + 0.5)
+        disc = np.clip(0.5 + radius - np.hypot(columns - x, rows - y), 0, 1)[..., None]
+        shown = np.rint(255 * encode_srgb(image / 2).clip(0, 1)).astype(np.uint8)
+        picture = np.rint(disc * shown + (1 - disc) * behind).astype(np.uint8)
+        found = find_ball(picture)
+        assert found == pytest.approx((x, y, radius), abs=0.02 * radius)  # 2 degrees of what is mirrored half-way out
+        assert find_ball(picture // 64, picture, np.full_like(picture, 255)) == found  # other exposures show it less
+        assert find_ball(behind) is None
+        assert find_ball(np.full((240, 240, 3), 90, np.uint8)) is None
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    image = room.render(room.room(room.ball(type="conductor", material="none")), room.SIZE, 48)
+    return room.photographs(tmp_path_factory.mktemp("shots"), image, [0.01, 0.05, 0.25, 1.2])
+
+
+@pytest.fixture(scope="module")
+def direct() -> list[Float64Array]:
+    """Irradiance of a table in the ball's place by each lamp, in closed form."""
+    return [room.lambert_irradiance(lamp.corners) * np.array(lamp.radiance) for lamp in room.LAMPS]
+
+
+@pytest.fixture(scope="module")
+def whole() -> Float64Array:
+    """The same by everything."""
+    return level_irradiance(room.true_panorama(128, 48))
+
+
+@pytest.fixture(scope="module")
+def found(shots: list[Path]) -> LightEstimate:
+    reading = read_ball(shots, BallView(room.AZIMUTH, room.ELEVATION))
+    assert reading.warnings == []
+    assert reading.ball == pytest.approx(seen_ball_in_the_middle(), abs=1.0)
+    return estimate_light(reading.panorama.radiance, LightSettings(irradiance=np.pi))
+
+
+class TestRoom:
+    """A path-traced room, photographed in exposures of 8 bits with noise and a tone curve."""
+
+    def test_where_the_lamps_are(self, found: LightEstimate) -> None:
+        """That light is mirrored 3 cm from the ball's middle is a degree of a lamp in 1.9 m."""
+        assert len(found.lamps) == len(room.LAMPS)
+        for lamp, true in zip(found.lamps, room.LAMPS, strict=True):
+            assert between(lamp.direction, true.direction) < 3.0
+
+    def test_how_large_and_of_which_colour(self, found: LightEstimate) -> None:
+        for lamp, true in zip(found.lamps, room.LAMPS, strict=True):
+            flat = true.corners / (true.corners @ true.direction)[:, None]
+            area = 0.5 * np.linalg.norm(np.cross(flat[2] - flat[0], flat[3] - flat[1]))
+            assert lamp.extents[0] * lamp.extents[1] == pytest.approx(area, rel=0.15)
+            np.testing.assert_allclose(lamp.colour, np.array(true.radiance) / (true.radiance @ LUMINANCE), atol=0.06)
+
+    def test_shares(self, found: LightEstimate, direct: list[Float64Array], whole: Float64Array) -> None:
+        ambient = 1 - float(sum(direct) @ LUMINANCE / (whole @ LUMINANCE))
+        assert 0.25 < ambient < 0.4
+        assert found.share(found.ambient) == pytest.approx(ambient, rel=0.1)
+        for lamp, true in zip(found.lamps, direct, strict=True):
+            assert found.share(lamp.irradiance) == pytest.approx(float(true @ LUMINANCE / (whole @ LUMINANCE)), rel=0.1)
+        np.testing.assert_allclose(found.irradiance / np.pi, whole / (whole @ LUMINANCE), rtol=0.05)
+
+    def test_a_thing_under_it_looks_as_in_the_room(
+        self, found: LightEstimate, whole: Float64Array, tmp_path: Path
+    ) -> None:
+        """A matt ball, lit by the room and by the lines; and by lines that are turned, which show."""
+        matt = room.ball(type="diffuse", reflectance={"type": "rgb", "value": 0.5})
+
+        def shaded(scene: dict[str, Any]) -> Float32Array:
+            """The middle of the ball, whose radius is 17 px, in 6 x 6 patches."""
+            return room.render(scene, (60, 60), 64)[18:42, 18:42].reshape(6, 4, 6, 4, 3).mean(axis=(1, 3))
+
+        true = shaded(room.room(matt)) * (np.pi / (whole @ LUMINANCE))
+
+        def error(turn: float) -> float:
+            write_light(found, tmp_path / "cell.yaml")
+            lights = load_lights(tmp_path / "cell.yaml")
+            scene = {"type": "scene", "integrator": {"type": "direct"}, "thing": matt}
+            for number, light in enumerate(lights):
+                scene[f"light_{number}"] = emitter_dict(turned(light, turn, room.CENTRE), tmp_path)
+            return float(np.abs(shaded(scene) - true).mean() / true.mean())
+
+        assert error(0) < 0.05
+        assert error(15) > 2 * error(0)
+
+    def test_one_photograph_is_said_to_be_a_bound(self, shots: list[Path]) -> None:
+        reading = read_ball(shots[2:3], BallView(room.AZIMUTH, room.ELEVATION))
+        assert reading.warnings[0].startswith("1 exposure: radiance is by the curve of sRGB")
+        assert "is white (from 250 of 255) in the shortest exposure" in reading.warnings[1]
+        single = estimate_light(reading.panorama.radiance, LightSettings())
+        assert between(single.lamps[0].direction, room.LAMPS[0].direction) < 15
+
+    def test_what_the_ball_swallows(self, shots: list[Path]) -> None:
+        ball = BallView(room.AZIMUTH, room.ELEVATION, ball=seen_ball_in_the_middle())
+        whole = read_ball(shots, ball).panorama.radiance
+        tinted = read_ball(shots, replace(ball, reflectivity=(1.0, 0.8, 0.25))).panorama.radiance
+        np.testing.assert_allclose(tinted * np.float32([1, 0.8, 0.25]), whole, rtol=1e-5)
+
+    def test_the_command(self, shots: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        camera = ("--camera", room.AZIMUTH, room.ELEVATION)
+        assert run("lights", *shots, *camera, "-o", tmp_path / "cell.yaml") == 0
+        out = capsys.readouterr().out
+        assert out.startswith("ball: 135 90 ") and "warning" not in out
+        assert len([line for line in out.splitlines() if line.endswith("%") and "°" in line]) == 2
+        written = ["cell.png", "cell.yaml", "cell_panorama.exr", "cell_rest.exr"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == written
+        with Image.open(tmp_path / "cell.png") as picture:
+            assert picture.size == (512 * 270 // 180 + 1024, 512)
+        lines = (tmp_path / "cell.yaml").read_text()
+        assert lines.startswith("# Captured light: 3.142 W/m^2 on a horizontal plane")
+
+
+def seen_ball_in_the_middle() -> tuple[float, float, float]:
+    width, height = room.SIZE
+    focal = 0.5 * width / np.tan(np.radians(room.FOV) / 2)
+    return 0.5 * width, 0.5 * height, focal * np.tan(np.arcsin(room.RADIUS / room.AWAY))
+
+
+def load_lights(path: Path) -> list[LightSpec]:
+    adapter = TypeAdapter(list[LightSpec])
+    return adapter.validate_python(YAML(typ="safe").load(path)["lights"], strict=False)
+
+
+def turned(light: LightSpec, degrees: float, around: Float64Array) -> LightSpec:
+    """The light, around a place instead of the origin, turned about the vertical."""
+    if isinstance(light, EnvironmentLight):
+        return light.model_copy(update={"rotate_z": light.rotate_z + degrees})
+    assert isinstance(light, AreaLight)
+    position = Rotation.from_euler("z", degrees, degrees=True).apply(light.position) + around
+    return light.model_copy(update={"position": tuple(position), "target": tuple(around)})
+
+
+class TestInput:
+    """What is wrong is told in a sentence."""
+
+    CAMERA = ("--camera", 0, 10)
+
+    @pytest.fixture
+    def folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        monkeypatch.chdir(tmp_path)
+        grey = np.full((60, 120, 3), 90, np.uint8)
+        Image.fromarray(grey).save("grey.png")
+        Image.fromarray(grey[:, :100]).save("small.png")
+        Path("broken.jpg").write_bytes(b"no image")
+        sky = np.ones((8, 16, 3), np.float32)
+        panorama.write_exr(Path("square.exr"), sky[:, :8])
+        panorama.write_exr(Path("dark.exr"), 0 * sky)
+        sky[3, 5] = np.nan
+        panorama.write_exr(Path("nan.exr"), sky)
+        return tmp_path
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (["grey.png"], "grey.png: without --camera there must be one HDR panorama, .exr, .hdr, .pfm; give"),
+            (["nan.exr", "nan.exr"], "nan.exr: without --camera there must be one HDR panorama"),
+            (["square.exr"], "square.exr: a panorama must be twice as wide as high, all around (got 8 x 8 px)"),
+            (["nan.exr"], "nan.exr: radiance must be finite (got nan at pixel 5, 3, and 1 such pixels)"),
+            (["dark.exr"], "dark.exr: a panorama must have light above the horizon (got none)"),
+            (["no.exr"], "no.exr: cannot be read (No such file or directory)"),
+            (["no.png", *CAMERA], "no.png: no such file"),
+            (["broken.jpg", *CAMERA], "broken.jpg: not a readable photograph"),
+            (["grey.png", *CAMERA], "grey.png: no ball stands out in it: give --ball X Y RADIUS"),
+            (
+                ["grey.png", *CAMERA, "--ball", 20, 30, 25],
+                "grey.png: the ball must be whole in the photograph, 120 x 60 px (got one of radius 25 around 20, 30)",
+            ),
+            (
+                ["grey.png", "small.png", *CAMERA],
+                "small.png: exposures must be of one size, 120 x 60 px as grey.png (got 100 x 60)",
+            ),
+            (
+                ["grey.png", "grey.png", *CAMERA],
+                "grey.png: EXIF must state the exposure time (got none): give --exposures",
+            ),
+            (
+                ["grey.png", "grey.png", *CAMERA, "--exposures", "1,1"],
+                "grey.png: exposures of several photographs must differ (got 1, 1)",
+            ),
+            (["grey.png", *CAMERA, "--exposures", "1,2"], "--exposures must be as many as photographs, 1 (got 2)"),
+            (["grey.png", *CAMERA, "--exposures", "1/0"], "--exposures must be times such as 1/60,1/8,1 (got 1/0)"),
+            (["grey.png", "grey.png", *CAMERA, "--exposures", "1,-2"], "exposures must be finite and > 0 (got 1, -2)"),
+            (["nan.exr", "grey.png", *CAMERA], "grey.png: an HDR photograph must be the only one (got 2)"),
+            (["nan.exr", *CAMERA, "--exposures", "1"], "nan.exr: --exposures is of photographs of 8 bits; an HDR"),
+            (
+                ["grey.png", "--camera", 0, 90],
+                "--camera must be an azimuth and an elevation between -90 and 90 (got 0 90)",
+            ),
+            (["grey.png", *CAMERA, "--fov-x", 180], "--fov-x must be between 0 and 180 degrees (got 180)"),
+            (["grey.png", *CAMERA, "--reflectivity", 0, 1, 1], "--reflectivity must be above 0 and at most 1"),
+            (["grey.png", *CAMERA, "--ball", 5, 5, 0], "--ball must have a radius > 0"),
+            (["grey.png", *CAMERA, "--ball", 60, 30, 9], "grey.png: the ball's radius must be 20 px or more (got 9)"),
+            (
+                ["nan.exr", "--fov-x", 30],
+                "--ball, --fov-x, --exposures and --reflectivity are of photographs of a mirror",
+            ),
+            (
+                ["grey.png", *CAMERA, "--rotate-z", 5],
+                "--rotate-z is of panoramas: the ball's is turned by --camera (got 5)",
+            ),
+            (["nan.exr", "--distance", 0], "--distance must be finite and > 0 (got 0)"),
+            (["nan.exr", "--irradiance", -1], "--irradiance must be finite and > 0 (got -1)"),
+            (["nan.exr", "--lamps", -1], "--lamps must be >= 0 (got -1)"),
+            (["nan.exr", "--rotate-z", "nan"], "--around and --rotate-z must be finite"),
+        ],
+    )
+    def test_one_sentence(
+        self,
+        folder: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+        words: Any,
+        sentence: str,
+    ) -> None:
+        # Its process, which takes seconds, is tested with scenes; here all files but the missing one can be read.
+        if words[0] != "no.exr":
+            monkeypatch.setattr(panorama, "check_images", lambda paths: [None] * len(paths))
+        assert run("lights", *words, "-o", "out.yaml") == 2
+        assert capsys.readouterr().err.startswith(f"mitsplat: {sentence}")
+        assert not list(folder.glob("out*"))
+
+    def test_lines_are_yaml(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert run("lights", "dark.exr", "-o", "out.txt") == 2
+        assert capsys.readouterr().err == "mitsplat: --out must end in .yaml or .yml (got out.txt)\n"

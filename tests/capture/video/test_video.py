@@ -1,0 +1,321 @@
+"""Frames of videos that are drawn, so that it is known how far each picture has moved, and which are blurred."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsplat.capture.video import ChosenFrames, choose_frames
+from mitsplat.capture.video.frame_selection import STEP, FrameMeasure, choose
+from mitsplat.capture.video.motion import MotionClock, Moved
+from mitsplat.errors import InputError
+
+SIZE = (320, 240)
+RATE = 30.0
+
+
+def plane(seed: int = 0, size: tuple[int, int] = (360, 2400)) -> np.ndarray:
+    """A texture of several scales, which fades from strong on the left to weak on the right."""
+    rng, whole = np.random.default_rng(seed), np.zeros(size)
+    for scale in (2, 5, 12, 30):
+        noise = rng.normal(size=(size[0] // scale + 1, size[1] // scale + 1))
+        whole += cv2.resize(noise, size[::-1], interpolation=cv2.INTER_CUBIC)
+    fade = np.linspace(1, 0.25, size[1])
+    return np.clip(128 + 45 * whole * fade, 0, 255).astype(np.uint8)
+
+
+def seen(texture: np.ndarray, x: float, y: float = 40.0) -> np.ndarray:
+    """What a camera shows whose left upper corner lies at x, y [px] of a texture, BGR."""
+    move = np.float32([[1, 0, -x], [0, 1, -y]])
+    return cv2.cvtColor(cv2.warpAffine(texture, move, SIZE), cv2.COLOR_GRAY2BGR)
+
+
+def smeared(picture: np.ndarray, length: int = 13) -> np.ndarray:
+    return cv2.filter2D(picture, -1, np.full((1, length), 1 / length))
+
+
+def write(file: Path, pictures: Sequence[np.ndarray], code: str = "mp4v") -> Path:
+    height, width = pictures[0].shape[:2]
+    writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), RATE, (width, height))
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return file
+
+
+def places() -> np.ndarray:
+    """Where a camera is that starts slowly, stands still for a second, and goes on three times as fast [px]."""
+    slow, fast = np.arange(120) * 2.0, np.arange(1, 91) * 6.0
+    return np.concatenate([slow, np.full(30, slow[-1]), slow[-1] + fast])
+
+
+BLURRED = {number for start in (20, 62, 101) for number in range(start, start + 5)} | {
+    160,
+    171,
+    200,
+}  # 2 of them are all of a step
+
+
+@pytest.fixture(scope="module")
+def pan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    texture, folder = plane(), tmp_path_factory.mktemp("pan")
+    pictures = [
+        smeared(seen(texture, x)) if number in BLURRED else seen(texture, x) for number, x in enumerate(places())
+    ]
+    return write(folder / "pan.mp4", pictures)
+
+
+@pytest.fixture(scope="module")
+def few(pan: Path, tmp_path_factory: pytest.TempPathFactory) -> ChosenFrames:
+    """Eight frames of it, at most."""
+    return choose_frames(pan, tmp_path_factory.mktemp("few") / "frames", most=8, least=3)
+
+
+def numbers(chosen: ChosenFrames) -> list[int]:
+    """Of the frames in the video, by their names."""
+    times = [int(n[:2]) * 60 + int(n[3:5]) + int(n[6:9]) / 1000 for n in chosen.names]
+    return [round(time * RATE) for time in times]
+
+
+def test_frames_are_sharp_and_lie_evenly_in_displacement(pan: Path, tmp_path: Path) -> None:
+    chosen = choose_frames(pan, tmp_path / "frames", most=150, least=3)
+    x = places()
+    length = (x[-1] - x[0]) / SIZE[0]
+    assert chosen.moved == pytest.approx(length, rel=0.02)
+    assert (chosen.read, chosen.seconds, chosen.cuts) == (len(x), pytest.approx((len(x) - 1) / RATE), ())
+    taken = numbers(chosen)
+    assert len(taken) == 1 + int(chosen.moved / STEP)
+    assert not BLURRED & set(taken)
+    steps = np.diff(x[taken]) / SIZE[0]
+    # A frame is in the middle half of its step; the fast part has two or three frames in a step.
+    assert steps.min() > 0.4 * STEP and steps.max() < 1.6 * STEP
+    assert steps.mean() == pytest.approx(STEP, rel=0.05)
+    assert sum(120 <= number < 149 for number in taken) <= 1  # while it stands still
+    texture = plane()
+    for name, number in zip(chosen.names, taken, strict=True):
+        with Image.open(chosen.folder / name) as picture:
+            error = np.asarray(picture.convert("L")).astype(float) - seen(texture, x[number])[..., 0]
+        assert np.sqrt(np.mean(error**2)) < 12  # of the video's own compression; the next frame's is 20 and more
+
+
+def test_no_more_frames_than_asked_for_and_then_farther_apart(few: ChosenFrames) -> None:
+    assert 7 <= len(few.names) <= 8
+    steps = np.diff(places()[numbers(few)])
+    assert steps.max() < 3.5 * steps.min()
+    assert not BLURRED & set(numbers(few))
+
+
+def test_the_same_video_gives_the_same_frames_and_they_are_kept(pan: Path, few: ChosenFrames, tmp_path: Path) -> None:
+    one = choose_frames(pan, tmp_path / "one", most=8, least=3)
+    data = {name: (one.folder / name).read_bytes() for name in one.names}
+    assert data == {name: (few.folder / name).read_bytes() for name in few.names}
+    before = {path: path.stat().st_mtime_ns for path in one.folder.iterdir()}
+    assert choose_frames(pan, tmp_path / "one", most=8, least=3) == one
+    assert before == {path: path.stat().st_mtime_ns for path in one.folder.iterdir()}
+    (one.folder / one.names[3]).unlink()  # as if it had been interrupted
+    assert choose_frames(pan, tmp_path / "one", most=8, least=3) == one
+    assert (one.folder / one.names[3]).read_bytes() == data[one.names[3]]
+    other = choose_frames(pan, tmp_path / "one", most=6, least=3)
+    assert {path.name for path in one.folder.glob("*.jpg")} == set(other.names) != set(one.names)
+
+
+def test_cuts_are_noticed_and_each_shot_has_its_frames(tmp_path: Path) -> None:
+    first, second = plane(1), plane(2)
+    pictures = [seen(first, 2.0 * k) for k in range(60)] + [seen(second, 600 - 2.0 * k) for k in range(60)]
+    chosen = choose_frames(write(tmp_path / "cut.avi", pictures, "MJPG"), tmp_path / "frames", most=150, least=3)
+    (cut,) = chosen.cuts
+    assert 60 <= round(cut * RATE) <= 66
+    assert chosen.warnings[0].startswith(f"{tmp_path / 'cut.avi'}: jumps at {cut:.1f} s, by a cut or a movement")
+    taken = numbers(chosen)
+    shots = [number for number in taken if number < 60], [number for number in taken if number >= 60]
+    assert len(shots[0]) >= 7 and len(shots[1]) >= 6
+
+
+def test_a_moment_of_blur_is_no_cut(tmp_path: Path) -> None:
+    texture = plane(3)
+    pictures = [
+        cv2.GaussianBlur(seen(texture, 2.0 * k), (0, 0), 25) if 50 <= k < 54 else seen(texture, 2.0 * k)
+        for k in range(120)
+    ]
+    chosen = choose_frames(write(tmp_path / "blur.avi", pictures, "MJPG"), tmp_path / "frames", most=150, least=3)
+    assert chosen.cuts == ()
+    assert chosen.moved == pytest.approx(238 / 320, rel=0.02)
+    assert not set(range(50, 54)) & set(numbers(chosen))
+
+
+def test_noise_and_a_trembling_hand_add_up_to_nothing() -> None:
+    texture, rng, clock = plane(4), np.random.default_rng(0), MotionClock()
+    for _ in range(150):
+        x, y = rng.normal(0, 0.6, 2)
+        noisy = seen(texture, 300 + x, 40 + y)[..., 0] + rng.normal(0, 4, SIZE[::-1])
+        moved = clock.add(np.clip(noisy, 0, 255).astype(np.uint8))
+    assert moved.followed and moved.segment == 0
+    assert moved.path < 0.01
+
+
+def test_nothing_to_follow_is_not_taken(tmp_path: Path) -> None:
+    """A video that fades in from black: what shows nothing is neither a shot nor a frame to take."""
+    texture = plane(5)
+    pictures = [np.zeros((SIZE[1], SIZE[0], 3), np.uint8)] * 20 + [seen(texture, 2.0 * k) for k in range(60)]
+    chosen = choose_frames(write(tmp_path / "fade.mp4", pictures), tmp_path / "frames", most=150, least=3)
+    assert chosen.cuts == ()
+    assert min(numbers(chosen)) >= 20
+
+
+def test_blur_decides_and_not_texture() -> None:
+    """A step of which every other frame is blurred, while texture grows tenfold from its begin to its end."""
+    measures = [
+        FrameMeasure(k, k / 30, Moved(0, 0.005 * k, followed=True), (0.2 if k % 2 else 1.0) * 10 ** (k / 100))
+        for k in range(101)
+    ]
+    frames = choose(measures, 150).frames
+    assert len(frames) == 11
+    assert all(frame.index % 2 == 0 for frame in frames)
+    steps = np.diff([frame.moved.path for frame in frames])
+    assert steps.min() > 0.5 * STEP and steps.max() < 1.5 * STEP
+
+
+def test_a_step_that_is_sharp_at_its_border_alone_is_taken_there() -> None:
+    measures = [
+        FrameMeasure(k, k / 30, Moved(0, 0.005 * k, followed=True), 1.0 if k % 10 == 1 else 0.1) for k in range(31)
+    ]
+    assert [frame.index for frame in choose(measures, 150).frames][:3] == [1, 11, 21]
+
+
+def turned_by(file: Path, degrees: int) -> Path:
+    """A copy of an MP4 with the matrix that phones write for a camera held on its side (ISO 14496-12, tkhd)."""
+    data = bytearray(file.read_bytes())
+    start = data.index(b"tkhd") + 4
+    assert data[start] == 0  # version 0: the matrix is 40 bytes behind version and flags
+    a, b, c, d = {90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}[degrees]
+    one = 1 << 16
+    struct.pack_into(">9i", data, start + 40, a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
+    turned = file.with_name(f"turned{degrees}.mp4")
+    turned.write_bytes(data)
+    return turned
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_videos_of_a_phone_on_its_side_are_turned(pan: Path, few: ChosenFrames, tmp_path: Path, degrees: int) -> None:
+    turned = choose_frames(turned_by(pan, degrees), tmp_path / "turned", most=8, least=3)
+    with Image.open(turned.folder / turned.names[0]) as picture:
+        shown = np.asarray(picture).astype(float)
+    frame = [seen(plane(), x) for x in places()][numbers(turned)[0]]
+    assert numbers(turned)[0] not in BLURRED
+    expected = np.rot90(frame, -degrees // 90)
+    assert shown.shape == expected.shape
+    assert np.sqrt(np.mean((shown - expected) ** 2)) < 12
+    assert turned.moved == pytest.approx(few.moved * (SIZE[0] / SIZE[1] if degrees != 180 else 1), rel=0.02)
+
+
+def still(file: Path) -> Path:
+    return write(file, [seen(plane(), 100.0)] * 60)
+
+
+def short(file: Path) -> Path:
+    return write(file, [seen(plane(), 0.4 * k) for k in range(60)])
+
+
+def plain(file: Path) -> Path:
+    return write(file, [np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)] * 30)
+
+
+def text(file: Path) -> Path:
+    file.write_text("no video")
+    return file
+
+
+def headless(file: Path) -> Path:
+    """MP4 keeps its table of frames at its end."""
+    data = write(file, [seen(plane(), 2.0 * k) for k in range(60)]).read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    return file
+
+
+def torn(file: Path) -> Path:
+    data = write(file.with_suffix(".avi"), [seen(plane(), 2.0 * k) for k in range(60)], "MJPG").read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    return file
+
+
+def jumpy(file: Path) -> Path:
+    return write(file, [seen(plane(10 + k // 8), 0) for k in range(80)])
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (
+            text,
+            r"must be a whole video that FFmpeg reads, such as .mp4, .mov or .avi \(got a file of 8 bytes that",
+        ),
+        (headless, r"must be a whole video that FFmpeg reads, .* that it cannot open\)"),
+        (
+            torn,
+            r"must hold the 60 frames that it is said to \(got \d\d, \d\.\d of 2\.0 s\): it is cut short or damaged",
+        ),
+        (still, r"its picture must move by 15% of its width or more \(got 0\.\d% in 2\.0 s\): walk around"),
+        (plain, r"its picture must move by 15% of its width or more \(got 0\.0% in 1\.0 s\).*must have texture"),
+        (short, r"must show at least 3 views that differ by 5% of the picture's width \(got 2 in 2\.0 s\)"),
+        (jumpy, r"must not jump more often than frames are taken of it \(got 9 cuts, .* for 6 frames\)"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_what_is_no_use_is_refused_in_a_sentence(make, sentence: str, tmp_path: Path) -> None:
+    file = make(tmp_path / "clip.mp4")
+    with pytest.raises(InputError, match=rf"clip\.mp4: {sentence}") as refused:
+        choose_frames(file, tmp_path / "frames", most=6, least=3)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_number_of_frames_that_is_no_use() -> None:
+    with pytest.raises(InputError, match=r"at least 3 frames must be taken of a video \(got 2\)"):
+        choose_frames(Path("clip.mp4"), Path("frames"), most=2, least=3)
+
+
+def test_a_decoder_that_ends_its_process_is_told_of(pan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in = tmp_path / "python"
+    stand_in.write_text("#!/bin/sh\nkill -SEGV $$\n")
+    stand_in.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(stand_in))
+    with pytest.raises(InputError, match=r"pan\.mp4: must be a video that FFmpeg can decode \(got signal 11"):
+        choose_frames(pan, tmp_path / "frames", most=6, least=3)
+
+
+def test_lists_of_other_files_are_no_videos(pan: Path, tmp_path: Path) -> None:
+    for name, lines in {
+        "list.m3u8": ["#EXTM3U", "#EXTINF:8,", "http://127.0.0.1:9/clip.ts", "#EXT-X-ENDLIST"],
+        "list.ffconcat": ["ffconcat version 1.0", f"file '{pan}'"],
+    }.items():
+        (tmp_path / name).write_text("\n".join(lines) + "\n")
+        with pytest.raises(InputError, match=f"{name}: must "):
+            choose_frames(tmp_path / name, tmp_path / "frames", most=6, least=3)
+
+
+def test_the_worker_says_one_object_a_line_and_nothing_else(pan: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "mitsplat.capture.video.video_worker",
+        str(pan),
+        str(tmp_path / "frames"),
+        "6",
+        "3",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
+    said = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.stderr == ""
+    assert {key for message in said for key in message} == {"progress", "found"}
+    steps = [message["progress"] for message in said[:-1]]
+    assert steps[0] == [1, len(places()), "watching the video"]
+    assert steps[len(places()) - 1][:2] == [len(places())] * 2

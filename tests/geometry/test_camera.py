@@ -1,0 +1,114 @@
+"""Cameras against OpenCV's own functions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.formats.colmap import camera_model
+from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.renderer.layers import describe_sensor, ensure_variant
+
+PINHOLE = Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), width=640, height=480, fov_x=60)
+BENT = (0.02, -0.01, 0.004, -0.001)
+FISHEYE = replace(PINHOLE, fx=300.0, fy=290.0, cx=330.0, cy=235.0, distortion=BENT, lens="fisheye")
+
+
+def test_fisheye_is_that_of_opencv() -> None:
+    angle, turn = np.meshgrid(np.linspace(0, 1.3, 14), np.linspace(0, 2 * np.pi, 9))
+    slope = np.tan(angle.ravel())
+    points = np.stack([slope * np.cos(turn.ravel()), slope * np.sin(turn.ravel()), np.ones_like(slope)], axis=1)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), FISHEYE.intrinsics, np.array(FISHEYE.distortion)
+    )
+    pixels, depth = FISHEYE.project(points)
+    np.testing.assert_allclose(pixels, expected.reshape(-1, 2), atol=1e-9)
+    np.testing.assert_allclose(depth, 1.0)
+
+
+@pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), BENT])
+def test_rays_of_a_fisheye_come_back_to_their_pixels(distortion: tuple[float, ...]) -> None:
+    camera = replace(FISHEYE, distortion=distortion)
+    x, y = np.meshgrid(np.linspace(0, 640, 9), np.linspace(0, 480, 7))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    slopes = camera.ray_slopes(pixels)
+    back, _ = camera.project(np.column_stack([slopes, np.ones(len(slopes))]))
+    np.testing.assert_allclose(back, pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"distortion": (0.1, 0.0)}, "takes 4 coefficients"),
+        ({"fx": 200.0}, "at most 85 degrees"),
+        ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, "in growing distance"),
+    ],
+)
+def test_fisheye_that_cannot_be_is_refused(changes: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        replace(FISHEYE, **changes)
+
+
+@pytest.mark.parametrize("width", [0, 10.5, 200_000])
+def test_size_that_cannot_be_is_refused(width: float) -> None:
+    with pytest.raises(ValueError, match=rf"whole numbers of 1 to 16384 px \(got {width}x480\)"):
+        Camera(width, 480, 100.0, 100.0, 5.0, 240.0, np.eye(4))  # type: ignore[arg-type]
+
+
+def test_places_must_be_finite() -> None:
+    with pytest.raises(ValueError, match=r"must have finite places \(got \[0.0, 0.0, nan\]"):
+        look_at_pose((0, 0, np.nan), (0, 0, 0))
+
+
+def test_sensor_plugin_sends_the_same_rays() -> None:
+    ensure_variant()
+    from mitsplat.plugins.splat_proxy import view_of
+
+    x, y = np.meshgrid(np.linspace(1, 639, 9), np.linspace(1, 479, 7))
+    u, v = view_of(mi.load_dict(describe_sensor(FISHEYE))).slopes(mi.Float(x.ravel()), mi.Float(y.ravel()))
+    expected = FISHEYE.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+    np.testing.assert_allclose(np.stack([u, v], axis=1), expected, rtol=2e-5, atol=1e-5)
+
+
+def test_other_integrators_see_through_the_sensor_what_mitsubas_own_sees() -> None:
+    ensure_variant()
+    camera = Camera.look_at((0.3, -3, 1), (0, 0, 0), width=32, height=24, fov_x=50)
+    ours = describe_sensor(camera)
+    theirs = {"type": "perspective", "fov": 50.0, "to_world": ours["to_world"], "film": ours["film"]}
+    pictures = []
+    for sensor in (ours, theirs):
+        scene = {"type": "scene", "sensor": sensor, "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
+        pictures.append(np.array(mi.render(mi.load_dict({**scene, "integrator": {"type": "depth"}}), spp=64))[..., 0])
+    assert 0.1 < (pictures[0] > 0).mean() < 0.9
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.02
+
+
+@pytest.mark.parametrize("wrong", [{"distortion": "0.1"}, {"lens": "mirror"}, {"lens": "fisheye"}])
+def test_sensor_plugin_refuses_what_is_no_lens(wrong: dict[str, str]) -> None:
+    ensure_variant()
+    with pytest.raises((InputError, RuntimeError), match=r"opencv_camera.*(coefficients|lens)"):
+        mi.load_dict({**describe_sensor(PINHOLE), **wrong})
+
+
+def test_colmap_names_the_fisheye() -> None:
+    assert camera_model(FISHEYE).split() == (
+        ["OPENCV_FISHEYE", "640", "480", "300.0", "290.0", "330.0", "235.0", "0.02", "-0.01", "0.004", "-0.001"]
+    )
+
+
+THIN = replace(PINHOLE, aperture_radius=0.002, focus_distance=0.008, near=0.004)
+"""Focused nearer than the nearest depth that cameras have by default."""
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, THIN, replace(PINHOLE, fy=1 / 3, cx=-7.1, distortion=BENT)])
+def test_json_brings_back_every_field(camera: Camera) -> None:
+    back = Camera.from_json(json.loads(json.dumps(camera.to_json())))
+    for field in fields(Camera):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(camera, field.name))
+        assert type(getattr(back, field.name)) is type(getattr(camera, field.name))

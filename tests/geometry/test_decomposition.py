@@ -1,0 +1,191 @@
+"""Convex pieces: few, convex, and close to the solids that they stand for."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+
+from mitsplat.geometry import decomposition
+from mitsplat.geometry.decomposition import convex_pieces, thin_solid, widest_gap
+from mitsplat.geometry.mesh import simplify_solid
+from mitsplat.geometry.mesh_distance import Surface, standoff
+
+PARTS = Path(__file__).parents[2] / "scenes/assets"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "mitsplat/pieces"
+
+
+@pytest.fixture(scope="module")
+def bracket():
+    """An L of two plates, 40 x 20 x 4 and 4 x 20 x 30 mm."""
+    floor, wall = trimesh.creation.box((0.04, 0.02, 0.004)), trimesh.creation.box((0.004, 0.02, 0.03))
+    wall.apply_translation((-0.018, 0, 0.013))
+    return trimesh.boolean.union([floor, wall])
+
+
+def _inside(hull, point):
+    return bool((np.einsum("ij,ij->i", hull.face_normals, point - hull.triangles[:, 0]) < 0).all())
+
+
+def test_a_convex_solid_is_its_own_piece():
+    box = trimesh.creation.box((0.01, 0.02, 0.03))
+    (piece,) = convex_pieces(box)
+    assert piece.volume == pytest.approx(box.volume, rel=1e-9)
+
+
+def test_pieces_fill_a_concave_solid_and_nothing_else(bracket):
+    pieces = convex_pieces(bracket)
+    assert len(pieces) >= 2
+    assert all(piece.is_convex for piece in pieces)
+    assert sum(piece.volume for piece in pieces) == pytest.approx(bracket.volume, rel=0.03)
+    # The hull is three times the volume: its middle must stay free.
+    middle = np.array([0.0, 0.0, 0.005])
+    assert _inside(bracket.convex_hull, middle)
+    assert not any(_inside(piece, middle) for piece in pieces)
+
+
+def test_separate_parts_are_split_apart():
+    apart = trimesh.util.concatenate([trimesh.creation.box((0.01,) * 3), trimesh.creation.icosphere(2, 0.01)])
+    apart.vertices[:8] += 0.05
+    assert len(convex_pieces(apart)) == 2
+
+
+def test_pieces_are_kept_on_disk_and_damaged_files_made_anew(cache, bracket, caplog):
+    shifted = bracket.copy().apply_translation((0.001, 0, 0))  # not yet in memory
+    first = convex_pieces(shifted)
+    (path,) = cache.iterdir()
+    again = np.load(path)
+    assert len(again.files) == 2 * len(first)
+    np.testing.assert_array_equal(again["vertices_0"], first[0].vertices)
+
+    from mitsplat.geometry.decomposition import _cached_pieces
+
+    _cached_pieces.cache_clear()
+    path.write_bytes(path.read_bytes()[:100])
+    assert [piece.volume for piece in convex_pieces(shifted)] == [piece.volume for piece in first]
+    assert "made anew" in caplog.text
+
+
+def test_scan_that_lacks_a_triangle_is_closed_first():
+    """CoACD would rebuild an open mesh of voxels: slowly, and too thick."""
+    ball = trimesh.creation.icosphere(3, 0.05)
+    torn = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
+    (piece,) = convex_pieces(torn)
+    assert piece.volume == pytest.approx(ball.volume, rel=1e-6)
+
+
+def scanned_angle() -> trimesh.Trimesh:
+    """An L of two plates as a scanner sees it: 7168 triangles, 0.02 mm of noise."""
+    outline = shapely.box(0, 0, 0.06, 0.01).union(shapely.box(0, 0, 0.01, 0.05))
+    solid = trimesh.creation.extrude_polygon(outline, 0.03)
+    for _ in range(4):
+        solid = solid.subdivide()
+    noise = np.random.default_rng(0).normal(size=solid.vertices.shape) * 2e-5
+    return trimesh.Trimesh(solid.vertices + noise, solid.faces, process=False)
+
+
+def test_scan_is_thinned_before_it_is_split_and_its_pieces_follow_it():
+    scan = scanned_angle()
+    assert scan.is_volume
+    assert len(scan.faces) > 5000
+    thin = simplify_solid(scan, 1e-4)
+    assert thin.is_volume
+    assert len(thin.faces) < 0.1 * len(scan.faces)
+    truth = Surface(scan)
+    assert np.abs(truth.signed_distances(np.concatenate([thin.vertices, thin.sample(2000, seed=0)]))).max() < 2e-4
+    pieces = convex_pieces(scan)
+    assert standoff(truth, pieces) < 6.4e-4
+    # Nor does the scan reach out of its pieces by more than objects may sink into a table.
+    outside = [
+        np.einsum("fvd,fd->vf", scan.vertices - piece.triangles[:, :1], piece.face_normals).max(axis=1)
+        for piece in pieces
+    ]
+    assert np.min(outside, axis=0).max() < 3e-4
+
+
+def test_what_is_ragged_is_followed_coarsely(caplog):
+    """In fine pieces it has more than 300, which take minutes."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    factors = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
+    pieces = convex_pieces(trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False))
+    assert 8 < len(pieces) < 64
+    assert "a mesh of 320 faces is ragged" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["hex_bolt", "proximity_sensor", "spur_gear"])
+def test_parts_are_not_ragged(name):
+    assert decomposition._valleys(trimesh.load_mesh(PARTS / name / "mesh.ply")) < 0.15
+
+
+def scanned_can(noise: float = 2e-5) -> trimesh.Trimesh:
+    """A can of 66 x 84 mm, its lid 4 mm deep behind its rim, in more than 3000 triangles."""
+    outline = [(0, 0), (0.033, 0), (0.033, 0.084), (0.029, 0.084), (0.028, 0.08), (0, 0.08)]
+    dense = [
+        (1 - t) * np.array(start) + t * np.array(end)
+        for start, end in pairwise(outline)
+        for t in np.linspace(0, 1, max(1, round(np.hypot(*np.subtract(end, start)) / 4e-3)), endpoint=False)
+    ]
+    can = trimesh.creation.revolve([*dense, outline[-1]], sections=48)
+    return trimesh.Trimesh(
+        can.vertices + noise * np.random.default_rng(0).normal(size=can.vertices.shape), can.faces, process=False
+    )
+
+
+def test_pieces_of_a_scan_are_few_and_stand_off_no_more_than_layouts_bear():
+    can = scanned_can()
+    assert can.is_volume
+    assert len(can.faces) > 3000
+    pieces = convex_pieces(can)
+    assert len(pieces) <= decomposition.MOST_PIECES
+    assert all(piece.is_convex for piece in pieces)
+    assert standoff(Surface(can), pieces) < widest_gap(0)
+    assert standoff(Surface(can), [can.convex_hull]) > 3 * widest_gap(0)
+
+
+def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    rough = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
+    pieces = convex_pieces(trimesh.Trimesh(ball.vertices * rough, ball.faces, process=False), most=5)
+    assert 1 < len(pieces) <= 5
+
+
+@pytest.mark.parametrize("normal", [(1.0, 0, 0), (0.6, 0, 0.8)])
+@pytest.mark.parametrize("offset", [-0.013, 0.0, 0.004])
+def test_what_a_cut_leaves_empty_is_what_manifold_says_of_both_sides(bracket, normal, offset):
+    emptiness = decomposition._emptiness(bracket, bracket.vertices @ normal - offset, offset * np.array(normal))
+    sides = decomposition._manifold(bracket).split_by_plane(normal, offset)
+    hulls = [side.hull().volume() for side in sides]
+    expected = sum(hull * (hull - side.volume()) for hull, side in zip(hulls, sides, strict=True))
+    assert emptiness == pytest.approx(expected, rel=1e-9, abs=1e-18)
+
+
+def test_a_scan_is_thinned_to_5000_faces_unless_that_moves_its_surface():
+    ball = trimesh.creation.icosphere(5, 0.05)
+    assert len(ball.faces) == 20480
+    thin = thin_solid(ball)
+    assert thin.is_volume
+    assert len(thin.faces) <= 5000
+    points = np.concatenate([thin.vertices, thin.sample(2000, seed=0)])
+    # Radius against a sphere's: the chords of both meshes lie within.
+    assert np.abs(np.linalg.norm(points, axis=1) - 0.05).max() < 0.003 * ball.scale
+    rough = ball.vertices * (1 + np.random.default_rng(1).uniform(-0.02, 0.02, (len(ball.vertices), 1)))
+    kept = thin_solid(trimesh.Trimesh(rough, ball.faces, process=False))
+    assert len(kept.faces) > 5000
+    assert np.abs(Surface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
+
+
+def test_a_small_dent_of_a_large_face_is_not_overlooked():
+    plate, drill = trimesh.creation.box((0.16, 0.12, 0.012)), trimesh.creation.cylinder(0.004, 0.008, sections=32)
+    drill.apply_translation((0.031, 0.017, 0.006))
+    dented = trimesh.boolean.difference([plate.subdivide().subdivide().subdivide(), drill]).subdivide().subdivide()
+    assert len(dented.faces) > 3000
+    pieces = convex_pieces(dented)
+    assert len(pieces) > 1
+    assert standoff(Surface(dented), pieces) < widest_gap(0)

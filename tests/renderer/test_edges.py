@@ -1,0 +1,206 @@
+"""Antialiased silhouettes, against pictures of twice the size and brute force."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.quality import PRESETS, Quality
+from mitsplat.renderer.layers import Layers, ensure_variant, make_integrator, make_splats_shape, render_layers
+from tests.renderer.test_render import make_splats
+
+ensure_variant()
+CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=49, height=38, fov_x=40)
+FINE = replace(PRESETS["exact"], samples="edges")
+LENSES = {
+    "pinhole": {},
+    "distorted": {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)},
+    "fisheye": {"distortion": (0.05, -0.02, 0.01, -0.003), "lens": "fisheye"},
+}
+
+
+def scene_of(**meshes: Any) -> Any:
+    """Two objects before a background that does not fill the picture, and what else there is."""
+    pose = np.diag([0.4, 0.4, 0.4, 1.0])
+    shapes: dict[str, Any] = {"background": make_splats_shape(make_splats(60, 1, scales=(0.05, 0.2)))}
+    for number in (1, 2):
+        pose[0, 3] = 0.5 * number - 0.75
+        thing = make_splats(300, number + 1, scales=(0.02, 0.1))
+        shapes[f"thing_{number}"] = make_splats_shape(thing, pose, instance=number)
+    return mi.load_dict({"type": "scene", **shapes, **meshes})
+
+
+def plate(pose: Any) -> dict[str, Any]:
+    return {"type": "rectangle", "to_world": pose, "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}}
+
+
+CUTTING = plate(mi.ScalarTransform4f().translate([0, 0.6, 0]).rotate([1, 0, 0], 20).scale(0.4))
+"""A mesh that cuts through all splats."""
+
+
+def layers_of(scene: Any, camera: Camera, quality: Quality, **properties: Any) -> Layers:
+    properties = {"shadow": "none", **properties}
+    return render_layers(make_integrator(quality=quality, **properties), scene, camera)
+
+
+def changed_by(smooth: Layers, plain: Layers) -> np.ndarray:
+    return np.asarray((smooth.rgb != plain.rgb).any(axis=-1) | (smooth.alpha != plain.alpha))
+
+
+def means_of_four(values: np.ndarray) -> np.ndarray:
+    height, width, *rest = values.shape
+    return np.asarray(values.reshape(height // 2, 2, width // 2, 2, *rest).mean(axis=(1, 3)))
+
+
+@pytest.mark.parametrize(("preset", "lens"), [*(("fast", lens) for lens in LENSES), ("balanced", "pinhole")])
+def test_borders_are_means_of_a_picture_twice_as_large(preset: str, lens: str) -> None:
+    camera, scene = replace(CAMERA, **LENSES[lens]), scene_of(plate=CUTTING)
+    quality = replace(PRESETS[preset], kernel="mip")
+    smooth, plain = (layers_of(scene, camera, replace(quality, samples=samples)) for samples in ("edges", 1))
+    order = quality.tolerance if preset == "fast" else 0.0  # what is looked at again is in the order of each ray
+    large = layers_of(scene, camera.resized(2 * camera.width, 2 * camera.height), replace(quality, tolerance=order))
+    changed = changed_by(smooth, plain)
+    assert 0.05 < changed.mean() < 0.6
+    for name in ("rgb", "alpha", "captured"):
+        twin = means_of_four(getattr(large, name))
+        np.testing.assert_allclose(getattr(smooth, name)[changed], twin[changed], atol=2e-5, err_msg=name)
+    for field in fields(smooth):
+        own, other = getattr(smooth, field.name), getattr(plain, field.name)
+        if field.name in ("rgb", "alpha", "captured"):
+            own, other = own[~changed], other[~changed]
+        assert np.array_equal(own, other), field.name
+
+
+def test_each_point_of_a_lens_sees_smooth_borders() -> None:
+    camera, scene = replace(CAMERA, aperture_radius=0.02, focus_distance=1.5), scene_of()
+    smooth, plain = (layers_of(scene, camera, replace(FINE, samples=samples, lens_rings=1)) for samples in ("edges", 1))
+    size = 2 * camera.width, 2 * camera.height
+    twin = means_of_four(layers_of(scene, camera.resized(*size), replace(FINE, samples=1, lens_rings=1)).rgb)
+    changed = changed_by(smooth, plain)
+    before, after = (np.sqrt(np.mean((layers.rgb - twin)[changed] ** 2)) for layers in (plain, smooth))
+    assert after < 0.5 * before
+
+
+def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -> None:
+    from mitsplat.renderer.layers import make_sensor
+    from mitsplat.renderer.rays.sensors import view_of
+    from mitsplat.renderer.splatting.antialiasing import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
+
+    view = view_of(make_sensor(CAMERA))
+    keys = np.zeros((CAMERA.height, CAMERA.width), np.uint32)
+    assert Edges.find(mi.UInt32(keys.ravel()), view) is None
+    keys[7:20, 10:31], keys[19, 30], keys[37, 48] = 3, 0, 9
+    around = np.pad(keys, 1, mode="edge")
+    height, width = keys.shape
+    beside = [around[dy : dy + height, dx : dx + width] != keys for dy in range(3) for dx in range(3)]
+    rows, columns = np.nonzero(np.any(beside, axis=0))
+    edges = Edges.find(mi.UInt32(keys.ravel()), view)
+    assert edges is not None
+    blocks = np.unique(rows // BLOCK_HEIGHT * edges.fine.tiles_x + columns // BLOCK_WIDTH)
+    assert np.array_equal(np.array(edges.chosen.number), blocks)
+
+
+def test_chosen_tiles_are_counted_as_by_hand() -> None:
+    from mitsplat.renderer.layers import make_sensor
+    from mitsplat.renderer.rays.sensors import view_of
+    from mitsplat.renderer.splatting.tile_subset import ChosenTiles
+
+    view, random = view_of(make_sensor(CAMERA)), np.random.default_rng(1)
+    flags = random.random((view.tiles_y, view.tiles_x)) < 0.1
+    chosen = ChosenTiles.of(mi.Bool(flags.ravel()), view)
+    assert np.array_equal(np.array(chosen.number), np.flatnonzero(flags))
+    (x0, x1), (y0, y1) = (np.sort(random.integers(0, n + 1, (2, 200)), axis=0) for n in (view.tiles_x, view.tiles_y))
+    found = np.array(chosen.any_in(*(mi.UInt32(v.astype(np.uint32)) for v in (x0, x1, y0, y1))))
+    assert np.array_equal(found, [flags[c:d, a:b].any() for a, b, c, d in zip(x0, x1, y0, y1, strict=True)])
+    first, size = chosen.among(mi.UInt32([0, 3, flags.size]), mi.UInt32([flags.size, 40, 0]))
+    flat = flags.ravel()
+    assert np.array(first).tolist() == [0, flat[:3].sum(), flat.sum()]
+    assert np.array(size).tolist() == [flat.sum(), flat[3:43].sum(), 0]
+    halves = chosen.halves(view)
+    assert np.array_equal(np.concatenate([np.array(half.number) for half in halves]), np.flatnonzero(flags))
+
+
+def test_a_box_of_tiles_counts_as_the_same_tiles_chosen_one_by_one() -> None:
+    from mitsplat.renderer.layers import make_sensor
+    from mitsplat.renderer.rays.sensors import view_of
+    from mitsplat.renderer.splatting.tile_subset import ChosenTiles, TileBox
+
+    view = view_of(make_sensor(CAMERA))
+    box = TileBox.around(mi.UInt32([3, 5, 2, 4, 2, 4, 3, 7]), view)
+    flags = np.zeros((view.tiles_y, view.tiles_x), bool)
+    flags[2:7, 2:5] = True
+    chosen = ChosenTiles.of(mi.Bool(flags.ravel()), view)
+    assert (box.count, np.array(box.number).tolist()) == (15, np.array(chosen.number).tolist())
+    begin, size = (mi.UInt32([row * view.tiles_x + 3 for row in range(2, 7)]), mi.UInt32([2, 1, 0, 2, 1]))
+    for own, other in zip(box.among(begin, size), chosen.among(begin, size), strict=True):
+        assert np.array(own).tolist() == np.array(other).tolist()
+
+
+def test_splats_stay_as_wide_as_trainers_dilate_them() -> None:
+    """Their dilation is in pixels of the picture, as in four rays of every pixel."""
+    quality, scene = replace(PRESETS["exact"], kernel="3dgs"), scene_of()
+    smooth, plain, everywhere = (layers_of(scene, CAMERA, replace(quality, samples=s)) for s in ("edges", 1, 2))
+    changed = changed_by(smooth, plain)
+    np.testing.assert_allclose(smooth.alpha[changed], everywhere.alpha[changed], atol=2e-5)
+
+
+def test_both_sides_of_a_border_have_their_own_light() -> None:
+    """An object that is lit ten times as much as the plate behind it, at an edge between pixels' centres."""
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 40)] * 2), axis=-1).reshape(-1, 2)
+    count = len(grid)
+    square = Splats(
+        np.column_stack([grid, np.zeros(count)]).astype(np.float32),
+        np.tile(np.float32([0, 0, 0, 1]), (count, 1)),
+        np.tile(np.float32([0.02, 0.02, 0.001]), (count, 1)),
+        np.full(count, 0.99, np.float32),
+        np.full((count, 1, 3), 0.5, np.float32),
+    )
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
+    turn[2, 3] = -0.7
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "square": make_splats_shape(square, turn, instance=1, capture_light="uniform"),
+            "plate": plate(mi.ScalarTransform4f().translate([0, 0, 0.7]).scale(3)),
+            "lamp": {"type": "point", "position": [0, 0, -1.3], "intensity": {"type": "rgb", "value": 3.0}},
+        }
+    )
+    lit = {"shadow": "traced", "white": 3.0, "bounce": False, "highlight": False}
+    smooth, plain, centres = (layers_of(scene, CAMERA, replace(FINE, samples=s), **lit) for s in ("edges", 1, 2))
+    large = layers_of(scene, CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height), replace(FINE, samples=1), **lit)
+    changed, twin = changed_by(smooth, plain), means_of_four(large.rgb)
+    inside, outside = (plain.light[plain.instance == i].mean() for i in (1, 0))
+    assert inside > 5 * outside
+    assert changed.mean() > 0.02
+
+    def error(layers: Layers) -> float:
+        return float(np.sqrt(np.mean((layers.rgb - twin)[changed] ** 2)))
+
+    assert error(smooth) < 0.15 * min(error(plain), error(centres))
+
+
+def test_what_is_too_crowded_is_looked_at_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mitsplat.renderer.splatting import antialiasing as edges
+    from mitsplat.renderer.splatting import pairs
+
+    scene = scene_of()
+    whole = layers_of(scene, CAMERA, FINE)
+    bins, sizes = edges.bin_gaussians, []
+
+    def crowded(*given: Any, chosen: Any) -> Any:
+        if chosen.count > 20:
+            raise pairs.CrowdedError
+        sizes.append(chosen.count)
+        return bins(*given, chosen=chosen)
+
+    monkeypatch.setattr(edges, "bin_gaussians", crowded)
+    parts = layers_of(scene, CAMERA, FINE)
+    assert len(sizes) > 2
+    assert np.array_equal(parts.rgb, whole.rgb)

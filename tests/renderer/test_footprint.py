@@ -1,0 +1,125 @@
+"""Light of pixels across which surfaces bend, against that of its points, and what is known of the noise there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.renderer.layers import make_integrator, make_splats_shape
+from mitsplat.renderer.light import light_points as footprint
+from mitsplat.renderer.light.light_filter import GAIN, SMALL, Estimate, LightFilter
+from mitsplat.renderer.light.light_points import OFFSETS
+from mitsplat.renderer.light.lit_surface import Surface
+from mitsplat.renderer.rays.camera_rays import View
+from tests.renderer.test_light import down_camera, floor, render
+
+SIZE, FINER = 24, 4
+
+
+def ridges(period: float, slope: float, extent: float = 0.5) -> trimesh.Trimesh:
+    """A roof of many ridges along y, whose tops lie at z = 0."""
+    count = int(2 * extent / period)
+    x = np.linspace(-extent, extent, 2 * count + 1)
+    z = np.where(np.arange(len(x)) % 2, 0.0, -slope * period / 2)
+    vertices = np.concatenate([np.stack([x, np.full_like(x, y), z], axis=1) for y in (-extent, extent)])
+    left = np.arange(2 * count)
+    far = left + len(x)
+    faces = np.concatenate([np.stack([left, left + 1, far], 1), np.stack([left + 1, far + 1, far], 1)])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_integrator()
+    pixel = 2 * np.tan(np.radians(10)) / SIZE
+    lamp = mi.ScalarTransform4f().look_at(origin=[1.2, 0, 2], target=[0, 0, 0], up=[0, 1, 0]).scale(0.1)
+    shapes = {
+        "ridges": make_splats_shape(
+            floor(0.5),
+            proxy=ridges(0.7 * pixel, 0.3),
+            instance=1,
+            capture_light="uniform",
+            roughness=0.4,
+            specular=0.5,
+        ),
+        "lamp": {
+            "type": "rectangle",
+            "to_world": lamp,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 100.0}},
+        },
+    }
+    own = render(shapes, down_camera(size=SIZE), samples=4)
+    monkeypatch.setattr(footprint, "_bends", lambda here, *_: here.instance < 0)
+    middles = render(shapes, down_camera(size=SIZE), samples=4)
+    large = render(shapes, down_camera(size=SIZE * FINER), samples=4)
+    inner = slice(2, -2)  # the picture's border has no neighbours beyond it
+    for name in ("light", "highlight"):
+        fine = getattr(large, name).reshape(SIZE, FINER, SIZE, FINER, 3)
+        at = [tuple(int(FINER * (0.5 + v)) for v in offset) for offset in OFFSETS]
+        twin = np.mean([fine[:, y, :, x] for x, y in at], axis=0)[inner, inner]
+        np.testing.assert_allclose(getattr(own, name)[inner, inner], twin, rtol=2e-3, atol=2e-3, err_msg=name)
+        assert np.abs(getattr(middles, name)[inner, inner] - twin).max() > 0.05
+
+
+def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
+    make_integrator()
+    camera = down_camera(size=9)
+    view = View(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    count, up = 81, mi.Vector3f(0, 0, 1)
+    pixel = dr.arange(mi.UInt32, count)
+    estimate = Estimate(
+        *[mi.Color3f(v * dr.ones(mi.Float, count)) for v in (2.0, 4.0)],
+        *[dr.full(mi.Float, v, count) for v in (0.0, 0.0, 36.0, 4.0)],
+    )
+
+    def wanted(trait: Any) -> float:
+        fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+        fields |= {"position": dr.zeros(mi.Point3f, count), "normal": up, "trait": mi.Float(trait)}
+        fields |= {"offset": mi.Float(1), "known": dr.full(mi.Bool, True, count)}
+        rays = LightFilter(Surface(**fields), view, pixel).rays_for(estimate, 0.03, mi.Float(1))
+        return float(np.array(rays)[40])
+
+    def twin(like: float, gain: float) -> float:
+        draws = 4 * like
+        share = (0.5 * draws + 0.5) / (draws + 1)
+        return 4 * share * (1 - share) / draws / (gain * 0.03**2)
+
+    assert wanted(dr.zeros(mi.Float, count)) == pytest.approx(twin(SMALL, GAIN), rel=1e-4)
+    assert wanted(pixel) == pytest.approx(twin(1, 1), rel=1e-4)
+
+
+def test_rays_follow_how_light_looks() -> None:
+    """In equal steps of the display: fewest where it is bright, and where a dark picture is exposed for, more."""
+    make_integrator()
+    camera = down_camera(size=9)
+    view = View(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    count = 81
+    fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+    fields |= {"position": dr.zeros(mi.Point3f, count), "normal": mi.Vector3f(0, 0, 1), "offset": mi.Float(1)}
+    fields |= {"known": dr.full(mi.Bool, True, count)}
+    light_filter = LightFilter(Surface(**fields), view, dr.arange(mi.UInt32, count))
+
+    def wanted(unshadowed: float, share: float = 0.5, **options: Any) -> float:
+        estimate = Estimate(
+            *[mi.Color3f(v * dr.ones(mi.Float, count)) for v in (4 * share, 4.0)],
+            *[dr.full(mi.Float, v, count) for v in (0.0, 0.0, 36.0, 4.0)],
+        )
+        return float(np.array(light_filter.rays_for(estimate, 0.03, mi.Float(unshadowed), **options))[40])
+
+    at_half = wanted(1.0)
+    # The slope of v^(1/2.2) at v is that at a half times (v / 0.5)^(1/2.2 - 1).
+    for light in (0.06, 0.2, 0.5):
+        steps = (light / 0.5) * (light / 0.5) ** (1 / 2.2 - 1)
+        assert wanted(2 * light) / at_half == pytest.approx(steps**2, rel=1e-4)
+    assert wanted(0.02) / at_half == pytest.approx((0.02 * (0.05 / 0.5) ** (1 / 2.2 - 1)) ** 2, rel=1e-4)
+    for light in (0.03, 0.3, 3.0):  # as bright as any other, however much light there is
+        assert wanted(light, metered=count) == pytest.approx(at_half, rel=2e-3)
+    # Nine in ten pixels of a picture are lit by 1, as bright as if a half of it arrived.
+    mean = (9 * 1 + 0.1 ** (1 / 2.2)) / 10
+    own = 0.1 * 0.5 * mean**-2.2
+    steps = (own / 0.5) ** (1 / 2.2)
+    assert wanted(0.2, metered=10 * count) / at_half == pytest.approx(steps**2, rel=2e-3)

@@ -1,0 +1,520 @@
+"""Traced light against closed forms, and the mutual occlusion of splats and visible meshes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_normals import CREASE_ANGLE
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.light.light import RECURRENCE
+from mitsplat.renderer.light.light_points import OFFSETS
+from mitsplat.renderer.light.light_tiles import BLOCK
+from mitsplat.renderer.occluders.proxies import Proxies, smooth_normals
+
+WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
+
+
+def down_camera(height: float = 1.0, size: int = 32, fov: float = 20.0) -> Camera:
+    return Camera.look_at((0, 0, height), (0, 0, 0), up=(0, 1, 0), width=size, height=size, fov_x=fov)
+
+
+def floor(extent: float = 1.0, grey: float = 0.5, z: float = 0.0) -> Splats:
+    """An opaque grey plane of Gaussians at height z."""
+    n = 40
+    x, y = np.meshgrid(np.linspace(-extent, extent, n), np.linspace(-extent, extent, n))
+    spacing = 2 * extent / (n - 1)
+    means = np.stack([x.ravel(), y.ravel(), np.full(n * n, z)], axis=1)
+    return Splats(
+        means,
+        np.tile([0, 0, 0, 1.0], (n * n, 1)),
+        np.tile([spacing, spacing, 0.01 * spacing], (n * n, 1)),
+        np.full(n * n, 0.999),
+        np.full((n * n, 1, 3), (grey - 0.5) / SH_C0),
+    )
+
+
+def slab(extent: float = 1.0, top: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[[-extent, -extent, top - 0.1 * extent], [extent, extent, top]])
+
+
+def render(shapes: dict[str, Any], camera: Camera, *, samples: int = 64, **options: Any) -> Layers:
+    integrator = make_integrator(shadow_samples=samples, shadow_error=0, **options)
+    return render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), camera)
+
+
+def test_without_dynamic_objects_nothing_changes_bit_for_bit() -> None:
+    make_integrator()
+    shapes = {"floor": make_splats_shape(floor(), proxy=slab()), "sky": WHITE_SKY}
+    lit = render(shapes, down_camera())
+    plain = render(shapes, down_camera(), shadow="none")
+    assert (lit.light == 1).all()
+    assert lit.rgb.tobytes() == plain.rgb.tobytes()
+    assert lit.rgb.max() > 0.1
+
+
+def test_wall_hides_half_of_a_uniform_sky() -> None:
+    """At the foot of a tall wall half of the cosine-weighted hemisphere is dark: the ratio is 1/2."""
+    make_integrator()
+    wall = trimesh.creation.box(bounds=[[0.0, -500, 0.001], [0.5, 500, 500]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "wall": make_splats_shape(floor().select(np.zeros(1600, bool)), proxy=wall, instance=1),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((-0.02, 0, 0.3), (-0.02, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=4)
+    light = render(shapes, camera, samples=256).light
+    assert light.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_sky_within_reach_is_hidden_by_what_is_near_alone() -> None:
+    """A ceiling at height h hides the directions in which it is within reach r; (h / r)^2 of a sky's light is left."""
+    make_integrator()
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
+    for ceiling, bright in ((2.0, (0.0, 1.0)), (0.5, (0.0, 0.25))):
+        plate = trimesh.creation.box(bounds=[[-500, -500, ceiling], [500, 500, ceiling + 0.1]])
+        shapes = {
+            "floor": make_splats_shape(floor(), proxy=slab()),
+            "ceiling": make_splats_shape(nothing(), proxy=plate, instance=1),
+        }
+        camera = down_camera(height=0.4)
+        for reach, expected in zip((0.0, 1.0), bright, strict=True):
+            light = render({**shapes, "sky": WHITE_SKY}, camera, sky_reach=reach).light
+            np.testing.assert_allclose(light, expected, atol=0.01)
+            assert render({**shapes, "sun": sun}, camera, sky_reach=reach).light.max() == 0
+
+
+def test_object_between_a_point_light_and_the_floor_leaves_none() -> None:
+    make_integrator()
+    blocker = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.4], [0.05, 0.05, 0.41]])
+    lamp = {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": {"type": "rgb", "value": 5.0}}
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "blocker": make_splats_shape(floor().select(np.zeros(1600, bool)), proxy=blocker, instance=1),
+        "lamp": lamp,
+    }
+    camera = Camera.look_at((0.0, -1.5, 0.3), (0, 0, 0), width=64, height=48, fov_x=30)
+    light = render(shapes, camera).light
+    assert light.min() == 0.0
+    assert light.max() == 1.0
+    # The shadow of a 0.1 m square from 2 m above, 0.4 m over the floor, is 0.1 * 2 / 1.6 m wide.
+    pixels, _ = camera.project([[0.0, 0.0, 0.0], [0.055, 0, 0], [0.07, 0, 0], [-0.055, 0, 0], [-0.07, 0, 0]])
+    values = [light[int(y), int(x), 0] for x, y in pixels]
+    assert values[0] == values[1] == values[3] == 0.0
+    assert values[2] == values[4] == 1.0
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
+def test_uniform_capture_keeps_its_colour_on_an_open_horizontal_surface(unit: float) -> None:
+    """At three scales: no acne, no missing light."""
+    make_integrator()
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5 * unit], target=[0, 0, 0], up=[0, 1, 0]).scale(unit),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 3.0}},
+    }
+    camera = Camera.look_at((0, 0, unit), (0, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=6, near=0.01 * unit)
+    shapes = {
+        "floor": make_splats_shape(floor(unit), proxy=slab(unit), instance=1, capture_light="uniform"),
+        "sky": WHITE_SKY,
+        "lamp": lamp,
+    }
+    light = render(shapes, camera, samples=256).light
+    np.testing.assert_allclose(light, 1.0, atol=0.03)
+    assert light.mean() == pytest.approx(1.0, abs=5e-3)
+
+
+def test_side_away_from_the_light_is_darker() -> None:
+    make_integrator()
+    ball = trimesh.creation.icosphere(4, 0.3)
+    sphere = Splats(
+        ball.vertices,
+        np.tile([0, 0, 0, 1.0], (len(ball.vertices), 1)),
+        np.full((len(ball.vertices), 3), 0.02),
+        np.full(len(ball.vertices), 0.99),
+        np.zeros((len(ball.vertices), 1, 3)),
+    )
+    lamp = {"type": "point", "position": [3.0, 0.0, 0.0], "intensity": {"type": "rgb", "value": 5.0}}
+    shapes = {"ball": make_splats_shape(sphere, proxy=ball, instance=1), "lamp": lamp}
+    camera = Camera.look_at((0, -2, 0), (0, 0, 0), width=48, height=48, fov_x=25)
+    light = render(shapes, camera).light[..., 0]
+    assert light[24, 36] > 4 * light[24, 20] + 0.1
+    assert light[24, 16] == 0.0
+
+
+def test_highlight_lies_at_the_mirror_direction_and_only_there() -> None:
+    make_integrator()
+    lamp = {"type": "point", "position": [0.0, 0.0, 1.0], "intensity": {"type": "rgb", "value": 1.0}}
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab(), instance=1, specular=0.5, roughness=0.1),
+        "lamp": lamp,
+    }
+    highlight = render(shapes, down_camera(1.0, 65, 40.0)).highlight[..., 0]
+    assert np.unravel_index(highlight.argmax(), highlight.shape) == (32, 32)
+    assert highlight[32, 60] < 0.01 * highlight.max()
+
+
+def test_visible_mesh_and_splats_hide_each_other() -> None:
+    make_integrator()
+    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.1, 0.1]}}
+    cube = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([0.1, 0, 0]).scale(0.1),
+        "bsdf": red,
+    }
+    shapes = {
+        "above": make_splats_shape(floor(0.04, grey=0.9, z=0.3), instance=2),
+        "below": make_splats_shape(floor(1.0, grey=0.2, z=0.0), instance=1),
+        "cube": cube,
+    }
+    layers = render(shapes, down_camera(1.0, 64, 40.0))
+    pixels, _ = down_camera(1.0, 64, 40.0).project([[0.0, 0, 0.3], [0.16, 0, 0.1], [-0.2, 0, 0.0]])
+    above, mesh, below = [(int(y), int(x)) for x, y in pixels]
+    assert [layers.instance[p] for p in (above, mesh, below)] == [2, 0, 1]
+    assert layers.rgb[mesh][0] > 4 * layers.rgb[mesh][1] > 0
+    assert layers.depth[mesh] == pytest.approx(0.9, abs=1e-3)
+    assert layers.depth[below] == pytest.approx(1.0, abs=1e-2)
+    assert layers.rgb[above].min() > layers.rgb[below].max()
+
+
+def test_layers_say_where_the_proxy_is() -> None:
+    make_integrator()
+    shapes = {"floor": make_splats_shape(floor(), proxy=slab(), instance=7)}
+    layers = render(shapes, down_camera())
+    np.testing.assert_allclose(layers.proxy_depth, 1.0, atol=1e-5)
+    np.testing.assert_allclose(layers.normal, np.broadcast_to([0, 0, 1.0], layers.normal.shape), atol=1e-5)
+    assert (layers.proxy_instance == 7).all() and (layers.instance == 7).all()
+
+
+def nothing() -> Splats:
+    return floor().select(np.zeros(1600, bool))
+
+
+def test_few_rays_leave_no_speckles_in_a_faint_shadow() -> None:
+    """A strong lamp and a weak sky, four rays a pixel: the edge of a wide penumbra, where few rays meet the object."""
+    make_integrator()
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 1.4], target=[0, 0, 0], up=[0, 1, 0]).scale(0.3),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 14.0}},
+    }
+    blocker = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.4], [0.05, 0.05, 0.41]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "blocker": make_splats_shape(nothing(), proxy=blocker, instance=1),
+        "lamp": lamp,
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    }
+    camera = Camera.look_at((0.0, -1.5, 0.35), (0, 0, 0), width=160, height=90, fov_x=25)
+    few, many = (render(shapes, camera, samples=n).light[..., 0] for n in (4, 1024))
+    assert many.min() < 0.8
+    assert np.abs(few - many).max() < 0.2
+    assert np.sqrt(np.mean((few - many) ** 2)) < 0.02
+
+
+def test_relit_surface_shows_no_pattern_of_the_sampling() -> None:
+    make_integrator()
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[1, 0, 1.4], target=[0, 0, 0], up=[0, 1, 0]).scale(0.3),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 14.0}},
+    }
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab(), instance=1, capture_light="uniform"),
+        "lamp": lamp,
+        "sky": WHITE_SKY,
+    }
+    light = render(shapes, down_camera(size=48), samples=4).light[..., 0]
+    assert np.abs(np.diff(light, 2, axis=0)).max() < 1e-3
+    assert np.abs(np.diff(light, 2, axis=1)).max() < 1e-3
+
+
+def test_point_seen_beside_its_proxy_takes_the_light_of_its_neighbours() -> None:
+    """A proxy wider than its object by a few pixels: the floor seen there is not under the object."""
+    make_integrator()
+    base = trimesh.creation.box(bounds=[[-0.125, -0.125, 0.0], [0.125, 0.125, 0.05]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "object": make_splats_shape(floor(0.1, 0.8, 0.05), proxy=base, instance=1, capture_light="uniform"),
+        "sky": WHITE_SKY,
+    }
+    layers = render(shapes, down_camera(size=64), samples=64)
+    seam = (layers.instance == 0) & (layers.proxy_instance == 1)
+    assert seam.sum() > 20
+    assert layers.light[seam].min() > 0.3
+
+
+def noise_free(shapes: dict[str, Any], camera: Camera, **options: Any) -> Layers:
+    return render(shapes, camera, samples=1024, **options)
+
+
+def area_light(size: float, height: float, radiance: float = 5.0) -> dict[str, Any]:
+    """A square of edge ``size`` at ``height`` above the origin that shines down."""
+    pose = mi.ScalarTransform4f().look_at(origin=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0]).scale(0.5 * size)
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    return {"type": "rectangle", "to_world": pose, "emitter": emitter}
+
+
+def test_penumbra_of_a_square_light_has_the_width_of_similar_triangles() -> None:
+    """A half plane at height h under a square light of edge s at height H: the penumbra is s h / (H - h) wide.
+
+    In between the visible share of the light rises linearly, and its middle is under the half plane's edge.
+    """
+    make_integrator()
+    size, top, edge = 0.1, 2.0, 0.5
+    half_plane = trimesh.creation.box(bounds=[[-5, -5, edge], [0, 5, edge + 1e-4]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "half plane": make_splats_shape(nothing(), proxy=half_plane, instance=1),
+        "lamp": area_light(size, top),
+    }
+    camera = Camera.look_at((0, 0, 0.45), (0, 0, 0), up=(0, 1, 0), width=320, height=8, fov_x=10)
+    light = noise_free(shapes, camera).light[3, :, 0]
+    slopes = camera.ray_slopes(np.stack([np.arange(320) + 0.5, np.full(320, 4.0)], axis=1))
+    x = 0.45 * slopes[:, 0]
+    inside = (light > 0.1) & (light < 0.9)
+    slope, middle = np.polyfit(x[inside], light[inside], 1)
+    assert 1 / slope == pytest.approx(size * edge / (top - edge), rel=0.02)
+    assert -middle / slope + 0.5 / slope == pytest.approx(0.0, abs=0.02 / slope)
+
+
+def test_default_accuracy_keeps_its_promise_in_the_penumbra() -> None:
+    """Rays are spent until light has the stated error as it looks, and not evenly."""
+    make_integrator()
+    blocker = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.15], [0.1, 0.1, 0.2]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "blocker": make_splats_shape(nothing(), proxy=blocker, instance=1),
+        "lamp": area_light(0.4, 1.0),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
+    }
+    camera = Camera.look_at((0.0, -0.9, 0.6), (0, 0, 0), width=240, height=160, fov_x=45)
+    exact = noise_free(shapes, camera).light[..., 0]
+    seen = noise_free(shapes, camera).proxy_instance == 0
+    penumbra = seen & (exact > 0.15) & (exact < 0.97)
+    assert penumbra.sum() > 2000
+    for error in (0.03, 0.06):
+        layers = render_layers(
+            make_integrator(shadow_error=error), mi.load_dict({"type": "scene", **shapes}), camera, seed=3
+        )
+        # In equal steps of the display, of which the error states the size where half of the light arrives.
+        difference = (layers.light[..., 0] - exact) / (error * (np.maximum(exact, 0.05) / 0.5) ** (1 - 1 / 2.2))
+        assert np.sqrt(np.mean(difference[penumbra] ** 2)) < 1
+        assert abs(difference[penumbra].mean()) < 0.2
+        assert np.abs(difference[seen & (exact > 0.97)]).max() < 3
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
+def test_no_acne_beside_an_object_and_no_gap_under_it(unit: float) -> None:
+    """A cube on the floor under a slanting lamp: lit floor is lit to the last bit, the shadow starts at the edge."""
+    make_integrator()
+    cube = trimesh.creation.box(bounds=np.multiply(unit, [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]]))
+    lamp = {"type": "directional", "direction": [1, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
+    shapes = {
+        "floor": make_splats_shape(floor(unit), proxy=slab(unit)),
+        "cube": make_splats_shape(nothing(), proxy=cube, instance=1),
+        "lamp": lamp,
+    }
+    eye = np.multiply(unit, (0.6, 0, 1.0))
+    camera = Camera.look_at(
+        eye, np.multiply(unit, (0.2, 0, 0)), up=(0, 1, 0), width=200, height=120, fov_x=45, near=0.01 * unit
+    )
+    light = render(shapes, camera, samples=4).light[..., 0]
+    centres = np.stack(np.meshgrid(np.arange(200) + 0.5, np.arange(120) + 0.5), axis=-1).reshape(-1, 2)
+    directions = np.column_stack([camera.ray_slopes(centres), np.ones(len(centres))])
+    directions = directions @ camera.world_from_camera[:3, :3].T
+    point = (eye - directions * (eye[2] / directions[:, 2:])).reshape(120, 200, 3) / unit
+    x, y = point[..., 0], point[..., 1]
+    pixel = np.abs(np.diff(x, axis=1)).max()
+    seen = (directions[:, 2].reshape(120, 200) < 0) & (np.abs(y) < 0.08)
+    shadow = seen & (x > 0.1 + 1.5 * pixel) & (x < 0.3 - 1.5 * pixel)
+    lit = seen & (x > 0.3 + 1.5 * pixel) | (np.abs(y) > 0.1 + 2 * pixel) & (x > 0.3)
+    assert shadow.sum() > 200 and lit.sum() > 200
+    assert (light[shadow] == 0).all()
+    assert (light[lit] == 1).all()
+
+
+@pytest.mark.parametrize("subdivisions", [2, 3])
+def test_grazing_light_ends_on_a_coarse_ball_where_it_ends_on_a_round_one(subdivisions: int) -> None:
+    """No dark facets at the terminator: irradiance is max(0, n.l) of the round ball, though it has few faces."""
+    make_integrator()
+    ball = trimesh.creation.icosphere(subdivisions, 0.3)
+    fine = trimesh.creation.icosphere(5, 0.3)
+    sphere = Splats(
+        fine.vertices,
+        np.tile([0, 0, 0, 1.0], (len(fine.vertices), 1)),
+        np.full((len(fine.vertices), 3), 0.008),
+        np.full(len(fine.vertices), 0.99),
+        np.zeros((len(fine.vertices), 1, 3)),
+    )
+    lamp = {"type": "directional", "direction": [-1, 0, 0], "irradiance": {"type": "rgb", "value": np.pi}}
+    shapes = {"ball": make_splats_shape(sphere, proxy=ball, instance=1), "lamp": lamp}
+    camera = Camera.look_at((0, -2, 0), (0, 0, 0), width=96, height=96, fov_x=18)
+    layers = render(shapes, camera, samples=16, white=np.pi)
+    u = (np.arange(96) + 0.5 - 48) / camera.fx * 2 / 0.3
+    x, z = np.meshgrid(u, -u)
+    inner = x**2 + z**2 < 0.8**2
+    # The camera is near: a little parallax is left in x.
+    expected = np.maximum(x, 0)
+    difference = np.abs(layers.light[..., 0] - expected)[inner]
+    assert difference.mean() < 0.03
+    assert np.percentile(difference, 99) < 0.12
+
+
+def test_scan_that_is_rough_everywhere_has_no_creases_and_a_drawing_keeps_its_own() -> None:
+    rng = np.random.default_rng(0)
+    scan = trimesh.creation.icosphere(3, 0.1)
+    scan.vertices *= 1 + 0.025 * rng.normal(size=(len(scan.vertices), 1))
+    assert (scan.face_adjacency_angles > CREASE_ANGLE).mean() > 0.15
+    normals = smooth_normals(scan).reshape(-1, 3)
+    order = np.argsort(scan.faces.ravel(), kind="stable")
+    _, first, which = np.unique(scan.faces.ravel()[order], return_index=True, return_inverse=True)
+    agreement = np.einsum("ij,ij->i", normals[order], normals[order][first][which])
+    assert np.percentile(agreement, 2) > 0.99
+    for height in (0.01, 0.1, 2.0):
+        prism = trimesh.creation.cylinder(0.1, height, sections=6)
+        sharp = np.repeat(prism.face_normals[:, None], 3, axis=1)
+        np.testing.assert_allclose(smooth_normals(prism), sharp, atol=1e-6)
+
+
+def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None:
+    """Relit white under white = pi: E/pi for every kind of light, with nothing in the way."""
+    make_integrator()
+    pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0])
+    sky = np.zeros((256, 512, 3), np.float32)
+    polar = (np.arange(256) + 0.5) / 256 * np.pi
+    sky[:] = np.maximum(np.cos(polar), 0)[:, None, None]
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    rgb = {"type": "rgb", "value": 2.0}
+    lights = {
+        "spot": ({"type": "spot", "to_world": pose, "cutoff_angle": 30, "intensity": rgb}, 2.0 / 4),
+        "directional": ({"type": "directional", "direction": [1, 0, -1], "irradiance": rgb}, 2 / np.sqrt(2)),
+        "point": ({"type": "point", "position": [0, 0, 2], "intensity": rgb}, 2.0 / 4),
+        "constant": ({"type": "constant", "radiance": rgb}, 2 * np.pi),
+        # L = cos over the upper half: the integral of cos^2 is 2 pi / 3.
+        "map": ({"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": up}, 2 * np.pi / 3),
+    }
+    ground = make_splats_shape(floor(), proxy=slab(), instance=1, capture_light="uniform")
+    for name, (light, irradiance) in lights.items():
+        layers = render({"floor": ground, "light": light}, down_camera(fov=2.0), samples=256, white=np.pi)
+        assert layers.light.mean() == pytest.approx(irradiance / np.pi, rel=0.01), name
+
+
+def test_wall_hides_half_of_a_sky() -> None:
+    make_integrator()
+    wall = trimesh.creation.box(bounds=[[0.0, -5000, 0.0], [0.5, 5000, 5000]])
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "wall": make_splats_shape(nothing(), proxy=wall, instance=1),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((-0.005, 0, 0.3), (-0.005, 0, 0), up=(0, 1, 0), width=32, height=32, fov_x=0.5)
+    light = noise_free(shapes, camera).light
+    assert light.mean() == pytest.approx(0.5, abs=2e-3)
+
+
+def test_highlight_takes_no_more_light_than_arrives() -> None:
+    """Under a uniform sky of radiance 1 a lobe of reflectance 1 shows at most 1 (white furnace)."""
+    make_integrator()
+    for roughness in (0.3, 0.5, 1.0):
+        shiny = make_splats_shape(
+            floor(), proxy=slab(), instance=1, capture_light="scene", specular=1.0, roughness=roughness
+        )
+        for eye in ((0.0, -0.05, 1.0), (0.0, -1.0, 0.25)):
+            camera = Camera.look_at(eye, (0, 0, 0), width=32, height=32, fov_x=10)
+            highlight = noise_free({"floor": shiny, "sky": WHITE_SKY}, camera, white=np.pi).highlight
+            assert 0.25 < highlight.mean() < 1.02
+
+
+def test_bad_accuracy_is_refused() -> None:
+    make_integrator()
+    for name, value in (
+        ("shadow_error", 1.0),
+        ("shadow_error", -0.1),
+        ("white", -1.0),
+        ("sky_reach", -1.0),
+        ("shadow_error", "fine"),
+    ):
+        with pytest.raises(Exception, match=name):
+            mi.load_dict({"type": "splat_proxy", name: value})
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
+def test_in_the_light_of_its_capture_an_object_looks_as_captured(roughness: float) -> None:
+    """Even light of radiance 1: the ratio is 1 to 1e-3, and the highlight replaces what the capture held of it."""
+    make_integrator()
+    ground = make_splats_shape(
+        floor(), proxy=slab(), instance=1, capture_light="uniform", specular=0.04, roughness=roughness
+    )
+    for eye in ((0.0, -0.05, 1.0), (0.0, -1.0, 0.8)):
+        camera = Camera.look_at(eye, (0, 0, 0), width=24, height=24, fov_x=4)
+        layers = noise_free({"floor": ground, "sky": WHITE_SKY}, camera, white=np.pi)
+        np.testing.assert_allclose(layers.light, 1, atol=1e-3)
+        assert abs(layers.highlight.mean()) < 0.006
+
+
+@pytest.mark.parametrize("occluders", ["proxies", "splats"])
+@pytest.mark.parametrize("rays", [8, 80])
+def test_one_scene_in_each_kernel_makes_the_same_light(
+    occluders: str, rays: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on CUDA, where a kernel cannot trace several: what static and dynamic things stop is kept from one to the
+    next."""
+    make_integrator()
+    ball = trimesh.creation.icosphere(2, 0.05)
+    ball.apply_translation([0, 0, 0.06])
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.1, 0.05, 0.03]).scale(0.03)}
+    wall = trimesh.creation.box(bounds=[[-0.16, -0.2, 0.001], [-0.15, 0.2, 0.1]])
+    thing = Splats(
+        ball.vertices,
+        np.tile([0, 0, 0, 1.0], (len(ball.vertices), 1)),
+        np.full((len(ball.vertices), 3), 0.008),
+        np.full(len(ball.vertices), 0.9),
+        np.zeros((len(ball.vertices), 1, 3)),
+    )
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "wall": make_splats_shape(nothing(), proxy=wall),
+        "thing": make_splats_shape(thing, proxy=ball, instance=1, capture_light="uniform", specular=0.3),
+        "cube": cube,
+        "sky": WHITE_SKY,
+        "lamp": {"type": "point", "position": [0.5, 0.2, 0.8], "intensity": {"type": "rgb", "value": 1.0}},
+    }
+    camera = Camera.look_at((0.1, -0.5, 0.4), (0, 0, 0), width=48, height=40, fov_x=40)
+
+    def layers() -> Layers:
+        return render(shapes, camera, samples=rays, occluders=occluders)
+
+    together = layers()
+    assert together.light.min() < 0.5
+    build = Proxies.__init__
+
+    def apart(self: Proxies, *args: Any) -> None:
+        build(self, *args)
+        assert len(self.casting) == (2 if occluders == "splats" else 1)
+        self.apart = True
+
+    monkeypatch.setattr(Proxies, "__init__", apart)
+    one_by_one = layers()
+    for name in ("rgb", "light", "highlight", "normal"):
+        assert getattr(one_by_one, name).tobytes() == getattr(together, name).tobytes(), name
+
+
+@pytest.mark.parametrize(("stride", "apart"), [(1, 0.18), (BLOCK * BLOCK, 0.24), (len(OFFSETS) * BLOCK * BLOCK, 0.06)])
+def test_points_of_rays_stay_apart(stride: int, apart: float) -> None:
+    """Those of neighbours, of a pixel, and of each of a bent pixel's points.
+
+    The least n d^2 of points n steps apart, which sets that do not repeat keep from 0: Roberts' is 0.245.
+    """
+    step = np.array(RECURRENCE, dtype=np.int64) * stride % 2**32 / 2**32
+    n = np.arange(1, 1025)
+    offset = n[:, None] * step
+    distance = np.linalg.norm(offset - np.round(offset), axis=1)
+    assert np.min(n * distance**2) > apart

@@ -1,0 +1,97 @@
+"""Rays that a GPU would leave out: seen in the kernels' code on any machine, and an error where Dr.Jit says so."""
+
+import ctypes
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from mitsplat.renderer.occluders.proxies import Proxies
+from mitsplat.runtime.dropped_rays import SIGN, refuse_lost_rays, watch_rays
+from mitsplat.runtime.variant import ensure_variant
+from tests.gpu.cases import CASES
+from tests.kernels import traced_scenes
+
+TEXTS = [
+    "jit_eval(): more than one OptiX pipeline was used within a single kernel, which is not supported. Please split "
+    "your kernel into smaller parts (e.g. using `dr::eval()`). Disabling this ray tracing operation to avoid "
+    "potential undefined behavior.",
+    "jit_eval(): more than one OptiX shader binding table was used within a single kernel, which is not supported. "
+    "Please split your kernel into smaller parts (e.g. using `dr::eval()`). Disabling this ray tracing operation to "
+    "avoid potential undefined behavior.",
+]
+"""As the library of Dr.Jit 1.5 has them."""
+
+LIBRARY = Path(dr.__file__).with_name("libdrjit-core.so")
+
+
+@pytest.fixture(params=[ctypes.CDLL, ctypes.PyDLL])
+def log(request):
+    """Dr.Jit's own log, without and with Python's lock, and the callback in place while the test runs."""
+    function = request.param(str(LIBRARY))["_Z7jit_log8LogLevelPKcz"]
+    function.argtypes, function.restype = (ctypes.c_uint32, ctypes.c_char_p), None
+    level = dr.log_level()
+    watch_rays()
+    yield lambda text: function(dr.LogLevel.Warn.value, text.encode())
+    dr.set_log_level(level)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_lost_rays_are_an_error_once(log, text, capfd):
+    log(text)
+    log(text)
+    with pytest.raises(RuntimeError, match=r"left out rays \(2 times\): jit_eval\(\): more than one OptiX"):
+        refuse_lost_rays()
+    refuse_lost_rays()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_other_messages_are_printed(log, capfd):
+    log("something else")
+    refuse_lost_rays()
+    assert "something else" in capfd.readouterr().err
+
+
+def test_dr_jit_still_says_so():
+    """Another release may word it differently, and nothing else would tell."""
+    library = LIBRARY.read_bytes()
+    for text in TEXTS:
+        assert SIGN in text.encode()
+        assert text.encode() in library
+
+
+def test_a_process_ends_with_the_callback_in_place():
+    code = "import mitsuba as m; from mitsplat.runtime import dropped_rays as d; "
+    code += "m.set_variant('llvm_ad_rgb'); d.watch_rays(); m.Float(1)"
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.cpu(reason="reads kernels in LLVM's language")
+class TestKernels:
+    @pytest.mark.parametrize("case", CASES)
+    def test_each_traces_one_scene(self, monkeypatch, case):
+        """As they are split on CUDA."""
+        build = Proxies.__init__
+
+        def apart(self, *args):
+            build(self, *args)
+            self.apart = True
+
+        monkeypatch.setattr(Proxies, "__init__", apart)
+        with traced_scenes() as numbers:
+            CASES[case]()
+        assert max(numbers) == (0 if "gradients" in case or case == "silhouettes of splats" else 1)
+
+    def test_two_scenes_are_counted(self):
+        ensure_variant()
+        scenes = [mi.load_dict({"type": "scene", "shape": {"type": kind}}) for kind in ("sphere", "cube")]
+        ray = mi.Ray3f(mi.Point3f(dr.arange(mi.Float, 8), 0, -5), mi.Vector3f(0, 0, 1))
+        with traced_scenes() as numbers:
+            dr.eval(scenes[0].ray_test(ray) | scenes[1].ray_intersect_preliminary(ray).is_valid())
+            dr.eval(scenes[0].ray_test(ray) | scenes[0].ray_test(mi.Ray3f(ray.o + 0.1, ray.d)))
+        assert numbers == [2, 1]

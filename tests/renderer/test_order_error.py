@@ -1,0 +1,282 @@
+"""The error of the order of blending: its estimate, and tiles that are walked again where it is too large."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.images.colour import encode_srgb
+from mitsplat.quality import PRESETS, PresetName, Quality
+from mitsplat.renderer.layers import (
+    Layers,
+    ensure_variant,
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_splats,
+)
+from tests.renderer.test_render import CAMERA, make_splats
+
+WIDE = CAMERA.resized(96, 72)
+RAY = Quality(tolerance=0.0, alpha_min=1e-4, transmittance_min=0.0)
+CROWD = make_splats(600, 51, scales=(0.02, 0.3))
+
+
+def display(layers: Layers) -> np.ndarray:
+    """Display-encoded colour, multiplied by alpha, as it is blended."""
+    return encode_srgb(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
+
+
+def errors(quality: Quality) -> np.ndarray:
+    """Largest error of each pixel's channels against the order of its ray, (H, W)."""
+    exact = display(render_splats(CROWD, WIDE, quality=replace(quality, tolerance=0.0)))
+    return np.abs(display(render_splats(CROWD, WIDE, quality=quality)) - exact).max(axis=-1)
+
+
+def test_the_tolerance_is_kept_by_nearly_all_pixels() -> None:
+    tile = errors(replace(RAY, tolerance=math.inf))
+    assert (tile > 5e-3).mean() > 0.1
+    for tolerance in (2e-3, 5e-3, 2e-2):
+        found = errors(replace(RAY, tolerance=tolerance))
+        assert (found > tolerance).mean() < 0.01
+        assert np.sqrt(np.mean(found**2)) < tolerance / 2
+
+
+def test_a_smaller_tolerance_walks_more_tiles_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mitsplat.renderer.splatting import march
+
+    again: list[int] = []
+    sort = march.in_ray_order
+    monkeypatch.setattr(march, "in_ray_order", lambda lists, chosen, view: noted(sort(lists, chosen, view)))
+
+    def noted(lists: Any) -> Any:
+        again.append(dr.width(lists.tiles))
+        return lists
+
+    for tolerance in (0.05, 0.01, 1e-3, 1e-9):
+        render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=tolerance))
+    assert 0 < again[0] < again[1] < again[2] < again[3] <= 12 * 18
+    again.clear()
+    for tolerance in (0.0, math.inf):
+        render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=tolerance))
+    assert again == []
+
+
+VIEWS = {
+    "pinhole": {},
+    "distorted": {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)},
+    "fisheye": {"distortion": (0.05, -0.02, 0.01, -0.003), "lens": "fisheye", "fx": 60.0, "fy": 58.0},
+    "thin": {"aperture_radius": 0.05, "focus_distance": 2.0},
+    "inside": {"world_from_camera": look_at_pose((0, 0, -0.2), (0, 0, 1))},
+}
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("lens", VIEWS)
+@pytest.mark.parametrize("mesh", [False, True])
+def test_no_tolerance_is_the_order_of_rays(lens: str, samples: int, mesh: bool) -> None:
+    """Whatever is late at all is walked again: colours, depths and ids are those of the exact order.
+
+    But for pixels where two Gaussians are equally far: kernels of a GPU round the same depth in more than one way.
+    """
+    ensure_variant()
+    camera = replace(WIDE, width=50, height=38, **VIEWS[lens])
+    parts = [make_splats(250, seed, scales=(0.02, 0.25)) for seed in (61, 62, 63)]
+    scene: dict[str, Any] = {
+        f"part {number}": make_splats_shape(splats, instance=number) for number, splats in enumerate(parts)
+    }
+    if mesh:
+        scene["card"] = {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, 0.1]).rotate([1, 0, 0], 150).scale(0.4),
+        }
+    quality = replace(RAY, samples=samples, lens_rings=1)
+
+    def shown(tolerance: float) -> Layers:
+        integrator = make_integrator(quality=replace(quality, tolerance=tolerance), shadow="none")
+        return render_layers(integrator, mi.load_dict({"type": "scene", **scene}), camera)
+
+    exact, repaired = shown(0.0), shown(1e-9)
+    ties = 0.001 if mi.variant() == "cuda_ad_rgb" else 0.0
+    for name in ("rgb", "alpha", "captured", "depth"):
+        other = ~np.isclose(getattr(repaired, name), getattr(exact, name), rtol=1e-7, atol=2e-5)
+        assert other.reshape(*exact.instance.shape, -1).any(axis=2).mean() <= ties, name
+    assert (repaired.instance == exact.instance).mean() > 0.999
+    assert np.abs(shown(math.inf).captured - exact.captured).max() > 1e-3
+
+
+def sheets(colour: Any) -> Splats:
+    """Round Gaussians in three wide, tilted layers, opaque together, whose colour is a function of x."""
+    rng = np.random.default_rng(7)
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 60), np.linspace(-1.2, 1.2, 48)))
+    layers = []
+    for depth in (-0.04, 0.0, 0.04):
+        n = len(x)
+        places = np.column_stack([x, y, depth + 0.2 * x + rng.normal(0, 0.02, n)])
+        layers.append(
+            Splats(
+                means=places,
+                quats=np.tile([0.0, 0, 0, 1], (n, 1)),
+                scales=np.full((n, 3), 0.06),
+                opacities=np.full(n, 0.8),
+                sh=np.repeat(colour(x)[:, None, None], 3, axis=2),
+            )
+        )
+    return Splats.concatenate(layers)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+    """A picture of one colour keeps it, and a ramp has no steps, where tiles of all three orders lie side by side."""
+    from mitsplat.renderer.splatting import march
+
+    judged = march._too_wrong
+
+    def judged_or_some(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
+        """Also the black squares of a chequerboard of 12 x 18 tiles, and of those every other one a second time."""
+        tile = dr.arange(mi.UInt32, dr.width(errors[0])) // (32 // len(errors))
+        square = tile + tile // 12 if len(errors) > 1 else tile
+        return judged(errors, inside, tolerance) | (square % 2 == 0)
+
+    monkeypatch.setattr(march, "rows_together", lambda order: 4 if order == "tile" else 1)  # also on a GPU
+    monkeypatch.setattr(march, "_too_wrong", judged_or_some)
+    quality = Quality(tolerance=1e-3, alpha_min=1e-4, transmittance_min=1e-5, samples=samples)
+    even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality=quality)
+    assert np.ptp(even.rgb / even.alpha[..., None]) < 1e-5
+    ramp = display(render_splats(sheets(lambda x: 0.8 * x), WIDE, quality=quality))
+    exact = display(render_splats(sheets(lambda x: 0.8 * x), WIDE, quality=replace(quality, tolerance=0.0)))
+    steps = np.abs(np.diff(ramp - exact, axis=1)).max(axis=(0, 2))
+    assert np.ptp(ramp) > 0.3
+    assert steps[7::8].max() < 2e-3  # from the last column of a tile to the first of the next
+
+
+def test_late_by_one_place_is_estimated_exactly() -> None:
+    """Two neighbours that change places change a colour by the product of their opacities times what they differ."""
+    ensure_variant()
+    from mitsplat.renderer.splatting.march import ERROR, _blend, _fresh
+
+    colours, opacities = ((0.9, 0.2, 0.1), (0.3, 0.6, 0.4)), (0.6, 0.5)
+    pixel = _fresh(False, "estimated")
+    for colour, opacity, z in zip(colours, opacities, (2.0, 1.0), strict=True):
+        record = {6: colour[0], 7: colour[1], 8: colour[2]}
+        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "estimated")
+    assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
+
+
+def test_late_by_one_place_is_amended_exactly() -> None:
+    """The colour is that of the right order, and a third one, late behind both, is blended as it comes."""
+    ensure_variant()
+    from mitsplat.renderer.splatting.march import BLUE, RED, _blend, _fresh
+
+    met = [((0.9, 0.2, 0.1), 0.6, 2.0), ((0.3, 0.6, 0.4), 0.5, 1.0), ((0.1, 0.8, 0.5), 0.7, 3.0)]
+    pixel = _fresh(False, "amended")
+    for colour, opacity, z in met:
+        record = {6: colour[0], 7: colour[1], 8: colour[2]}
+        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "amended")
+    expected, transmittance = np.zeros(3), 1.0
+    for colour, opacity, _ in sorted(met, key=lambda peak: peak[2]):
+        expected += transmittance * opacity * np.array(colour)
+        transmittance *= 1 - opacity
+    assert np.array(pixel[RED : BLUE + 1]).ravel() == pytest.approx(expected, abs=1e-6)
+    assert np.array(pixel[0]).item() == pytest.approx(transmittance)
+
+
+def test_amended_pictures_are_nearer_to_the_order_of_rays_and_show_the_same_things() -> None:
+    plain = replace(PRESETS["fast"], amends=False)
+    layers, amended = (render_splats(CROWD, WIDE, quality=quality) for quality in (plain, PRESETS["fast"]))
+    exact = display(render_splats(CROWD, WIDE, quality=replace(plain, tolerance=0.0)))
+    before, after = (float(np.sqrt(np.mean((display(each) - exact) ** 2))) for each in (layers, amended))
+    assert after < 0.8 * before
+    for name in ("alpha", "depth", "instance"):
+        np.testing.assert_array_equal(getattr(amended, name), getattr(layers, name))
+
+
+def test_amended_pictures_of_one_colour_keep_it() -> None:
+    even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality="fast")
+    assert np.ptp(even.rgb / even.alpha[..., None]) < 1e-5
+
+
+def test_the_error_that_is_left_is_told_with_the_picture() -> None:
+    """The largest within the tolerance, since tiles above it are made again; the mean by any order of its sum."""
+    small, large = (render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=t)).order_error for t in (5e-3, 0.1))
+    assert small is not None and large is not None
+    assert 0 < small["mean"] < small["largest"] <= 5e-3 < large["largest"] <= 0.1
+    found = errors(replace(RAY, tolerance=0.1))
+    assert found.mean() / 2 < large["mean"] < 2 * found.mean()
+    assert render_splats(CROWD, WIDE, quality=RAY).order_error == {"largest": 0, "mean": 0}
+    assert render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=math.inf)).order_error is None
+
+
+def test_the_largest_and_the_mean_error_are_those_of_the_pixels() -> None:
+    from mitsplat.renderer.splatting.march import largest_and_mean
+
+    ensure_variant()
+    values = np.random.default_rng(1).uniform(0, 0.02, 5000).astype(np.float32)
+    largest, mean = largest_and_mean(mi.Float(values))
+    assert largest[0] == values.max() and mean[0] == pytest.approx(values.mean(), rel=1e-4)
+    assert largest_and_mean(mi.Float([3.0, 0.0]))[0][0] == 1
+
+
+def test_balanced_pops_less_than_fast() -> None:
+    """While a camera turns by a tenth of a degree, what the order of blending alone changes from picture to picture."""
+
+    def popping(preset: PresetName) -> float:
+        quality = PRESETS[preset]
+        cut_alike = replace(quality, tolerance=0.0)
+        wrong = [
+            display(render_splats(CROWD, camera, quality=quality))
+            - display(render_splats(CROWD, camera, quality=cut_alike))
+            for camera in TURNING
+        ]
+        return float(max(np.abs(after - before).max() for before, after in pairwise(wrong)))
+
+    assert popping("balanced") < 0.5 * popping("fast")
+
+
+def test_the_estimate_ranks_pixels_as_the_benchmark_records_it() -> None:
+    from benchmarks.render.order_error import Picture
+
+    ensure_variant()
+    picture, quality = Picture(CROWD, WIDE), replace(PRESETS["balanced"], extends=False)
+    rgb, estimate = picture.estimate(quality)
+    error = np.abs(rgb - picture.show(replace(quality, tolerance=0.0))).max(axis=-1)
+    assert spearmanr(estimate[error > 1e-6], error[error > 1e-6]).statistic > 0.6
+
+
+def turned(degrees: float) -> Camera:
+    angle = math.radians(degrees)
+    return replace(WIDE, world_from_camera=look_at_pose((3 * math.sin(angle), 0, -3 * math.cos(angle)), (0, 0, 0)))
+
+
+TURNING = [turned(0.02 * step) for step in range(6)]
+
+
+def test_tiles_sort_by_depth_where_they_see_most_of_a_gaussian() -> None:
+    """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
+    ensure_variant()
+    from mitsplat.renderer.splatting.tile_depths import depth_where_seen
+
+    box, centre, depth = (0.10, 0.14, -0.02, 0.01), np.array([0.125, -0.012]), 2.0
+    tilt = np.array([3.0, -2.0])  # E and F: depth falls and rises across the footprint
+    spread = np.diag([(box[1] - box[0]) ** 2, (box[3] - box[2]) ** 2]) / 12
+    for covariance in (np.array([[4e-5, 1e-5], [1e-5, 2e-5]]), np.array([[2e-3, -1e-3], [-1e-3, 1e-3]])):
+        inverse = np.linalg.inv(covariance)
+        scaled = inverse * 0.5 * math.log2(math.e)
+        middle = np.array([sum(box[:2]) / 2, sum(box[2:]) / 2])
+        mean = np.linalg.solve(inverse + np.linalg.inv(spread), inverse @ centre + np.linalg.inv(spread) @ middle)
+        du, dv = mean - centre
+        record = [*centre, scaled[0, 0], 2 * scaled[0, 1], scaled[1, 1], 0, 0, 0, 0, depth, *tilt, 0, 0, 0, 0]
+        found = depth_where_seen([mi.Float(value) for value in record], tuple(mi.Float(side) for side in box))
+        expected = depth * (1 + (tilt @ (du, dv)) / 2) / (1 + tilt @ (du, dv))
+        assert np.array(found).item() == pytest.approx(expected, rel=1e-5)
+        assert abs(expected - depth) > 1e-4

@@ -1,0 +1,59 @@
+"""What a scene says of a plugin is refused in one sentence where it is of another type, or out of range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.plugins.parameters import Parameters
+from mitsplat.runtime.variant import ensure_variant
+
+
+def given(**values: Any) -> Parameters:
+    ensure_variant()
+    props = mi.Properties("splats")
+    for name, value in values.items():
+        props[name] = value
+    return Parameters(props, "shape 'splats'")
+
+
+def test_what_is_absent_is_the_default() -> None:
+    none = given()
+    assert (none.text("a", "b"), none.truth("a", True), none.number("a", 2), none.whole("a", 3, 0, 9)) == (
+        "b",
+        True,
+        2.0,
+        3,
+    )
+    assert none.choice("a", "one", "two") == "one"
+    with pytest.raises(InputError, match=r"^shape 'splats': 'a' is missing$"):
+        none.positive("a", None)
+
+
+def test_what_is_given_is_taken() -> None:
+    some = given(text="b", truth=False, whole=3, number=0.5)
+    assert (some.text("text", ""), some.truth("truth", True), some.whole("whole", 0, 0, 3)) == ("b", False, 3)
+    assert (some.number("number", 1), some.number("whole", 1), some.choice("text", "a", "b")) == (0.5, 3.0, "b")
+
+
+@pytest.mark.parametrize(
+    ("value", "method", "limits", "sentence"),
+    [
+        ("1", "number", (0.0,), "'x' must be a number (got '1')"),
+        (True, "number", (0.0,), "'x' must be a number (got True)"),
+        (0, "positive", (1.0,), "'x' must be > 0 (got 0.0)"),
+        (float("nan"), "positive", (1.0,), "'x' must be > 0 (got nan)"),
+        (1.0, "whole", (0, 0, 9), "'x' must be from 0 to 9 (got 1.0)"),
+        (10, "whole", (0, 0, 9), "'x' must be from 0 to 9 (got 10)"),
+        (1, "truth", (True,), "'x' must be true or false (got 1)"),
+        (1, "text", ("",), "'x' must be text (got 1)"),
+        ("c", "choice", ("a", "b"), "'x' must be 'a' or 'b' (got 'c')"),
+    ],
+)
+def test_anything_else_is_refused(value: Any, method: str, limits: tuple[Any, ...], sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
+        getattr(given(x=value), method)("x", *limits)
+    assert str(caught.value) == f"shape 'splats': {sentence}"

@@ -1,0 +1,83 @@
+"""Rectangular lamps by table against Mitsuba's own plugins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsplat.renderer.layers import ensure_variant
+
+ensure_variant()
+from mitsplat.renderer.light.emitter_sampling import Emitters, receiver  # noqa: E402
+from mitsplat.renderer.light.highlight import Lobe  # noqa: E402
+from mitsplat.renderer.light.rectangle_lights import Rectangles  # noqa: E402
+
+
+def lamp(place: tuple[float, float, float], scale: tuple[float, float, float], **more: Any) -> dict[str, Any]:
+    pose = mi.ScalarTransform4f().look_at(origin=list(place), target=[0, 0, 0], up=[0, 1, 0.2])
+    light = {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 2.0, 3.0]}}
+    return {"type": "rectangle", "to_world": pose @ mi.ScalarTransform4f().scale(list(scale)), "emitter": light, **more}
+
+
+LAMPS = {
+    "plain": lamp((0.3, 0.2, 1.0), (0.2, 0.3, 1.0)),
+    "mirrored": lamp((-0.5, 0.4, 0.7), (-0.1, 0.05, 1.0)),
+    "flipped": lamp((0.1, -0.4, 0.9), (0.3, 0.1, 1.0), flip_normals=True),
+    "sky": {"type": "constant"},
+}
+
+
+def test_directions_and_light_are_those_of_mitsuba() -> None:
+    scene = mi.load_dict({"type": "scene", **LAMPS})
+    emitters, pointers = scene.emitters(), scene.emitters_dr()
+    sky = next(i for i, emitter in enumerate(emitters) if emitter.class_name() == "ConstantBackgroundEmitter")
+    table = Rectangles.of(emitters, sky)
+    assert table is not None
+    rng = np.random.default_rng(1)
+    count = 3000
+    index = mi.UInt32(rng.choice([i for i in range(4) if i != sky], count).astype(np.uint32))
+    point = mi.Point2f(rng.random((2, count)).astype(np.float32))
+    si = receiver(mi.Point3f(rng.uniform(-2, 2, (3, count)).astype(np.float32)), mi.Vector3f(0, 0, 1))
+    direction, distance, light = table.towards(si.p, index, point)
+    sample, radiance = dr.gather(mi.EmitterPtr, pointers, index).sample_direction(si, point, True)
+    np.testing.assert_allclose(np.array(direction), np.array(sample.d), atol=1e-5)
+    np.testing.assert_allclose(np.array(distance), np.array(sample.dist), rtol=1e-5)
+    np.testing.assert_allclose(np.array(light), np.array(radiance), rtol=1e-3, atol=1e-5)
+    assert 0.2 < np.mean(np.array(light)[0] > 0) < 0.8
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"type": "point", "position": [0, 0, 1]},
+        {"type": "disk", "emitter": {"type": "area"}},
+        {
+            "type": "rectangle",
+            "emitter": {"type": "area", "radiance": {"type": "checkerboard"}},
+        },
+    ],
+    ids=["point", "disk", "textured"],
+)
+def test_other_lamps_are_left_to_mitsuba(other: dict[str, Any]) -> None:
+    scene = mi.load_dict({"type": "scene", "lamp": LAMPS["plain"], "other": other})
+    assert Rectangles.of(scene.emitters(), None) is None
+
+
+def test_light_without_a_lobe_is_the_same_and_mirrors_nothing() -> None:
+    scene = mi.load_dict({"type": "scene", **LAMPS})
+    emitters = Emitters(scene, (0.0, 0.0, 0.0))
+    count = 100
+    rng = np.random.default_rng(2)
+    place = mi.Point3f(rng.uniform(-0.3, 0.3, (3, count)).astype(np.float32))
+    normal = mi.Vector3f(*[v + dr.zeros(mi.Float, count) for v in (0, 0, 1)])
+    lobe = Lobe(normal, normal, dr.full(mi.Float, 0.2, count), dr.full(mi.Float, 0.5, count))
+    si, active = receiver(place, normal), dr.full(mi.Bool, True, count)
+    matt, nothing = emitters.open_light(si, None, active)
+    light, mirrored = emitters.open_light(si, lobe, active)
+    np.testing.assert_array_equal(np.array(matt), np.array(light))
+    assert not np.array(nothing).any()
+    assert np.array(mirrored).min() > 0

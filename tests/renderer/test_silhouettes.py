@@ -1,0 +1,161 @@
+"""Silhouettes: each equals what the integrator shows of the instance with nothing else in the scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+import mitsplat as ms
+from mitsplat.errors import MissingResourceError
+from mitsplat.quality import Quality
+from mitsplat.renderer.layers import (
+    ensure_variant,
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_silhouettes,
+)
+
+WIDTH, HEIGHT = 96, 64
+
+
+def ball(seed: int, radius: float = 0.05, count: int = 300) -> tuple[ms.Splats, trimesh.Trimesh]:
+    """Gaussians of mixed opacity on a sphere, and the sphere."""
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    splats = ms.Splats(
+        means=(radius * normal).astype(np.float32),
+        quats=(rng.normal(size=(count, 4))).astype(np.float32),
+        scales=rng.uniform(0.05, 0.2, (count, 3)).astype(np.float32) * np.float32(radius),
+        opacities=rng.uniform(0.05, 0.99, count).astype(np.float32),
+        sh=np.zeros((count, 1, 3), dtype=np.float32),
+    )
+    return replace(splats, quats=splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)), (
+        trimesh.creation.icosphere(radius=radius)
+    )
+
+
+def placed() -> dict[str, Any]:
+    """Overlapping balls: one behind the other, one cut by the border, one outside, one far outside, one not there."""
+    positions = {1: (0, 0, 0), 2: (0.03, 0.05, 0.02), 7: (-0.17, 0, 0.1), 9: (0, 0.02, -0.27), 300: (3, 0, 0)}
+    shapes: dict[str, Any] = {}
+    for number, position in positions.items():
+        splats, mesh = ball(number)
+        pose = trimesh.transformations.rotation_matrix(number, (1, 2, 3))
+        pose[:3, 3] = position
+        shapes[f"instance_{number}"] = make_splats_shape(splats, pose, mesh, instance=number)
+    return shapes
+
+
+def camera(distortion: tuple[float, ...] = ()) -> ms.Camera:
+    return ms.Camera.look_at((0, -0.5, 0), (0, 0, 0), width=WIDTH, height=HEIGHT, fov_x=40, distortion=distortion)
+
+
+@pytest.mark.parametrize("source", ["splats", "proxies"])
+@pytest.mark.parametrize(
+    ("quality", "distortion"),
+    [
+        (Quality(), ()),
+        (Quality(samples=2), ()),
+        (Quality(tolerance=0.0, alpha_min=1e-5), ()),
+        (Quality(), (0.08, -0.02, 1e-3, -2e-3)),
+    ],
+    ids=["balanced", "samples", "exact", "distorted"],
+)
+def test_silhouettes_are_the_instances_rendered_alone(
+    source: str, quality: Quality, distortion: tuple[float, ...]
+) -> None:
+    ensure_variant()
+    shapes = placed()
+    integrator = make_integrator(quality=quality, shadow="none")
+    view = camera(distortion)
+    found = render_silhouettes(integrator, mi.load_dict({"type": "scene", **shapes}), view, source=source)
+    assert {1, 2, 7} <= set(found) <= {1, 2, 7, 9}
+    large = replace(view, width=3 * WIDTH, height=3 * HEIGHT, cx=view.cx + WIDTH, cy=view.cy + HEIGHT)
+    for number in (1, 2, 7, 9):
+        alone = mi.load_dict({"type": "scene", "one": shapes[f"instance_{number}"]})
+        layers = render_layers(make_integrator(quality=quality, shadow="none"), alone, large)
+        expected = (layers.instance if source == "splats" else layers.proxy_instance) == number
+        if number in found:
+            moved = replace_origin(found[number], WIDTH, HEIGHT)
+            shown = moved.whole(3 * WIDTH, 3 * HEIGHT)
+        else:
+            shown = np.zeros_like(expected)
+        if distortion:  # the canvas may be smaller than the one that is compared with
+            edge = [
+                slice(HEIGHT - HEIGHT // 8, 2 * HEIGHT + HEIGHT // 8),
+                slice(WIDTH - WIDTH // 8, 2 * WIDTH + WIDTH // 8),
+            ]
+            shown, expected = shown[tuple(edge)], expected[tuple(edge)]
+        np.testing.assert_array_equal(shown, expected)
+    if not distortion:
+        assert found[9].inside(WIDTH, HEIGHT) is None
+        assert found[7].box[0] < 0 < found[7].box[2]
+
+
+def replace_origin(silhouette: Any, x: int, y: int) -> Any:
+    x0, y0, x1, y1 = silhouette.box
+    return replace(silhouette, box=(x0 + x, y0 + y, x1 + x, y1 + y))
+
+
+def test_what_is_seen_is_covered_alone() -> None:
+    ensure_variant()
+    scene = mi.load_dict({"type": "scene", **placed()})
+    integrator = make_integrator(shadow="none")
+    layers = render_layers(integrator, scene, camera())
+    found = render_silhouettes(integrator, scene, camera())
+    for number in (1, 2, 7):
+        seen = layers.instance == number
+        assert seen.any()
+        assert np.count_nonzero(seen & ~found[number].whole(WIDTH, HEIGHT)) <= 2  # three instances mix there
+    assert 0 < np.count_nonzero(layers.instance == 2) < 0.9 * found[2].area  # hidden in part
+
+
+def test_a_scene_without_instances_has_no_silhouettes() -> None:
+    ensure_variant()
+    scene = mi.load_dict({"type": "scene", "environment": make_splats_shape(ball(1)[0])})
+    integrator = make_integrator(shadow="none")
+    assert render_silhouettes(integrator, scene, camera()) == {}
+    assert render_silhouettes(integrator, scene, camera(), source="proxies") == {}
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_crowded_silhouettes_are_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+    from mitsplat.renderer.splatting import pairs
+
+    ensure_variant()
+    scene = mi.load_dict({"type": "scene", **placed()})
+    integrator = make_integrator(quality=Quality(samples=samples), shadow="none")
+    whole = render_silhouettes(integrator, scene, camera())
+    monkeypatch.setattr(pairs, "PAIRS_MAX", 3000)
+    parts = render_silhouettes(integrator, scene, camera())
+    assert set(parts) == set(whole)
+    for number, silhouette in whole.items():
+        assert parts[number].box == silhouette.box
+        np.testing.assert_array_equal(parts[number].mask, silhouette.mask)
+    monkeypatch.setattr(pairs, "PAIRS_MAX", 10)
+    with pytest.raises(MissingResourceError, match="cover too much of the image"):
+        render_silhouettes(integrator, scene, camera())
+
+
+def test_many_instances_have_their_silhouettes_where_they_are() -> None:
+    """More instances than a word has bits, with ids that are far apart."""
+    ensure_variant()
+    splats, _ = ball(1, radius=0.01, count=40)
+    shapes = {}
+    for number in range(70):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.04 * (number % 10 - 4.5), 0, 0.04 * (number // 10 - 3)
+        shapes[f"instance_{number}"] = make_splats_shape(splats, pose, instance=900 * number + 1)
+    found = render_silhouettes(make_integrator(shadow="none"), mi.load_dict({"type": "scene", **shapes}), camera())
+    assert set(found) == {900 * number + 1 for number in range(70)}
+    for number in range(70):
+        pixel, _ = camera().project([(0.04 * (number % 10 - 4.5), 0, 0.04 * (number // 10 - 3))])
+        x0, y0, x1, y1 = found[900 * number + 1].box
+        assert np.abs(pixel[0] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() < 1.5

@@ -1,0 +1,60 @@
+"""Irradiance of environment maps by normal, against a quadrature of the same map."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsplat.renderer.layers import ensure_variant
+from mitsplat.renderer.light.emitter_sampling import sky_irradiance
+from mitsplat.renderer.light.sky_irradiance import _folded, _unfolded
+
+
+def sky_with_a_sun() -> dict[str, object]:
+    """Clouds, and a sun of four degrees that sends as much light as they do."""
+    rng = np.random.default_rng(3)
+    sky = rng.uniform(0.2, 0.8, (96, 192, 3)).astype(np.float32)
+    sky[30:32, 50:52] = (900, 800, 600)
+    turn = mi.ScalarTransform4f().rotate([0.36, 0.48, 0.8], 70)
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": turn}
+
+
+def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
+    """Irradiance (N, 3) on unit normals (N, 3), by the midpoint rule over the sphere."""
+    rows, columns = 384, 768
+    theta = (np.arange(rows) + 0.5) / rows * np.pi
+    phi = (np.arange(columns) + 0.5) / columns * 2 * np.pi
+    theta, phi = (grid.ravel() for grid in np.meshgrid(theta, phi, indexing="ij"))
+    directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = mi.Vector3f(-directions.T.astype(np.float32))
+    radiance = np.array(emitter.eval(si)).T  # type: ignore[attr-defined]
+    weight = np.sin(theta) * (np.pi / rows) * (2 * np.pi / columns)
+    return np.maximum(normals @ directions.T, 0) @ (radiance * weight[:, None])
+
+
+def test_table_agrees_with_a_quadrature() -> None:
+    """Within 1 % of the sky's largest where the sun sets, and 0.25 % in the mean of all normals."""
+    ensure_variant()
+    scene = mi.load_dict({"type": "scene", "sky": sky_with_a_sun()})
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(400, 3))
+    normals = np.concatenate([normals / np.linalg.norm(normals, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    expected = by_quadrature(scene.emitters()[0], normals)
+    table = sky_irradiance(scene.emitters_dr())
+    found = np.array(table.at(mi.Vector3f(normals.T.astype(np.float32)), True)).T
+    error = np.abs(found - expected) / expected.max()
+    assert error.max() < 0.01
+    assert error.mean() < 0.0025
+
+
+def test_octahedral_map_is_one_to_one() -> None:
+    """Directions come back, those on the fold and on the axes too."""
+    ensure_variant()
+    rng = np.random.default_rng(1)
+    vectors = np.concatenate([rng.normal(size=(1000, 3)), np.eye(3), -np.eye(3), [[1, 1, 0], [-1, 0, -1], [0, -1, -1]]])
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    x, y = _folded(mi.Vector3f(vectors.T.astype(np.float32)))
+    assert np.all((np.array([x, y]) >= 0) & (np.array([x, y]) <= 1))
+    np.testing.assert_allclose(np.array(_unfolded(x, y)).T, vectors, atol=2e-6)

@@ -1,0 +1,104 @@
+"""Patterns of materials: they repeat without a seam, in their colours, and lie on surfaces in their size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.renderer.textures import (
+    SIZE,
+    bitmap_texture,
+    box_projection,
+    finished_mesh,
+    material,
+    repeat_width,
+    texture_image,
+    with_gain,
+)
+from mitsplat.scene.planning.layout_surroundings import Finish
+from mitsplat.scene.spec.shape_spec import Box, Shape
+from mitsplat.scene.walls import stated_pose
+
+COLOURS = ((0.8, 0.6, 0.4), (0.4, 0.3, 0.2))
+
+
+def finish(kind: str, **values: object) -> Finish:
+    made = {"kind": kind, "colours": COLOURS, "scale": 0.05, "seed": 3, **values}
+    return Finish(**made)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["noise", "wood", "brushed_metal", "checker", "stripes"])
+def test_patterns_stay_between_their_colours_and_have_no_seam(kind: str) -> None:
+    image = texture_image(finish(kind), {})
+    assert image is not None and image.shape == (SIZE, SIZE, 3)
+    assert image.min(axis=(0, 1)).tolist() >= [102, 76, 51] and image.max(axis=(0, 1)).tolist() <= [204, 153, 102]
+    assert image[..., 0].std() > 8
+    assert not np.array_equal(image, texture_image(finish(kind, seed=4), {})) or kind in ("checker", "stripes")
+    values = image[..., 0].astype(float)
+    for axis in (0, 1):
+        steps = np.abs(np.diff(values, axis=axis)).mean(axis=1 - axis)
+        seam = np.abs(values.take(0, axis) - values.take(-1, axis)).mean()
+        assert seam <= steps.max() + 1
+
+
+def test_a_pattern_lies_on_every_face_in_its_size() -> None:
+    """Lengths on a face are lengths in its image: the projection is along the faces of a turned box."""
+    shape = Shape(name="a", box=Box(size=(0.4, 0.3, 0.2), rotate=(20, 30, 40)), visible=True)
+    assert shape.box is not None
+    pose = stated_pose(shape.box)
+    mesh = trimesh.creation.box(extents=shape.box.size, transform=pose)
+    wood = finish("wood", rotate=25.0, offset=(0.3, 0.1))
+    uv = box_projection(mesh, pose[:3, :3], wood, 1.0).reshape(-1, 3, 2)
+    for corners, at in zip(np.asarray(mesh.triangles), uv, strict=True):
+        lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+        np.testing.assert_allclose(np.linalg.norm(at - np.roll(at, 1, axis=0), axis=1) * repeat_width(wood), lengths)
+        # Rows of an image go down: from outside, corners that run counterclockwise do the reverse in (u, v).
+        (a, b), (c, d) = at[1] - at[0], at[2] - at[0]
+        assert a * d - b * c < 0
+
+
+def test_gain_is_of_linear_colours() -> None:
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
+    expected = np.rint(255 * encode_srgb(np.minimum(0.5 * decode_srgb(image / 255), 1)))
+    np.testing.assert_array_equal(with_gain(image, 0.5), expected)
+    assert with_gain(image, 1e6)[0, 1].tolist() == [255, 255, 255]
+
+
+@pytest.mark.parametrize("distance", [0.5, 4.0])
+def test_a_pixel_shows_the_mean_of_what_it_covers(tmp_path: Path, distance: float) -> None:
+    """Held against the mean of many rays through each pixel, near and far from a picture of fine squares."""
+    ensure_variant()
+    cells = np.indices((64, 64)).sum(axis=0) % 2
+    cv2.imwrite(str(tmp_path / "a.png"), (np.stack([cells] * 3, axis=2) * 200 + 20).astype(np.uint8))
+    tiles = Finish(kind="image", scale=0.64, rotate=20.0, image="a", gain=1.0)
+    image = texture_image(tiles, {"a": tmp_path / "a.png"})
+    assert image is not None
+    shape = Shape(name="a", box=Box(size=(20, 20, 1), position=(0, 0, -0.5)), visible=True)
+    assert shape.box is not None
+    mesh = trimesh.creation.box(
+        extents=shape.box.size, transform=trimesh.transformations.translation_matrix((0, 0, -0.5))
+    )
+    made = finished_mesh(mesh, shape, tiles, image, mi.load_dict(material(tiles, bitmap_texture(image))))
+    pose = look_at_pose((0.0, -0.3 * distance, distance), (0, 0, 0))
+
+    def seen(times: int) -> np.ndarray:
+        size, f = 24 * times, 160.0 * times
+        camera = Camera(width=size, height=size, fx=f, fy=f, cx=size / 2, cy=size / 2, world_from_camera=pose)
+        view = view_of(make_sensor(camera))
+        meshes = VisibleMeshes.build([made])
+        assert meshes is not None and meshes.patterned
+        red = np.array(meshes.trace(view, view.rays()).reflectance.x).reshape(24, times, 24, times)
+        return np.asarray(red.mean(axis=(1, 3)))
+
+    error = np.sqrt(np.mean((seen(1) - seen(16)) ** 2))
+    assert error < 0.03

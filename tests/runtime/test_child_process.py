@@ -1,0 +1,127 @@
+"""Python child processes: no module of the current folder, bounded memory and time, and their errors."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.runtime.child_process import (
+    REFUSED,
+    SAFE_PATH,
+    leave_current_folder,
+    limit_memory,
+    python_command,
+    python_environment,
+    run_bounded,
+    starting_safely,
+)
+
+GIB = 1 << 30
+
+
+def echo(output, data, *arguments):
+    os.write(1, b"a library's own words")
+    output.write(data[::-1] + "/".join(arguments).encode())
+
+
+def refuse(output, data):
+    output.write(b"so far")
+    output.flush()
+    raise InputError("first line\nit holds nothing")
+
+
+def fill(output, data, amount):
+    output.write(b"%d" % len(bytearray(int(amount))))
+
+
+def fill_twice(output, data, small, large):
+    limit_memory(int(small) * 2)
+    bytearray(int(small))
+    output.write(b"small ")
+    output.flush()
+    bytearray(int(large))
+    output.write(b"large")
+
+
+def die(output, data):
+    os.abort()
+
+
+def sleep(output, data):
+    time.sleep(60)
+
+
+def show_settings(output, data):
+    import resource
+
+    values = sys.flags.safe_path, os.environ[SAFE_PATH], resource.getrlimit(resource.RLIMIT_CORE)
+    output.write(repr(values).encode())
+
+
+class TestBounded:
+    @pytest.fixture(autouse=True)
+    def importable(self, monkeypatch):
+        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+
+    def test_output_is_what_the_function_writes(self):
+        ended = run_bounded(echo, "a", Path("/b c"), data=b"123", imports=["numpy"], memory=GIB, seconds=30)
+        assert ended == (0, b"321a//b c", "")
+
+    def test_a_refusal_gives_the_last_line_of_its_sentence(self):
+        assert run_bounded(refuse, memory=GIB, seconds=30) == (REFUSED, b"so far", "it holds nothing")
+
+    def test_memory_is_bounded_on_top_of_what_is_held(self):
+        assert run_bounded(fill, str(GIB // 2), imports=["numpy"], memory=GIB, seconds=30).output == b"%d" % (GIB // 2)
+        assert run_bounded(fill, str(GIB), imports=["numpy"], memory=GIB, seconds=30) == (1, b"", "MemoryError")
+
+    def test_a_part_may_have_a_lower_bound(self):
+        ended = run_bounded(fill_twice, str(GIB // 8), str(GIB // 2), memory=GIB, seconds=30)
+        assert ended == (1, b"small ", "MemoryError")
+
+    def test_a_signal_is_told_by_its_number(self):
+        assert run_bounded(die, memory=GIB, seconds=30) == (-6, b"", "stopped with status -6")
+
+    def test_time_is_bounded(self):
+        begun = time.monotonic()
+        assert run_bounded(sleep, memory=GIB, seconds=1) == (None, b"", "did not end within 1 s")
+        assert time.monotonic() - begun < 10
+
+    def test_it_is_safe_and_dumps_no_core(self):
+        assert run_bounded(show_settings, memory=GIB, seconds=30).output == b"(True, '1', (0, 0))"
+
+
+class TestSafePath:
+    def test_every_command_is_safe(self):
+        assert python_command("-m", Path("a")) == [sys.executable, "-P", "-m", "a"]
+        assert python_environment({"A": "b"}) == {**os.environ, "A": "b", SAFE_PATH: "1"}
+
+    @pytest.mark.parametrize("before", [None, "", "1"])
+    def test_the_environment_and_the_path_are_as_before(self, monkeypatch, before):
+        monkeypatch.delenv(SAFE_PATH, raising=False)
+        if before is not None:
+            monkeypatch.setenv(SAFE_PATH, before)
+        monkeypatch.setattr(sys, "path", ["", "/somewhere"])
+        with pytest.raises(OSError, match="x"), starting_safely():
+            assert (os.environ[SAFE_PATH], sys.path) == ("1", ["/somewhere"])
+            raise OSError("x")
+        assert (os.environ.get(SAFE_PATH), sys.path) == (before, ["", "/somewhere"])
+
+    @pytest.mark.skipif(sys.flags.safe_path, reason="Python was started in safe-path mode")
+    @pytest.mark.parametrize(("first", "kept"), [("", False), ("{cwd}", False), ("/usr/bin", True)])
+    def test_the_current_folder_is_left(self, monkeypatch, tmp_path, first, kept):
+        monkeypatch.setenv(SAFE_PATH, "0")
+        monkeypatch.chdir(tmp_path)
+        first = first.format(cwd=tmp_path)
+        monkeypatch.setattr(sys, "path", [first, "/somewhere"])
+        leave_current_folder()
+        assert (os.environ[SAFE_PATH], sys.path) == ("1", [first, "/somewhere"] if kept else ["/somewhere"])
+
+    def test_the_folder_that_mitsplat_is_in_stays(self, monkeypatch):
+        monkeypatch.setenv(SAFE_PATH, "0")
+        monkeypatch.chdir(Path(__file__).parents[2])
+        monkeypatch.setattr(sys, "path", ["", "/somewhere"])
+        leave_current_folder()
+        assert sys.path == ["", "/somewhere"]

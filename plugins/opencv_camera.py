@@ -11,7 +11,7 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 
 
 class OpenCVCamera(mi.Sensor):
@@ -84,13 +84,15 @@ class OpenCVCamera(mi.Sensor):
         except ValueError as error:
             raise InputError(f"sensor 'opencv_camera': {error}") from None
 
-    def view(self, samples: int = 1) -> View:
+    def view(self, samples: int = 1) -> CameraView:
         """What the splat renderer needs of this camera."""
         width, height = (int(n) for n in self.film().size())
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         pose = self.world_from_mitsuba @ flip
         intrinsics = self.fx, self.fy, self.cx, self.cy
-        return View(width, height, *intrinsics, pose, self.distortion, self.near, samples, self.lens, *self.thin_lens)
+        return CameraView(
+            width, height, *intrinsics, pose, self.distortion, self.near, samples, self.lens, *self.thin_lens
+        )
 
     def sample_ray(  # noqa: D102 - Mitsuba's interface
         self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True

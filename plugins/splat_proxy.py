@@ -26,14 +26,14 @@ from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
 from mitsplat.renderer.meshes.visible_meshes import Behind, PathTracer, SeenLights, VisibleMeshes, is_clear
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.occluders.splat_occlusion import Caster
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.splatting.antialiasing import Edges
 from mitsplat.renderer.splatting.gaussian import Cloud, upload_cloud
 from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, merge_clouds
-from mitsplat.renderer.splatting.static_tile_cache import StillLayer
+from mitsplat.renderer.splatting.static_tile_cache import StaticTileCache
 from mitsplat.runtime.dropped_rays import refuse_lost_rays
 
 AOVS = (
@@ -210,7 +210,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
         self._grid: tuple[Any, RadianceGrid | None] | None = None
-        self._still: tuple[tuple[Any, Quality, list[Any]], StillLayer | None] | None = None
+        self._still: tuple[tuple[Any, Quality, list[Any]], StaticTileCache | None] | None = None
 
     def aov_names(self) -> list[str]:
         """Names of the channels after R, G, B and A."""
@@ -268,7 +268,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return layers
 
     def _layers(
-        self, contents: _Contents, scene: Any, view: View, accuracy: Accuracy, paths: int, seed: int
+        self, contents: _Contents, scene: Any, view: CameraView, accuracy: Accuracy, paths: int, seed: int
     ) -> dict[str, Any]:
         """The layers that one point of the lens sees."""
         rays = view.rays()
@@ -329,7 +329,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return layers
 
     def _smooth_edges(
-        self, contents: _Contents, scene: Any, view: View, layers: dict[str, Any], key: Any, radiance: Any, white: Any
+        self,
+        contents: _Contents,
+        scene: Any,
+        view: CameraView,
+        layers: dict[str, Any],
+        key: Any,
+        radiance: Any,
+        white: Any,
     ) -> dict[str, Any]:
         """Colours and opacity of ``layers``, averaged over several rays where pixels that differ in ``key`` meet."""
         edges = Edges.find(key, view)
@@ -356,7 +363,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return smooth
 
     def _behind(
-        self, contents: _Contents, scene: Any, view: View, rays: Any, at: tuple[Any, Any] | None = None
+        self, contents: _Contents, scene: Any, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None
     ) -> tuple[Behind | None, SeenLights | None, Any | None]:
         """Visible meshes and emitters that rays meet, and the depths [m] of the nearest of them.
 
@@ -373,7 +380,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self,
         contents: _Contents,
         scene: Any,
-        view: View,
+        view: CameraView,
         rays: Any,
         behind: Behind | None,
         shown: Shown,
@@ -428,14 +435,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
         )
 
-    def _by_shape(self, contents: _Contents, view: View, z_max: Any | None) -> Any | None:
+    def _by_shape(self, contents: _Contents, view: CameraView, z_max: Any | None) -> Any | None:
         """Which of an instance's shapes a pixel shows, where these are not lit alike; see :class:`Traits`."""
         if contents.traits.placements is None or contents.clouds is None:
             return None
         fine = view.sampled(self.quality.grid)
         return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
 
-    def _trace_splats(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> Image:
+    def _trace_splats(self, contents: _Contents, scene: Any, view: CameraView, z_max: Any | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
         fine = view.sampled(self.quality.grid)
@@ -446,7 +453,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 return still.with_objects(contents.clouds, objects, fine, self.quality, z_max)
         return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
 
-    def _still_layer(self, contents: _Contents, scene: Any, view: View, z_max: Any | None) -> StillLayer | None:
+    def _still_layer(
+        self, contents: _Contents, scene: Any, view: CameraView, z_max: Any | None
+    ) -> StaticTileCache | None:
         """What is static as seen from here, from the second time that the camera is in the same place."""
         static = [p for p in contents.placements if p.instance == 0]
         if contents.clouds is None or len(static) == len(contents.placements):
@@ -461,7 +470,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             self._still = seen, None
         elif self._still[1] is None:
             with suppress(CrowdedError):
-                self._still = seen, StillLayer.of(contents.clouds, static, view, self.quality, z_max)
+                self._still = seen, StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
         return self._still[1]
 
     def _read(self, scene: Any) -> _Contents:

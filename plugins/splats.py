@@ -13,7 +13,7 @@ from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.renderer.splatting.splat_appearance import Appearance
+from mitsplat.renderer.splatting.splat_appearance import SplatAppearance
 
 
 class SplatsShape(mi.Mesh):
@@ -140,7 +140,7 @@ class SplatsShape(mi.Mesh):
 
         self.appearance = self._read_appearance(given)
 
-    def _read_appearance(self, given: Parameters) -> Appearance | None:
+    def _read_appearance(self, given: Parameters) -> SplatAppearance | None:
         """What its colours are changed by, if the scene says anything of that."""
         text, wear = given.text("colours", ""), given.number("wear", 0.0)
         seed = given.whole("wear_seed", 0, 0, 2**23 - 1)
@@ -156,7 +156,7 @@ class SplatsShape(mi.Mesh):
             given.refuse("colours", "be nine numbers", text)
         points = self.splats.means if self.proxy is None else self.proxy.vertices
         size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-        return Appearance(tuple(matrix), wear, seed, size or 1.0)
+        return SplatAppearance(tuple(matrix), wear, seed, size or 1.0)
 
     def to_string(self) -> str:
         """Mitsuba's description of the plugin."""

@@ -27,7 +27,7 @@ import trimesh
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.geometry.mesh_distance import Surface, standoff
+from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 from mitsplat.runtime.device import use_device
 from scenes.build.parts import PARTS, build_part
 
@@ -88,7 +88,7 @@ def measure(arguments: argparse.Namespace) -> None:
             )
         seconds, passed = cpu_seconds() - start, time.monotonic() - began
         truth = result.asset.mesh if result.surface is None else result.surface
-        gap = 1e3 * standoff(Surface(truth), result.asset.pieces)
+        gap = 1e3 * standoff(DistanceSurface(truth), result.asset.pieces)
         print(
             f"{name}: {len(result.asset.splats)} Gaussians, {seconds:.1f} CPU s, {passed:.1f} s, "
             f"{result.psnr:.2f} dB (object "

@@ -34,7 +34,7 @@ from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
 from mitsplat.renderer.layers import ensure_variant
@@ -168,8 +168,8 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> 
 
 def chamfer(one: trimesh.Trimesh, truth: trimesh.Trimesh, samples: int = 20_000) -> float:
     """Mean distance between two surfaces, both ways, as a share of the diagonal of the true one."""
-    there = np.abs(Surface(truth).signed_distances(np.asarray(one.sample(samples, seed=1)))).mean()
-    back = np.abs(Surface(one).signed_distances(np.asarray(truth.sample(samples, seed=2)))).mean()
+    there = np.abs(DistanceSurface(truth).signed_distances(np.asarray(one.sample(samples, seed=1)))).mean()
+    back = np.abs(DistanceSurface(one).signed_distances(np.asarray(truth.sample(samples, seed=2)))).mean()
     return float(there + back) / 2 / float(truth.scale)
 
 

@@ -28,7 +28,7 @@ from scipy.spatial import KDTree
 from benchmarks.detector.experiment import write_scene
 from benchmarks.detector.material import wanted_assets
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import Part, part_shape, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, part_shape, read_parts
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import Frame
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -38,7 +38,7 @@ from mitsplat.renderer.rays.device_arrays import ray_scene
 from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.planning.frame_plan import layout_of
-from mitsplat.scene.planning.object_appearance import Appearance, draw_appearances
+from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.scene_spec import BACKDROP
 
@@ -62,13 +62,13 @@ def main() -> None:
     print(ms.write_frames(scene, options.work / "data" / options.scene, traced, overwrite=True))
 
 
-def textured(hope: Path) -> dict[str, tuple[Part, ...]]:
+def textured(hope: Path) -> dict[str, tuple[MeshPart, ...]]:
     """What all assets were baked of, by their names."""
     meshes = {one.name: one.mesh() for one in wanted_assets(hope)}
     return {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
 
 
-def frames(scene: Scene, parts: Mapping[str, tuple[Part, ...]], indices: range, samples: int) -> Iterator[Frame]:
+def frames(scene: Scene, parts: Mapping[str, tuple[MeshPart, ...]], indices: range, samples: int) -> Iterator[Frame]:
     """Frames of a scene with path-traced pictures, which take processor seconds ``seconds["path"]`` each."""
     with ms.Renderer(scene) as renderer:
         layout, objects = None, dict[str, Any]()
@@ -112,7 +112,7 @@ def _stands(scene: Scene, name: str) -> bool:
     return shape.visible and not shape.name.startswith(BACKDROP)
 
 
-def object_shapes(scene: Scene, layout: Layout, parts: Mapping[str, tuple[Part, ...]]) -> dict[str, Any]:
+def object_shapes(scene: Scene, layout: Layout, parts: Mapping[str, tuple[MeshPart, ...]]) -> dict[str, Any]:
     """Mitsuba's shapes of all objects of a layout, as they look there."""
     looks = draw_appearances(scene, layout)
     shapes = {}
@@ -123,15 +123,15 @@ def object_shapes(scene: Scene, layout: Layout, parts: Mapping[str, tuple[Part, 
     return shapes
 
 
-def primitive(asset: Asset) -> Part:
+def primitive(asset: Asset) -> MeshPart:
     """A solid that no file holds, in the colour of the nearest of its splats."""
     mesh = asset.mesh.subdivide_to_size(0.004)
     _, nearest = KDTree(asset.splats.means).query(mesh.vertices)
     colours = decode_srgb(np.clip(asset.splats.sh[nearest, 0] * SH_C0 + 0.5, 0, 1))
-    return Part(asset.name, mesh, colours[mesh.faces], None, None, 0.0, asset.roughness, True, asset.specular)
+    return MeshPart(asset.name, mesh, colours[mesh.faces], None, None, 0.0, asset.roughness, True, asset.specular)
 
 
-def _placed(part: Part, instance: Instance, look: Appearance | None) -> Part:
+def _placed(part: MeshPart, instance: Instance, look: ObjectAppearance | None) -> MeshPart:
     mesh = part.mesh.copy()
     mesh.apply_transform(instance.world_from_object)
     if look is None:

@@ -32,7 +32,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.assets.photographing import Sensors
 from benchmarks.light.shadows import block, nearest_object, placed, shipped, worn
 from benchmarks.record import ROOT, figure, recording
-from mitsplat.bake.mesh_parts import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.capture.lighting.panorama import unit_vector
 from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import settle_layout
@@ -139,7 +139,7 @@ def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndar
     return [(loaded.assets[one.asset].name, np.array(one.world_from_object)) for one in layout.instances]
 
 
-def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[Part, ...]:
+def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[MeshPart, ...]:
     """A bench with a wall behind it and things that are none of the parts on it; the tray, where parts are poured."""
     colours = [tuple(int(value) for value in rng.uniform(40, 225, 3)) for _ in range(12)]
     scratched = m.scratched(m.cast(colours[1], rng), rng, count=80, length=(10, 120), gain=0.3)
@@ -227,9 +227,9 @@ def develop(radiance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def labelled(
     camera: Camera,
-    room: Sequence[Part],
+    room: Sequence[MeshPart],
     lying: Sequence[tuple[str, np.ndarray]],
-    things: Sequence[Sequence[Part]],
+    things: Sequence[Sequence[MeshPart]],
     names: Sequence[str],
 ) -> list[dict[str, Any]]:
     """COCO annotations of the parts of which enough is seen, by what the middle of each pixel shows."""

@@ -44,7 +44,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import Part, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, encode_srgb
@@ -250,7 +250,7 @@ class Photographer:
         folder.mkdir(parents=True, exist_ok=True)
 
     def take(
-        self, name: str, parts: Sequence[Part], lights: dict[str, Any], *, bounces: int = 6, clay: bool = False
+        self, name: str, parts: Sequence[MeshPart], lights: dict[str, Any], *, bounces: int = 6, clay: bool = False
     ) -> tuple[Float64Array, Float64Array]:
         """Radiance (H, W, 3) averaged over each pixel, and coverage (H, W)."""
         file = self.folder / f"{name}_{self.samples}.npz"
@@ -274,7 +274,7 @@ class Photographer:
         return stored["radiance"].astype(np.float64), stored["cover"].astype(np.float64)
 
 
-def placed(thing: Thing) -> tuple[Part, ...]:
+def placed(thing: Thing) -> tuple[MeshPart, ...]:
     scene = thing.mesh.copy()
     scene.apply_transform(thing.pose)
     return tuple(replace(part, name=f"{thing.name} {part.name}") for part in read_parts(scene))
@@ -317,7 +317,9 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
 
 
-def nearest_object(camera: Camera, room: Sequence[Part], things: Sequence[Sequence[Part]]) -> npt.NDArray[np.uint32]:
+def nearest_object(
+    camera: Camera, room: Sequence[MeshPart], things: Sequence[Sequence[MeshPart]]
+) -> npt.NDArray[np.uint32]:
     """Number of the object that the middle of each pixel shows (H, W), 0 for the surroundings."""
     occluders = [Occluder(part.mesh, 0, dynamic=False) for part in room]
     occluders += [Occluder(part.mesh, i, dynamic=True) for i, parts in enumerate(things, 1) for part in parts]

@@ -7,6 +7,6 @@ path tracer saw, with a proxy mesh, convex pieces, and a report that shows the m
 from __future__ import annotations
 
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
-from mitsplat.bake.surface_materials import Finish
+from mitsplat.bake.surface_materials import SurfaceFinish
 
-__all__ = ["BakeResult", "BakeSettings", "Finish", "bake_asset"]
+__all__ = ["BakeResult", "BakeSettings", "SurfaceFinish", "bake_asset"]

@@ -23,7 +23,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.bake.mesh_parts import bake_lights, mitsuba_scene, read_parts, world_from_file
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.bake.surface_materials import Finish
+from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.bake.verification import BakedView, compare_views, compare_with_textures
 from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
@@ -146,7 +146,7 @@ def bake_asset(
     pieces: Sequence[trimesh.Trimesh] = (),
     cameras: Sequence[Camera] = (),
     fit_cameras: Sequence[Camera] = (),
-    finish: Finish | None = None,
+    finish: SurfaceFinish | None = None,
     any_size: bool = False,
     progress: Progress | None = None,
 ) -> BakeResult:

@@ -22,8 +22,8 @@ from mitsplat.bake.surface_materials import (
     MOST_SPECULAR,
     ROUGHNESS,
     UNKNOWN_COLOUR,
-    Finish,
     Material,
+    SurfaceFinish,
     check_textures,
     read_material,
 )
@@ -49,7 +49,7 @@ _DETAIL_CONTRAST = 0.12
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class MeshPart:
     """One material's share of a mesh.
 
     Attributes:
@@ -113,8 +113,8 @@ def read_parts(
     *,
     metres_per_unit: float = 1.0,
     up: Literal["y", "z"] = "z",
-    finish: Finish | None = None,
-) -> tuple[Part, ...]:
+    finish: SurfaceFinish | None = None,
+) -> tuple[MeshPart, ...]:
     """Parts of a mesh or of a file that trimesh reads, in metres, z up, with ``finish`` over their own materials.
 
     Raises:
@@ -122,7 +122,7 @@ def read_parts(
             not finite.
         MissingResourceError: If what reads such files is not installed.
     """
-    finish, linear = finish or Finish(), False
+    finish, linear = finish or SurfaceFinish(), False
     source = "mesh"
     if isinstance(mesh, str | Path):
         source, path = str(mesh), Path(mesh)
@@ -178,7 +178,9 @@ def world_from_file(metres_per_unit: float, up: Literal["y", "z"]) -> Float64Arr
     return np.asarray(matrix)
 
 
-def _read_part(name: str, source: trimesh.Trimesh, transform: Float64Array, finish: Finish, *, linear: bool) -> Part:
+def _read_part(
+    name: str, source: trimesh.Trimesh, transform: Float64Array, finish: SurfaceFinish, *, linear: bool
+) -> MeshPart:
     """A part; its vertex colours are ``linear`` or display-encoded."""
     geometry = trimesh.Trimesh(source.vertices, source.faces, process=False)
     geometry.merge_vertices(merge_tex=True, merge_norm=True)
@@ -212,14 +214,14 @@ def _read_part(name: str, source: trimesh.Trimesh, transform: Float64Array, fini
         texture = material.texture
         if not (material.factor == 1.0).all():
             texture = (255.0 * encode_srgb(decode_srgb(texture / 255.0) * material.factor)).round().astype(np.uint8)
-        return Part(name, geometry, None, texture, np.asarray(visual.uv)[faces], *gloss, tuple(warnings))
+        return MeshPart(name, geometry, None, texture, np.asarray(visual.uv)[faces], *gloss, tuple(warnings))
     colours = np.ones((*faces.shape, 3))
     if per_corner is not None:
         colours = per_corner[..., :3] / 255.0 if linear else decode_srgb(per_corner[..., :3] / 255.0)
-    return Part(name, geometry, colours * material.factor, None, None, *gloss, tuple(warnings))
+    return MeshPart(name, geometry, colours * material.factor, None, None, *gloss, tuple(warnings))
 
 
-def _finished(material: Material, finish: Finish) -> Material:
+def _finished(material: Material, finish: SurfaceFinish) -> Material:
     """``material`` with what ``finish`` gives."""
     colour = finish.linear_colour()
     if colour is not None:
@@ -239,7 +241,7 @@ def _finished(material: Material, finish: Finish) -> Material:
     )
 
 
-def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
+def mitsuba_scene(parts: Sequence[MeshPart], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
     """Mitsuba scene of ``parts`` under emitters ``lights``.
 
     Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
@@ -249,12 +251,12 @@ def mitsuba_scene(parts: Sequence[Part], lights: dict[str, Any], *, clay: bool =
     return ray_scene({**shapes, **lights})
 
 
-def part_shape(part: Part) -> mi.Mesh:
+def part_shape(part: MeshPart) -> mi.Mesh:
     """Mitsuba's shape of a part in its own material."""
     return _mitsuba_mesh(part, _bsdf(part))
 
 
-def _bsdf(part: Part) -> dict[str, Any]:
+def _bsdf(part: MeshPart) -> dict[str, Any]:
     if part.texture is not None:
         colour: dict[str, Any] = {"type": "bitmap", "bitmap": mi.Bitmap(part.texture), "raw": False}
     else:
@@ -270,7 +272,7 @@ def _bsdf(part: Part) -> dict[str, Any]:
     }
 
 
-def _mitsuba_mesh(part: Part, bsdf: dict[str, Any]) -> mi.Mesh:
+def _mitsuba_mesh(part: MeshPart, bsdf: dict[str, Any]) -> mi.Mesh:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     count = len(part.mesh.faces)

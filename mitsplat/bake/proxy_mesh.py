@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 import trimesh
 
-from mitsplat.bake.mesh_parts import Part
+from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.geometry.mesh import simplify_solid
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
@@ -19,7 +19,7 @@ _TOLERANCES = 1e-5 * 1.5 ** np.arange(18)
 """Of simplification, relative to the size, up to a hundredth; tried in turn until the faces are few enough."""
 
 
-def make_proxy(parts: Sequence[Part], most_faces: int) -> trimesh.Trimesh:
+def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     """One surface of all parts, of at most about ``most_faces`` faces; labels on solids are left out.
 
     Decimation eats open sheets from their edges, so they keep all faces, the flat ones only as many as they need.

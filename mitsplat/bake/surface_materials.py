@@ -38,7 +38,7 @@ _TRIMESH_DIFFUSE = (102, 102, 102)
 
 
 @dataclass(frozen=True)
-class Finish:
+class SurfaceFinish:
     """A material to use instead of a file's own; each value replaces that of all parts, None leaves it.
 
     A colour replaces textures and vertex colours. Roughness, metalness or specular on a matt part make it glossy.

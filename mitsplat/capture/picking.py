@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.isolation import ChosenObject, Pick, View, choose_object
+from mitsplat.capture.isolation import ChosenObject, PhotoView, Pick, choose_object
 from mitsplat.errors import InputError
 
 _CONE = np.radians(1.0)
@@ -34,7 +34,7 @@ def chosen_object(
     Raises:
         InputError: If a pick means nothing, or nothing stands out there.
     """
-    views = {photo.name: View(photo.camera, photo.seen) for photo in capture.photos}
+    views = {photo.name: PhotoView(photo.camera, photo.seen) for photo in capture.photos}
 
     def pick(spot: str) -> Pick:
         photo, pixel = capture.picked(spot)

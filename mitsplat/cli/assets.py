@@ -66,7 +66,7 @@ def bake(
     """
     from mitsplat.bake.bake import BakeSettings, bake_asset
     from mitsplat.bake.bake_report import write_bake_report
-    from mitsplat.bake.surface_materials import Finish
+    from mitsplat.bake.surface_materials import SurfaceFinish
 
     _check_folder(out, mesh, name, overwrite=overwrite)
     if not 0 < units < math.inf:
@@ -74,7 +74,7 @@ def bake(
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed must be 0 to {2**32 - 1} (got {seed})")
     settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
-    finish = Finish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
+    finish = SurfaceFinish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
     take_device(device)
     with stage_bar() as progress:
         result = bake_asset(

@@ -157,7 +157,7 @@ class _Motion(_Stored):
 
 
 class _Viewpoint(_Stored):
-    """How a camera was drawn: see :class:`mitsplat.scene.planning.viewpoints.View`, whose units these are."""
+    """How a camera was drawn: see :class:`mitsplat.scene.planning.viewpoints.Viewpoint`, whose units these are."""
 
     camera: Count = 0
     side: Literal["left", "right"] | None = None

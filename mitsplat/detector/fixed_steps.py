@@ -72,7 +72,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainingOutcome:
     """How a training went.
 
     Attributes:
@@ -92,7 +92,7 @@ class Outcome:
 
 def train_job(
     job: Job, *, network: str, weights: Path | None, size: int, mirror: bool, seed: int, device: str, workers: int
-) -> Outcome:
+) -> TrainingOutcome:
     """Train, from the run's checkpoint if it has one.
 
     Args:
@@ -271,10 +271,10 @@ class _FixedSteps:
         """Make the final weights, and judge them not."""
         finish_checkpoint(self.job.run)
 
-    def outcome(self: Any) -> Outcome:
+    def outcome(self: Any) -> TrainingOutcome:
         """How it went."""
         resumed_at = min(self.start_epoch * EPOCH, len(self.job.plan))
-        return Outcome(
+        return TrainingOutcome(
             self.job.run / "weights.pt",
             resumed_at + self.updates,
             resumed_at,

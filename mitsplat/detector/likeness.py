@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
 from mitsplat.detector.pictures import read_picture
-from mitsplat.detector.sets import STRIDE, Instance, Sample, Split, in_classes, read_set
+from mitsplat.detector.sets import STRIDE, LabelledObject, Sample, Split, in_classes, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress
@@ -261,7 +261,7 @@ def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hue
         values["noise of images", None].append((number, noise))
 
 
-def _inside(instance: Instance, sample: Sample, width: int, height: int) -> BoolArray:
+def _inside(instance: LabelledObject, sample: Sample, width: int, height: int) -> BoolArray:
     """Pixels (height, width) of an object in the scaled image."""
     factor = np.array([width / sample.width, height / sample.height])
     if instance.has_mask:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsplat.arrays import BoolArray
 from mitsplat.detector.pictures import SMALLEST, read_picture
-from mitsplat.detector.sets import Instance, LabelledSet
+from mitsplat.detector.sets import LabelledObject, LabelledSet
 from mitsplat.errors import InputError
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.polygons import outline
@@ -72,18 +72,18 @@ def _starts(side: int, tile: int) -> list[int]:
 
 
 def _within(
-    instance: Instance, mask: BoolArray | None, left: int, top: int, width: int, height: int
-) -> Instance | None:
+    instance: LabelledObject, mask: BoolArray | None, left: int, top: int, width: int, height: int
+) -> LabelledObject | None:
     """What a tile shows of an object, which has a mask or a box in the photograph; None if that is too little."""
     if mask is not None:
         seen = mask[top : top + height, left : left + width]
         if seen.sum() < max(LEAST_SEEN * mask.sum(), 1):
             return None
         box = Silhouette.cropped(seen, 0, 0).box
-        return Instance(instance.class_index, box, outline(seen), crowd=instance.crowd)
+        return LabelledObject(instance.class_index, box, outline(seen), crowd=instance.crowd)
     low, high = np.reshape(instance.box, (2, 2))
     inside = np.clip([low, high], (left, top), (left + width, top + height))
     if (inside[1] - inside[0]).prod() < LEAST_SEEN * (high - low).prod():
         return None
     (x0, y0), (x1, y1) = (inside - (left, top)).tolist()
-    return Instance(instance.class_index, (x0, y0, x1, y1), crowd=instance.crowd)
+    return LabelledObject(instance.class_index, (x0, y0, x1, y1), crowd=instance.crowd)

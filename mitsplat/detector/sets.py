@@ -47,7 +47,7 @@ _BEYOND = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Instance:
+class LabelledObject:
     """One labelled object.
 
     Attributes:
@@ -104,7 +104,7 @@ class Sample:
     name: str
     width: int
     height: int
-    instances: tuple[Instance, ...]
+    instances: tuple[LabelledObject, ...]
     digest: str
 
 
@@ -302,7 +302,7 @@ def _label_of(image: Path) -> Path:
     return Path(f"{before}/labels/{after}"[1:] if found else image).with_suffix(".txt")
 
 
-def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, int]) -> Iterator[Instance]:
+def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, int]) -> Iterator[LabelledObject]:
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -327,7 +327,7 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
         if not (x1 > x0 and y1 > y0):
             raise InputError(f"{place}: must have a width and a height (got {line[:60]!r})")
         box = float(x0), float(y0), float(x1), float(y1)
-        yield Instance(int(values[0]), box, None if len(values) == 5 else polygon)
+        yield LabelledObject(int(values[0]), box, None if len(values) == 5 else polygon)
 
 
 def _clipped(points: Float64Array, size: tuple[int, int], place: str) -> Float64Array:
@@ -440,7 +440,7 @@ def _finder(root: Path, listing: Path) -> Callable[[str], Path]:
     return find
 
 
-def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int, int], path: Path) -> Instance:
+def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int, int], path: Path) -> LabelledObject:
     place = f"{path}: annotation {annotation.get('id')}"
     width, height = size
     try:
@@ -480,7 +480,7 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
     crowd = annotation.get("iscrowd") or 0
     if crowd not in (0, 1):
         raise InputError(f"{place}: iscrowd must be 0 or 1 (got {crowd!r})")
-    return Instance(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), bool(crowd))
+    return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), bool(crowd))
 
 
 def _run_lengths(code: str) -> list[int]:

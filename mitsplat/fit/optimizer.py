@@ -16,7 +16,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import (
     Eye,
-    Rendering,
+    RenderOp,
     gather_gradients,
     pack_cloud,
     project_cloud,
@@ -180,7 +180,7 @@ class GaussianModel(Adam):
         """The Gaussians as the renderer takes them."""
         return pack_cloud(*self.activated(), self.bands)
 
-    def render(self, eye: Eye, quality: Quality, *, depth: bool = False) -> Rendering:
+    def render(self, eye: Eye, quality: Quality, *, depth: bool = False) -> RenderOp:
         """The Gaussians as a camera sees them, a :class:`DepthRendering` with depth; :meth:`learn` goes back.
 
         Args:

@@ -12,15 +12,15 @@ import numpy.typing as npt
 from mitsplat.arrays import ByteImage, Float32Array
 from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.textures import read_image
-from mitsplat.scene.planning.layout_surroundings import Backing
+from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
 
 
-def background_picture(backing: Backing, path: Path, width: int, height: int) -> Float32Array:
+def background_picture(backing: BackgroundDraw, path: Path, width: int, height: int) -> Float32Array:
     """Linear picture (H, W, 3) of what a backing shows of an image file."""
     return backing.gain * cut_out(read_image(path), backing, width, height)
 
 
-def cut_out(image: ByteImage, backing: Backing, width: int, height: int) -> Float32Array:
+def cut_out(image: ByteImage, backing: BackgroundDraw, width: int, height: int) -> Float32Array:
     """Linear colours (H, W, 3) of the part of an image that a backing says, in another size.
 
     The part is a turned rectangle of the picture's proportions, all of which is inside of the image. Where it has more

@@ -74,7 +74,7 @@ def swept_by(
     Args:
         depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
         camera: Where it is in the middle of the exposure.
-        motion: As :class:`mitsplat.scene.planning.viewpoints.View` has it.
+        motion: As :class:`mitsplat.scene.planning.viewpoints.Viewpoint` has it.
         moving: A conveyor's belt, and which pixels show what it carries (H, W); those that show its surface follow
             from their depth.
     """

@@ -40,7 +40,7 @@ from mitsplat.renderer.layers import (
     render_layers,
     render_silhouettes,
 )
-from mitsplat.renderer.lazy_value import Deferred
+from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.renderer.rays.device_arrays import plain_mesh
 from mitsplat.renderer.scene_emitters import emitter_dict, movable
 from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
@@ -49,8 +49,14 @@ from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.planning.conveyor import Belt, carried, carried_by, carried_instances
 from mitsplat.scene.planning.frame_lights import written_out
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
-from mitsplat.scene.planning.layout_surroundings import Backing, Finish, Place, draw_place, environment_at
-from mitsplat.scene.planning.object_appearance import Appearance, draw_appearances
+from mitsplat.scene.planning.layout_surroundings import (
+    BackgroundDraw,
+    LayoutSurroundings,
+    MaterialDraw,
+    draw_place,
+    environment_at,
+)
+from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.scene.walls import backdrop_distance
@@ -61,12 +67,12 @@ KEPT_LAYOUTS = 4
 NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
 """Splats of a proxy that only receives and casts shadows."""
 
-NOWHERE = Place()
+NOWHERE = LayoutSurroundings()
 """The place of a scene that draws none."""
 
 
 @dataclass(frozen=True, eq=False)
-class Frame(Deferred):
+class Frame(LazyValue):
     """A labelled picture of H x W pixels with everything that it was made from. In a notebook it shows itself.
 
     Layers and linear picture stay on the device, and come to the host when they are first looked at.
@@ -93,7 +99,7 @@ class Frame(Deferred):
     labels: Labels
     seconds: Mapping[str, float]
     order_error: Mapping[str, float] | None = None
-    appearances: Mapping[int, Appearance] = field(default_factory=dict)
+    appearances: Mapping[int, ObjectAppearance] = field(default_factory=dict)
     next_layout: Layout | None = None
 
     @property
@@ -273,9 +279,9 @@ class Renderer:
         self.quality = quality
         self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
-        self._static: tuple[Place, dict[str, Any]] | None = None
-        self._pattern: tuple[int, Finish, ByteImage, Any] | None = None  # of a belt
-        self._behind: tuple[Backing, Any] | None = None
+        self._static: tuple[LayoutSurroundings, dict[str, Any]] | None = None
+        self._pattern: tuple[int, MaterialDraw, ByteImage, Any] | None = None  # of a belt
+        self._behind: tuple[BackgroundDraw, Any] | None = None
         self._placed: tuple[Layout, dict[str, Any]] | None = None
         self._settled: dict[int, Layout] = {}
         self._sky: tuple[str, Any] | None = None
@@ -478,7 +484,7 @@ class Renderer:
         state.update()
         return self._sky[1]
 
-    def _background(self, backing: Backing | None, camera: Camera) -> Any:
+    def _background(self, backing: BackgroundDraw | None, camera: Camera) -> Any:
         """What is behind everything, on the device; kept as long as it is the same."""
         if backing is None:
             return BACKGROUND
@@ -487,7 +493,7 @@ class Renderer:
             self._behind = backing, device_array(picture)
         return self._behind[1]
 
-    def _surroundings(self, place: Place) -> dict[str, Any]:
+    def _surroundings(self, place: LayoutSurroundings) -> dict[str, Any]:
         """What does not move in a place; the same objects as before if they look the same."""
         place = replace(place, background=None)
         if self._static is None or self._static[0] != place:
@@ -495,7 +501,7 @@ class Renderer:
             self.integrator.white = white_irradiance(self.scene, place)
         return self._static[1]
 
-    def _static_shapes(self, place: Place) -> dict[str, Any]:
+    def _static_shapes(self, place: LayoutSurroundings) -> dict[str, Any]:
         shapes: dict[str, Any] = {}
         conveyor, self._pattern = self.scene.spec.conveyor, None
         environment = environment_at(self.scene, place)
@@ -516,7 +522,7 @@ class Renderer:
 
 
 def _asset_shape(
-    asset: Asset, world_from_asset: Float64Array, instance: int, appearance: Appearance | None = None
+    asset: Asset, world_from_asset: Float64Array, instance: int, appearance: ObjectAppearance | None = None
 ) -> Any:
     own = {"roughness": float(asset.roughness), "specular": float(asset.specular) if instance else 0.0}
     return make_splats_shape(
@@ -538,7 +544,7 @@ def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) ->
     return plain_mesh(mesh, props)
 
 
-def light_properties(scene: Scene, place: Place = NOWHERE) -> dict[str, Any]:
+def light_properties(scene: Scene, place: LayoutSurroundings = NOWHERE) -> dict[str, Any]:
     """Properties of the integrator ``splat_proxy`` by which it lights a place of a scene as its file says."""
     composite = scene.spec.composite
     return {
@@ -557,7 +563,7 @@ def light_properties(scene: Scene, place: Place = NOWHERE) -> dict[str, Any]:
     }
 
 
-def white_irradiance(scene: Scene, place: Place) -> float:
+def white_irradiance(scene: Scene, place: LayoutSurroundings) -> float:
     """Irradiance [W/m^2] of display white in a place's surroundings, or 0 where it is unknown or of no matter.
 
     The image-space shadow only looks at light relative to its brightest.

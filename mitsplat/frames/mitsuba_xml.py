@@ -31,7 +31,7 @@ from mitsplat.renderer.textures import finished_mesh, material, texture_image
 from mitsplat.runtime.device import Device
 from mitsplat.scene.planning.conveyor import Belt, carried
 from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
-from mitsplat.scene.planning.layout_surroundings import Finish, draw_place
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_place
 from mitsplat.scene.planning.object_appearance import draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
@@ -245,7 +245,7 @@ def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, inst
 
 
 def _describe_shape(
-    shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: Finish | None, scene: Scene, belt: Belt | None
+    shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: MaterialDraw | None, scene: Scene, belt: Belt | None
 ) -> dict[str, Any]:
     """A mesh as ``stem.ply`` and, if it has a pattern, ``stem.png``."""
     path = stem.with_suffix(".ply")

@@ -62,7 +62,7 @@ def bands_of(camera: Camera, motion: Mapping[str, Any], swept: Sequence[npt.NDAr
 
     Args:
         camera: Where it is when the middle row is exposed.
-        motion: As :class:`mitsplat.scene.planning.viewpoints.View` has it.
+        motion: As :class:`mitsplat.scene.planning.viewpoints.Viewpoint` has it.
         swept: How far pixels move during an exposure then [px], see :func:`mitsplat.frames.flow.swept_by`.
     """
     readout = motion.get("readout", 0.0)
@@ -123,7 +123,7 @@ def project_by_row(
 
     Args:
         camera: Where it is when the middle row is exposed.
-        motion: As :class:`mitsplat.scene.planning.viewpoints.View` has it.
+        motion: As :class:`mitsplat.scene.planning.viewpoints.Viewpoint` has it.
         points: Where they are then [m].
         velocity: At which the points move [m/s], shape (3,).
     """

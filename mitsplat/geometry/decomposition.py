@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
-from mitsplat.geometry.mesh_distance import Surface, farthest_outside
+from mitsplat.geometry.mesh_distance import DistanceSurface, farthest_outside
 from mitsplat.storage.cache import cache_folder, keep_file
 from mitsplat.storage.content_hash import ContentHash
 
@@ -153,7 +153,7 @@ def thin_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
 def _largest_distance(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:
     """Of either surface's vertices and some points of its faces from the other [m]."""
     points = [np.concatenate([mesh.vertices, mesh.sample(_SAMPLES, seed=0)]) for mesh in (first, second)]
-    surfaces = Surface(first), Surface(second)
+    surfaces = DistanceSurface(first), DistanceSurface(second)
     return max(float(surface.nearest(other)[2].max()) for surface, other in zip(surfaces, points[::-1], strict=True))
 
 
@@ -178,7 +178,7 @@ class _Cutter:
 
     def __init__(self, part: trimesh.Trimesh, limit: float) -> None:
         self._solid = _manifold(thin_solid(part))
-        self._surface, self._limit = Surface(part), _MARGIN * limit
+        self._surface, self._limit = DistanceSurface(part), _MARGIN * limit
         self._least = 1e-6 * self._solid.hull().volume()  # slivers carry no contact that their neighbours lack
         self._points = _mesh(self._solid).vertices
         self._touching = 1e-4 * part.scale

@@ -23,7 +23,7 @@ ROUNDING = 1e-6
 _FAR = 1e6  # farther than any inside point is from its surface [m]
 
 
-class Surface:
+class DistanceSurface:
     """A mesh that answers how far points are from it, and the points that would touch another first.
 
     Inside is where the generalised winding number says so (Jacobson et al., *Robust Inside-Outside Segmentation using
@@ -81,7 +81,7 @@ class PlacedSurface:
         bounds: Corners of their bounding box, shape (2, 3).
     """
 
-    def __init__(self, name: str, surface: Surface, world_from_surface: Float64Array | None = None) -> None:
+    def __init__(self, name: str, surface: DistanceSurface, world_from_surface: Float64Array | None = None) -> None:
         pose = np.eye(4) if world_from_surface is None else world_from_surface
         self.name = name
         self.points = surface.points @ pose[:3, :3].T + pose[:3, 3]
@@ -134,7 +134,7 @@ def all_clearances(
     return [clearance(first, second, reach=reach) for first, second in pairs]
 
 
-def standoff(surface: Surface, pieces: Sequence[trimesh.Trimesh]) -> float:
+def standoff(surface: DistanceSurface, pieces: Sequence[trimesh.Trimesh]) -> float:
     """How far convex pieces stand off the mesh that they stand for [m]: the widest gap that they can leave at rest.
 
     Measured at their vertices, edges and 4000 points of their faces.
@@ -143,7 +143,9 @@ def standoff(surface: Surface, pieces: Sequence[trimesh.Trimesh]) -> float:
     return farthest_outside(surface, np.concatenate([*(contact_points(piece) for piece in pieces), samples]))
 
 
-def farthest_outside(surface: Surface, points: Float64Array, *, least: float = 0.0, batch: int = _BATCH) -> float:
+def farthest_outside(
+    surface: DistanceSurface, points: Float64Array, *, least: float = 0.0, batch: int = _BATCH
+) -> float:
     """Distance from a mesh of the farthest of points (N, 3) that are outside of it [m]; 0 if none is by ``least``.
 
     Which side of a mesh a point is on costs ten times what its distance does: the farthest points are asked first, and

@@ -16,8 +16,8 @@ def points_inside(mesh: trimesh.Trimesh, points: Float64Array) -> BoolArray:
     """Which of some points (N, 3) are inside a mesh: around which it winds, as often as not (Jacobson et al. 2013).
 
     The solid angles of its triangles are those of Van Oosterom and Strackee (1983).
-    :class:`mitsplat.geometry.mesh_distance.Surface` finds the same faster, once physics has been started, for which no
-    check should wait.
+    :class:`mitsplat.geometry.mesh_distance.DistanceSurface` finds the same faster, once physics has been started, for
+    which no check should wait.
     """
     low, high = mesh.bounds
     inside = ((points > low) & (points < high)).all(axis=1)

@@ -94,7 +94,7 @@ class ImportSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
+class ImportSupport:
     """A horizontal surface of surroundings that things can be dropped on, in the middle of which the origin is.
 
     Attributes:
@@ -130,7 +130,7 @@ class Imported:
     found: int
     removed: dict[str, int]
     rubbish: Splats
-    support: Support | None
+    support: ImportSupport | None
     views: Sequence[AssetView]
     mesh_iou: float | None
     offset: float | None
@@ -383,7 +383,7 @@ def _pieces(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
     return (*split, *(part.convex_hull for part in small))
 
 
-def _on_support(splats: Splats, plane: Plane) -> tuple[Support | None, Float64Array]:
+def _on_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Float64Array]:
     """The horizontal surface of surroundings, and the motion that takes its middle to the origin, its sides to x, y.
 
     No surface, and no motion, where what lies in the plane spans no area.
@@ -406,7 +406,7 @@ def _on_support(splats: Splats, plane: Plane) -> tuple[Support | None, Float64Ar
     motion = trimesh.transformations.rotation_matrix(-angle, (0, 0, 1)) @ trimesh.transformations.translation_matrix(
         -np.append(corners.mean(axis=0), plane.height)
     )
-    return Support((float(np.linalg.norm(along)), float(np.linalg.norm(across))), plane.share), motion
+    return ImportSupport((float(np.linalg.norm(along)), float(np.linalg.norm(across))), plane.share), motion
 
 
 def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:

@@ -18,10 +18,10 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import MOST_PIECES, convex_pieces, widest_gap
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
-from mitsplat.geometry.mesh_distance import Clearance, PlacedSurface, Surface, all_clearances, standoff
+from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.placement import Item, draw_poses
-from mitsplat.physics.rest import OVERFLOW, Outcome, run_to_rest
+from mitsplat.physics.rest import OVERFLOW, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, LeftOut, NothingRests, RestCertificate
@@ -52,7 +52,7 @@ class _Part:
     """What physics needs of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
 
     body: Body
-    surface: Surface
+    surface: DistanceSurface
     standoff: float
 
 
@@ -271,7 +271,7 @@ class Drop:
         regions: Sequence[int],
         given: Sequence[Float64Array | None],
         **options: Any,
-    ) -> Outcome:
+    ) -> RestOutcome:
         settle = self.scene.spec.settle
         fastest = _POURED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
         low, high = self._grounds[ground].bounds
@@ -316,7 +316,7 @@ class Drop:
             raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
         if id(asset.mesh) not in self._parts:
             mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
-            surface = Surface(mesh)
+            surface = DistanceSurface(mesh)
             pieces, stands_off = asset.pieces, 0.0
             if pieces:
                 stands_off = standoff(surface, pieces)
@@ -349,12 +349,12 @@ class Drop:
             else:
                 collider = Collider(shape.friction, box=(shape.box.size, stated_pose(shape.box)))
             colliders.append(collider)
-            obstacles.append(PlacedSurface(shape.name, Surface(mesh)))
+            obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh)))
         if surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
             pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
             colliders.append(Collider(surroundings.friction, pieces=pieces))
-            obstacles.append(PlacedSurface(surroundings.name, Surface(mesh)))
+            obstacles.append(PlacedSurface(surroundings.name, DistanceSurface(mesh)))
         if not colliders:
             raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
         lows, highs = [], []

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.geometry.mesh_distance import ROUNDING, PlacedSurface, Surface, clearance
+from mitsplat.geometry.mesh_distance import ROUNDING, DistanceSurface, PlacedSurface, clearance
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
@@ -41,7 +41,7 @@ class Item:
     """
 
     asset: int
-    surface: Surface
+    surface: DistanceSurface
     outline: Float64Array
     pose: Float64Array | None = None
     region: int = 0

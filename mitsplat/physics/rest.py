@@ -23,7 +23,7 @@ _MEAN_TIME = 0.05  # over which speeds are told [s]
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class RestOutcome:
     """How a drop ended.
 
     Attributes:
@@ -51,7 +51,7 @@ def run_to_rest(
     bounds: tuple[Float64Array, Float64Array],
     fastest: float = np.inf,
     observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
-) -> Outcome:
+) -> RestOutcome:
     """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
 
     At rest no surface moves by half a millimetre in a second, and by a tenth in its first quarter. After that quarter
@@ -70,7 +70,7 @@ def run_to_rest(
         refused = _Refused(OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
     except _Refused as error:
         refused = error
-    return Outcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses, refused.blamed)
+    return RestOutcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses, refused.blamed)
 
 
 class _Refused(Exception):
@@ -87,7 +87,7 @@ def _run_to_rest(
     bounds: tuple[Float64Array, Float64Array],
     fastest: float,
     observe: Callable[[float, Float64Array], None],
-) -> Outcome:
+) -> RestOutcome:
     mean_frames = max(1, round(_MEAN_TIME / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
     since, rest = 0.0, world.poses
@@ -105,7 +105,7 @@ def _run_to_rest(
         if since >= max_time:
             raise _Refused(f"not at rest within {max_time:g} s", moving)
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
-    return Outcome("", since, speed, spin, float(motion.max()), world.poses)
+    return RestOutcome("", since, speed, spin, float(motion.max()), world.poses)
 
 
 def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fastest: float) -> Float64Array:

@@ -24,7 +24,7 @@ from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.reconstruct.segment_splats import visible_area
 from mitsplat.renderer.path_tracing import trace_radiance
@@ -131,7 +131,7 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
         light: That it was photographed in.
         table: Whether it stands on one in z = 0.
     """
-    places, normals, away = Surface(mesh).nearest(splats.means.astype(np.float64))
+    places, normals, away = DistanceSurface(mesh).nearest(splats.means.astype(np.float64))
     area, near = visible_area(splats), away < _NEAR * float(np.linalg.norm(mesh.extents))
     below = _table(light) if table else None
     traced = [

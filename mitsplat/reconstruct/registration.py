@@ -21,7 +21,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats, split_similarity
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.renderer.layers import render_splats
 
 _OPAQUE = 0.9
@@ -122,7 +122,7 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
     """
     if len(points) < 100:
         raise InputError(f"a registration needs at least 100 points of the splats' surface (got {len(points)})")
-    surface = Surface(mesh)
+    surface = DistanceSurface(mesh)
     rng = np.random.default_rng(0)
     few = points[rng.choice(len(points), min(_COARSE_POINTS, len(points)), replace=False)]
     samples = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0])
@@ -145,7 +145,7 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
 
 def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
     """How far a mesh is from surface points (N, 3) in the same frame."""
-    nearest, normal, distance = Surface(mesh).nearest(points)
+    nearest, normal, distance = DistanceSurface(mesh).nearest(points)
     near = distance <= np.quantile(distance, _NEAREST)
     gap = np.einsum("nd,nd->n", normal, nearest - points)
     # Directions in which the surface can slide along itself stay at zero: the least-squares solution of least norm.
@@ -179,7 +179,9 @@ def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
     return starts
 
 
-def _plane_steps(surface: Surface, points: Float64Array, matrix: Float64Array, widths: Float64Array) -> Float64Array:
+def _plane_steps(
+    surface: DistanceSurface, points: Float64Array, matrix: Float64Array, widths: Float64Array
+) -> Float64Array:
     """Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t.
 
     Points are weighted by Geman and McClure's kernel, of one width a step; they shrink (graduated non-convexity, Blake
@@ -209,7 +211,7 @@ def _plane_steps(surface: Surface, points: Float64Array, matrix: Float64Array, w
 
 
 def _misfit(
-    surface: Surface, samples: Float64Array, points: Float64Array, matrix: Float64Array, missed: float
+    surface: DistanceSurface, samples: Float64Array, points: Float64Array, matrix: Float64Array, missed: float
 ) -> float:
     """Mean distance both ways: a cloud that shrank into a corner is near the mesh, but the mesh not near the cloud.
 

@@ -18,7 +18,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
-from mitsplat.renderer.lazy_value import Deferred
+from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.renderer.rays.device_arrays import concatenated, wrapped
 from mitsplat.runtime.dropped_rays import refuse_lost_rays
 from mitsplat.runtime.variant import ensure_variant as ensure_variant
@@ -26,7 +26,7 @@ from mitsplat.runtime.variant import one_at_a_time
 
 
 @dataclass(frozen=True, eq=False)
-class Layers(Deferred):
+class Layers(LazyValue):
     """What the integrator makes of one view, H x W pixels.
 
     Layers that were rendered stay on the device as long as this does, and come to the host one by one, when they are

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 from mitsplat.runtime.variant import one_at_a_time
 
 
-class Deferred:
+class LazyValue:
     """A dataclass of which some fields are made when they are first looked at, and kept from then on.
 
     Copies by ``replace`` and pickles hold the values of all fields.

@@ -13,7 +13,7 @@ import trimesh
 from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.rays.device_arrays import plain_mesh, wrapped
-from mitsplat.scene.planning.layout_surroundings import Finish
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.walls import stated_pose
 
@@ -24,7 +24,7 @@ FEATURES = 12
 """Largest features across the image; lines of grain, twice as many."""
 
 
-def texture_image(finish: Finish, images: Mapping[str, Path]) -> ByteImage | None:
+def texture_image(finish: MaterialDraw, images: Mapping[str, Path]) -> ByteImage | None:
     """The image (H, W, 3) that a finish repeats, sRGB-encoded; None for one colour.
 
     Args:
@@ -41,7 +41,7 @@ def texture_image(finish: Finish, images: Mapping[str, Path]) -> ByteImage | Non
     return encoded
 
 
-def repeat_width(finish: Finish) -> float:
+def repeat_width(finish: MaterialDraw) -> float:
     """Width of a finish's image on a surface [m]."""
     repeats = {"image": 1, "checker": 2, "wood": 2 * FEATURES, "brushed_metal": 2}
     return finish.scale * repeats.get(finish.kind, FEATURES)
@@ -61,7 +61,7 @@ def with_gain(image: ByteImage, gain: float) -> ByteImage:
     return np.rint(255 * table).astype(np.uint8)[image]
 
 
-def material(finish: Finish, texture: dict[str, Any] | None) -> dict[str, Any]:
+def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, Any]:
     """Mitsuba's material of a finish.
 
     Args:
@@ -90,7 +90,7 @@ def bitmap_texture(image: ByteImage) -> dict[str, Any]:
 def finished_mesh(
     mesh: trimesh.Trimesh,
     shape: Shape,
-    finish: Finish,
+    finish: MaterialDraw,
     image: ByteImage | None,
     bsdf: Any = None,
     travel: float = 0.0,
@@ -133,7 +133,7 @@ def pattern_axes(shape: Shape) -> Float64Array:
 
 
 def box_projection(
-    mesh: trimesh.Trimesh, axes: Float64Array, finish: Finish, aspect: float, travel: float = 0.0
+    mesh: trimesh.Trimesh, axes: Float64Array, finish: MaterialDraw, aspect: float, travel: float = 0.0
 ) -> Float64Array:
     """Texture coordinates of each corner of each triangle (3 F, 2): every face sees the image along its nearest axis.
 

@@ -20,12 +20,12 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.view.guard import Guard, check_address, guarded
 from mitsplat.view.scene_parts import (
     HIDDEN_FIRST,
-    Cloud,
     Frustum,
     Lines,
-    Part,
-    Points,
-    Surface,
+    ShownMesh,
+    ShownPart,
+    ShownPoints,
+    ShownSplats,
     base_colours,
     bounds_of,
     changes,
@@ -77,7 +77,7 @@ class Page:
         host = f"[{address.host}]" if ":" in address.host else address.host
         self.url = f"http://{host}:{self.port}/{guard.token}"
         self._gaussians = gaussians
-        self._shown: dict[str, Part] = {}
+        self._shown: dict[str, ShownPart] = {}
         self._handles: dict[str, Any] = {}
         self._clicked: Callable[[int], object] = lambda index: None
         self.gui = self._server.gui
@@ -136,7 +136,7 @@ class Page:
         handle.on_update(lambda _: moved(np.asarray(handle.position)))
         return handle
 
-    def show(self, parts: Iterable[Part]) -> None:
+    def show(self, parts: Iterable[ShownPart]) -> None:
         """Show these and nothing else; only what differs from what is shown is sent."""
         wanted = {part.name: part for part in parts}
         removed, added, moved = changes(self._shown, wanted)
@@ -218,12 +218,12 @@ class Page:
 
         box.on_update(lambda _: setattr(root, "visible", box.value))
 
-    def _add(self, part: Part) -> Any:
+    def _add(self, part: ShownPart) -> Any:
         scene, thing = self._server.scene, part.thing
         place = {"position": part.pose[:3, 3], "wxyz": _wxyz(part.pose)}
-        if isinstance(thing, Cloud):
+        if isinstance(thing, ShownSplats):
             return scene.add_gaussian_splats(part.name, **splat_arrays(thing.thinned(self._gaussians)), **place)
-        if isinstance(thing, Surface):
+        if isinstance(thing, ShownMesh):
             opacity = None if thing.opacity == 1.0 else thing.opacity
             vertices, faces = np.asarray(thing.mesh.vertices, dtype=np.float32), np.asarray(thing.mesh.faces)
             return scene.add_mesh_simple(
@@ -243,7 +243,7 @@ class Page:
             return scene.add_line_segments(
                 part.name, thing.segments, colours, thickness=2.0, thickness_units="screen", **place
             )
-        if isinstance(thing, Points):
+        if isinstance(thing, ShownPoints):
             return scene.add_point_cloud(part.name, thing.points, thing.colours, point_size=thing.edge, **place)
         return self._add_frustum(part.name, thing, place)
 

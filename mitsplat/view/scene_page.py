@@ -26,7 +26,7 @@ from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpe
 from mitsplat.scene.spec.object_spec import PRIMITIVES
 from mitsplat.view.page import Page
 from mitsplat.view.previews import PAUSES, NewestFirst, Preview, SceneRenders, ViewRequest, presets_up_to
-from mitsplat.view.scene_parts import Part, camera_parts, scene_parts
+from mitsplat.view.scene_parts import ShownPart, camera_parts, scene_parts
 from mitsplat.view.yaml_lines import camera_lines, light_line, rounded, seed_line
 
 _INTERVAL = 0.04
@@ -58,7 +58,7 @@ class ScenePage:
         self._looked: list[Float64Array] = []
         self._lights: dict[int, LightSpec] = {}
         self._layout: Layout | None = None
-        self._cameras: tuple[Any, list[Part]] = (None, [])
+        self._cameras: tuple[Any, list[ShownPart]] = (None, [])
         self._playing = False
         self._fault: str | None = None
         self._asked: ViewRequest | None = None

@@ -52,7 +52,7 @@ _EDGES = np.array([[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class ShownSplats:
     """Gaussians, drawn in the colour that they have from all sides on average."""
 
     splats: Splats
@@ -67,7 +67,7 @@ class Cloud:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ShownMesh:
     """A mesh in one colour, opaque or see-through."""
 
     mesh: trimesh.Trimesh
@@ -84,7 +84,7 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class ShownPoints:
     """Points, shape (N, 3), with 8-bit colours of the same shape, drawn with an edge of ``size``."""
 
     points: Float64Array
@@ -109,11 +109,11 @@ class Frustum:
     index: int
 
 
-Thing = Cloud | Surface | Lines | Points | Frustum
+Thing = ShownSplats | ShownMesh | Lines | ShownPoints | Frustum
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ShownPart:
     """A thing at its place.
 
     Attributes:
@@ -154,7 +154,7 @@ def base_colours(splats: Splats) -> Float32Array:
 
 def scene_parts(
     scene: Scene, index: int, layout: Layout | None = None, lights: Sequence[LightSpec] = ()
-) -> Iterator[Part]:
+) -> Iterator[ShownPart]:
     """What a scene is made of as frame ``index`` shows it; objects only once their layout is known.
 
     Args:
@@ -166,25 +166,25 @@ def scene_parts(
     number = index // scene.spec.output.views
     environment = scene.environment_of(number)
     if environment is not None:
-        yield Part("/splats/environment", Cloud(environment.splats))
+        yield ShownPart("/splats/environment", ShownSplats(environment.splats))
         if environment.mesh is not None:
-            yield Part("/meshes/environment", Surface(environment.mesh, _GREY, 0.6))
+            yield ShownPart("/meshes/environment", ShownMesh(environment.mesh, _GREY, 0.6))
     if layout is not None:
         yield from _object_parts(scene, layout)
     for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
         if shape.visible:
             red, green, blue = (round(255 * value) for value in shape.colour)
-            yield Part(f"/shapes/{shape.name}", Surface(mesh, (red, green, blue)))
+            yield ShownPart(f"/shapes/{shape.name}", ShownMesh(mesh, (red, green, blue)))
         else:
             walls = shape.name.startswith(ENCLOSURE)
             colour, opacity = (_WALL, 0.15) if walls else (_GREY, 0.5)
-            yield Part(f"/{'enclosure' if walls else 'colliders'}/{shape.name}", Surface(mesh, colour, opacity))
+            yield ShownPart(f"/{'enclosure' if walls else 'colliders'}/{shape.name}", ShownMesh(mesh, colour, opacity))
     for name, (region, _) in zip(scene.spec.region_names, scene.spec.all_regions, strict=True):
-        yield Part(f"/regions/{name}", Lines(_box_edges(region), _REGION))
+        yield ShownPart(f"/regions/{name}", Lines(_box_edges(region), _REGION))
     yield from light_parts(lights, scene)
 
 
-def _object_parts(scene: Scene, layout: Layout) -> Iterator[Part]:
+def _object_parts(scene: Scene, layout: Layout) -> Iterator[ShownPart]:
     """Splats, proxy mesh and convex pieces of every object, numbered by asset, so that a drop moves what is there."""
     counts = Counter[int]()
     for instance in layout.instances:
@@ -194,59 +194,61 @@ def _object_parts(scene: Scene, layout: Layout) -> Iterator[Part]:
         yield from _asset_parts(asset, name, instance.world_from_object)
 
 
-def _asset_parts(asset: Asset, name: str, pose: Float64Array) -> Iterator[Part]:
-    yield Part(f"/splats/{name}", Cloud(asset.splats), pose)
+def _asset_parts(asset: Asset, name: str, pose: Float64Array) -> Iterator[ShownPart]:
+    yield ShownPart(f"/splats/{name}", ShownSplats(asset.splats), pose)
     if asset.mesh is not None:
-        yield Part(f"/meshes/{name}", Surface(asset.mesh, _GREY), pose)
+        yield ShownPart(f"/meshes/{name}", ShownMesh(asset.mesh, _GREY), pose)
     for number, piece in enumerate(asset.pieces):
-        yield Part(f"/pieces/{name}/{number}", Surface(piece, class_colour(number), 0.7), pose)
+        yield ShownPart(f"/pieces/{name}/{number}", ShownMesh(piece, class_colour(number), 0.7), pose)
 
 
-def asset_parts(asset: Asset) -> Iterator[Part]:
+def asset_parts(asset: Asset) -> Iterator[ShownPart]:
     """An asset as it lies in its own frame."""
     yield from _asset_parts(asset, asset.name.replace("/", "_"), np.eye(4))
     if asset.keypoints:
         points = asset.keypoint_array
-        yield Part("/keypoints/all", Points(points, np.full(points.shape, (255, 60, 60), dtype=np.uint8)))
+        yield ShownPart("/keypoints/all", ShownPoints(points, np.full(points.shape, (255, 60, 60), dtype=np.uint8)))
 
 
-def capture_parts(capture: Capture) -> Iterator[Part]:
+def capture_parts(capture: Capture) -> Iterator[ShownPart]:
     """The points of a capture, and its cameras."""
-    yield Part("/points/all", Points(capture.points, capture.colours))
+    yield ShownPart("/points/all", ShownPoints(capture.points, capture.colours))
     centres = np.array([photo.camera.centre for photo in capture.photos]).reshape(-1, 3)
     around = centres if not len(capture.points) else np.vstack([centres, np.median(capture.points, axis=0)])
     depth = 0.06 * float(np.linalg.norm(np.ptp(around, axis=0))) if len(around) > 1 else 0.1
     for index, photo in enumerate(capture.photos):
-        yield Part(f"/cameras/{index}", Frustum(photo.camera, depth, _CAMERA, index), photo.camera.world_from_camera)
+        yield ShownPart(
+            f"/cameras/{index}", Frustum(photo.camera, depth, _CAMERA, index), photo.camera.world_from_camera
+        )
 
 
-def light_parts(lights: Sequence[LightSpec], scene: Scene | None = None) -> Iterator[Part]:
+def light_parts(lights: Sequence[LightSpec], scene: Scene | None = None) -> Iterator[ShownPart]:
     """Lights at their places and in their sizes, and the paths that a scene's lights move on."""
     for number, light in enumerate(lights):
         if isinstance(light, EnvironmentLight):
             continue
         if not isinstance(light, AreaLight | SpotLight):
-            yield Part(
-                f"/lights/{number}", Surface(trimesh.creation.icosphere(2, 0.02), _LIGHT), _moved(light.position)
+            yield ShownPart(
+                f"/lights/{number}", ShownMesh(trimesh.creation.icosphere(2, 0.02), _LIGHT), _moved(light.position)
             )
             continue
         pose = look_at_pose(light.position, light.target)
         if isinstance(light, AreaLight):
             width, height = light.size
-            yield Part(f"/lights/{number}", Surface(_rectangle(width, height), _LIGHT, 0.85), pose)
+            yield ShownPart(f"/lights/{number}", ShownMesh(_rectangle(width, height), _LIGHT, 0.85), pose)
         else:
-            yield Part(f"/lights/{number}", Lines(_cone(light.cone), _LIGHT), pose)
+            yield ShownPart(f"/lights/{number}", Lines(_cone(light.cone), _LIGHT), pose)
         aim = np.array([[light.position, light.target]], dtype=np.float64)
-        yield Part(f"/lights/{number}-aim", Lines(aim, _LIGHT))
+        yield ShownPart(f"/lights/{number}-aim", Lines(aim, _LIGHT))
     for number, entry in enumerate(() if scene is None else scene.spec.lights):
         if isinstance(entry, EnvironmentLight | RoomLight) or not entry.path:
             continue
         stops = np.array([key.position or entry.position for key in entry.path], dtype=np.float64)
         if len(stops) > 1:
-            yield Part(f"/lights/path-{number}", Lines(np.stack([stops[:-1], stops[1:]], axis=1), _LIGHT))
+            yield ShownPart(f"/lights/path-{number}", Lines(np.stack([stops[:-1], stops[1:]], axis=1), _LIGHT))
 
 
-def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Part]:
+def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[ShownPart]:
     """The cameras of frames: of those that show the layout of frame ``index``, and of others evenly spread."""
     views = scene.spec.output.views
     own = range(index // views * views, (index // views + 1) * views)
@@ -256,15 +258,15 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Pa
         there = None if layout is None or frame not in own else carried(scene.spec, layout, frame % views)
         camera = view_of(scene, frame, there).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
-        yield Part(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)
+        yield ShownPart(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)
 
 
-def bounds_of(parts: Iterable[Part]) -> Float64Array:
+def bounds_of(parts: Iterable[ShownPart]) -> Float64Array:
     """Lowest and highest coordinates [m] of what lies in the middle of splats and points, shape (2, 3)."""
     found = []
     for part in parts:
-        if isinstance(part.thing, Cloud | Points):
-            points = part.thing.splats.means if isinstance(part.thing, Cloud) else part.thing.points
+        if isinstance(part.thing, ShownSplats | ShownPoints):
+            points = part.thing.splats.means if isinstance(part.thing, ShownSplats) else part.thing.points
             if len(points):
                 low, high = np.percentile(points, (2, 98), axis=0)
                 corners = _corners(low, high) @ part.pose[:3, :3].T + part.pose[:3, 3]
@@ -272,7 +274,9 @@ def bounds_of(parts: Iterable[Part]) -> Float64Array:
     return np.array([np.min(found, axis=0), np.max(found, axis=0)]) if found else np.array([[-0.5] * 3, [0.5] * 3])
 
 
-def changes(shown: Mapping[str, Part], wanted: Mapping[str, Part]) -> tuple[list[str], list[Part], list[Part]]:
+def changes(
+    shown: Mapping[str, ShownPart], wanted: Mapping[str, ShownPart]
+) -> tuple[list[str], list[ShownPart], list[ShownPart]]:
     """What leads from what is shown to what is wanted: names to remove, parts to add, parts that only moved."""
     kept = {name for name, part in wanted.items() if name in shown and same(shown[name].thing, part.thing)}
     moved = [wanted[name] for name in kept if not np.array_equal(shown[name].pose, wanted[name].pose)]

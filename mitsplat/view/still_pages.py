@@ -20,7 +20,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, usual_up
 from mitsplat.view.dataset_index import OVERLAYS, DatasetIndex, Filter, OverlayName
 from mitsplat.view.page import Page
-from mitsplat.view.scene_parts import Cloud, Frustum, Part, Points, asset_parts, capture_parts
+from mitsplat.view.scene_parts import Frustum, ShownPart, ShownPoints, ShownSplats, asset_parts, capture_parts
 
 _ANY = "any"
 _EDGE = 960
@@ -75,7 +75,7 @@ class SplatsPage(StillPage):
 
     def __init__(self, page: Page, path: Path) -> None:
         splats = Splats.load(path)
-        page.show([Part("/splats/file", Cloud(splats))])
+        page.show([ShownPart("/splats/file", ShownSplats(splats))])
         axes = get_args(Axis)
         up = page.gui.add_dropdown("up axis", axes, initial_value=usual_up(path))
         up.on_update(lambda _: page.look_around(up.value) if up.value in axes else None)
@@ -151,7 +151,7 @@ class CapturePage(StillPage):
         words = " ".join(f"{option} {shlex.quote(pick)}" for option, pick in self._picks)
         self._told.content = f"```\n{words}\n```" if words else ""
 
-    def _chosen_parts(self, picks: Sequence[tuple[str, str]]) -> list[Part]:
+    def _chosen_parts(self, picks: Sequence[tuple[str, str]]) -> list[ShownPart]:
         """Points of what picks choose, as far as points tell."""
         on, off, away = ([pick for kind, pick in picks if kind == option] for option in (_PICK, _PICK_NOT, _REMOVE))
         parts = []
@@ -161,9 +161,9 @@ class CapturePage(StillPage):
             parts.append(self._highlighted("removed", chosen_object(self._capture, away).above, _COLOURS[_REMOVE]))
         return parts
 
-    def _highlighted(self, name: str, points: Float64Array, colour: tuple[int, int, int]) -> Part:
-        size = 2 * Points(self._capture.points, self._capture.colours).edge
-        return Part(f"/chosen/{name}", Points(points, np.full(points.shape, colour, dtype=np.uint8), size))
+    def _highlighted(self, name: str, points: Float64Array, colour: tuple[int, int, int]) -> ShownPart:
+        size = 2 * ShownPoints(self._capture.points, self._capture.colours).edge
+        return ShownPart(f"/chosen/{name}", ShownPoints(points, np.full(points.shape, colour, dtype=np.uint8), size))
 
     @property
     def _chosen(self) -> Photo:

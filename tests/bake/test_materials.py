@@ -15,8 +15,8 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.bake.bake_report import write_bake_report
-from mitsplat.bake.mesh_parts import Part, read_parts
-from mitsplat.bake.surface_materials import Finish, read_material
+from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.surface_materials import SurfaceFinish, read_material
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.images.colour import decode_srgb
@@ -42,12 +42,12 @@ def write_obj(folder: Path, lines: str, *, name: str = "box") -> Path:
     return folder / f"{name}.obj"
 
 
-def part_of(folder: Path, lines: str, **finish: object) -> Part:
-    (part,) = read_parts(write_obj(folder, lines), finish=Finish(**finish))  # type: ignore[arg-type]
+def part_of(folder: Path, lines: str, **finish: object) -> MeshPart:
+    (part,) = read_parts(write_obj(folder, lines), finish=SurfaceFinish(**finish))  # type: ignore[arg-type]
     return part
 
 
-def colour_of(part: Part) -> np.ndarray:
+def colour_of(part: MeshPart) -> np.ndarray:
     """Mean linear colour."""
     if part.colours is not None:
         return np.asarray(part.colours.mean(axis=(0, 1)))
@@ -67,10 +67,10 @@ def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
     box().export(folder / "box.stl")
     write_obj(folder, "map_Kd colour.png")
     finishes = {
-        "obj": Finish(),
-        "glb": Finish(specular=0.0),
-        "ply": Finish(),
-        "stl": Finish(colour="#c87828"),
+        "obj": SurfaceFinish(),
+        "glb": SurfaceFinish(specular=0.0),
+        "ply": SurfaceFinish(),
+        "stl": SurfaceFinish(colour="#c87828"),
     }
     return {
         kind: bake_asset(folder / f"box.{kind}", name="box", settings=QUICK, finish=finish)
@@ -195,7 +195,7 @@ def test_finish_replaces_what_the_file_says(tmp_path: Path) -> None:
 )
 def test_impossible_finishes_are_refused(finish: dict[str, object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Finish(**finish)  # type: ignore[arg-type]
+        SurfaceFinish(**finish)  # type: ignore[arg-type]
 
 
 def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
         InputError, match=r"box\.mtl: its texture absent\.png is missing; put it there, or give a colour"
     ):
         read_parts(path)
-    assert read_parts(path, finish=Finish(colour="red"))
+    assert read_parts(path, finish=SurfaceFinish(colour="red"))
     (tmp_path / "box.mtl").unlink()
     with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing"):
         read_parts(path)

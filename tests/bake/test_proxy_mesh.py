@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from mitsplat.bake.mesh_parts import Part
+from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
 def test_a_scan_of_many_faces_stays_closed() -> None:
@@ -17,8 +17,8 @@ def test_a_scan_of_many_faces_stays_closed() -> None:
     scan = trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False)
     assert scan.is_volume and not scan.simplify_quadric_decimation(face_count=4000).is_volume
     proxy = make_proxy(
-        [Part("scan", scan, np.full((len(scan.faces), 3, 3), 0.5), None, None, 0.0, None, True, 0.04, ())], 4000
+        [MeshPart("scan", scan, np.full((len(scan.faces), 3, 3), 0.5), None, None, 0.0, None, True, 0.04, ())], 4000
     )
     assert proxy.is_volume
     assert 1000 < len(proxy.faces) <= 4000
-    assert np.abs(Surface(scan).signed_distances(proxy.sample(2000, seed=0))).max() < 0.01 * scan.scale
+    assert np.abs(DistanceSurface(scan).signed_distances(proxy.sample(2000, seed=0))).max() < 0.01 * scan.scale

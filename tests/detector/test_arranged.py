@@ -10,10 +10,10 @@ import pytest
 import trimesh
 
 from benchmarks.detector import arranged, meshes
-from mitsplat.bake.mesh_parts import Part
+from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.images.colour import encode_srgb
 from mitsplat.scene.layout import Instance
-from mitsplat.scene.planning.object_appearance import Appearance
+from mitsplat.scene.planning.object_appearance import ObjectAppearance
 
 BOX = trimesh.creation.box((0.06, 0.08, 0.12))
 
@@ -54,8 +54,8 @@ def test_what_floats_is_apart_and_above_the_floor() -> None:
 def test_a_mesh_looks_as_its_instance_does() -> None:
     """Twice as bright, half of its red, moved, and rough; what would be brighter than white is white."""
     texture = np.rint(255 * encode_srgb(np.array([[[0.4, 0.3, 0.8]]]))).astype(np.uint8)
-    part = Part("box", BOX, None, texture, np.zeros((12, 3, 2)), 0.0, 0.9, True)
-    look = Appearance(1, 0, 0.0, 1.0, 2.0, (0.5, 1.0, 1.0), 0.3, 0.02, 0.0, 0)
+    part = MeshPart("box", BOX, None, texture, np.zeros((12, 3, 2)), 0.0, 0.9, True)
+    look = ObjectAppearance(1, 0, 0.0, 1.0, 2.0, (0.5, 1.0, 1.0), 0.3, 0.02, 0.0, 0)
     pose = np.eye(4)
     pose[2, 3] = 1.0
     found = meshes._placed(part, Instance(1, 0, 0, pose), look)

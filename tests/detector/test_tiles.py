@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsplat.detector.photo_tiles import cut_photographs
-from mitsplat.detector.sets import Instance, LabelledSet, Sample, read_set
+from mitsplat.detector.sets import LabelledObject, LabelledSet, Sample, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from tests.detector.painted import HEIGHT, WIDTH, paint, write_coco, write_yolo
@@ -41,7 +41,7 @@ def test_boxes_are_cut_with_the_picture(tmp_path: Path) -> None:
     cv2.imwrite(str(path), np.zeros((100, 300, 3), dtype=np.uint8))
     boxes = [(10.0, 10.0, 40.0, 30.0), (80.0, 20.0, 130.0, 40.0), (195.0, 0.0, 205.0, 50.0)]
     sample = Sample(
-        path, "photo.png", 300, 100, tuple(Instance(0, box, crowd=not k) for k, box in enumerate(boxes)), ""
+        path, "photo.png", 300, 100, tuple(LabelledObject(0, box, crowd=not k) for k, box in enumerate(boxes)), ""
     )
     photographs = LabelledSet(tmp_path, "coco", "all", ("part",), (sample,))
     tiles = cut_photographs(photographs, 1920, 640, tmp_path / "tiles").samples

@@ -13,12 +13,12 @@ import mitsplat as ms
 from mitsplat.frames.background import cut_out
 from mitsplat.images.colour import decode_srgb
 from mitsplat.scene.layout import NOTHING_TO_REST, Layout
-from mitsplat.scene.planning.layout_surroundings import Backing
+from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
 from tests.conftest import WriteScene
 
 
-def backing(**values: Any) -> Backing:
-    return Backing(**{"image": "a", "crop": 1.0, "place": (0.5, 0.5), "rotate": 0.0, "gain": 1.0, **values})
+def backing(**values: Any) -> BackgroundDraw:
+    return BackgroundDraw(**{"image": "a", "crop": 1.0, "place": (0.5, 0.5), "rotate": 0.0, "gain": 1.0, **values})
 
 
 def ramp(width: int, height: int) -> np.ndarray:

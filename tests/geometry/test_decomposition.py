@@ -11,7 +11,7 @@ import trimesh
 from mitsplat.geometry import decomposition
 from mitsplat.geometry.decomposition import convex_pieces, thin_solid, widest_gap
 from mitsplat.geometry.mesh import simplify_solid
-from mitsplat.geometry.mesh_distance import Surface, standoff
+from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 
 PARTS = Path(__file__).parents[2] / "scenes/assets"
 
@@ -98,7 +98,7 @@ def test_scan_is_thinned_before_it_is_split_and_its_pieces_follow_it():
     thin = simplify_solid(scan, 1e-4)
     assert thin.is_volume
     assert len(thin.faces) < 0.1 * len(scan.faces)
-    truth = Surface(scan)
+    truth = DistanceSurface(scan)
     assert np.abs(truth.signed_distances(np.concatenate([thin.vertices, thin.sample(2000, seed=0)]))).max() < 2e-4
     pieces = convex_pieces(scan)
     assert standoff(truth, pieces) < 6.4e-4
@@ -145,8 +145,8 @@ def test_pieces_of_a_scan_are_few_and_stand_off_no_more_than_layouts_bear():
     pieces = convex_pieces(can)
     assert len(pieces) <= decomposition.MOST_PIECES
     assert all(piece.is_convex for piece in pieces)
-    assert standoff(Surface(can), pieces) < widest_gap(0)
-    assert standoff(Surface(can), [can.convex_hull]) > 3 * widest_gap(0)
+    assert standoff(DistanceSurface(can), pieces) < widest_gap(0)
+    assert standoff(DistanceSurface(can), [can.convex_hull]) > 3 * widest_gap(0)
 
 
 def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
@@ -178,7 +178,7 @@ def test_a_scan_is_thinned_to_5000_faces_unless_that_moves_its_surface():
     rough = ball.vertices * (1 + np.random.default_rng(1).uniform(-0.02, 0.02, (len(ball.vertices), 1)))
     kept = thin_solid(trimesh.Trimesh(rough, ball.faces, process=False))
     assert len(kept.faces) > 5000
-    assert np.abs(Surface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
+    assert np.abs(DistanceSurface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
 
 
 def test_a_small_dent_of_a_large_face_is_not_overlooked():
@@ -188,4 +188,4 @@ def test_a_small_dent_of_a_large_face_is_not_overlooked():
     assert len(dented.faces) > 3000
     pieces = convex_pieces(dented)
     assert len(pieces) > 1
-    assert standoff(Surface(dented), pieces) < widest_gap(0)
+    assert standoff(DistanceSurface(dented), pieces) < widest_gap(0)

@@ -42,7 +42,7 @@ BIN = {"name": "bin", "bin": {"size": [0.12, 0.09, 0.05], "position": [0, 0, 0.0
 
 def test_a_bin_is_five_boxes_around_its_inside(scene_data, write_scene):
     """Volume of the walls: outer less inner; the inside is empty and the middle of its floor where it should be."""
-    from mitsplat.geometry.mesh_distance import Surface
+    from mitsplat.geometry.mesh_distance import DistanceSurface
 
     scene_data["shapes"].append(BIN)
     mesh = load_scene(write_scene(scene_data)).shape_meshes[1]
@@ -52,7 +52,9 @@ def test_a_bin_is_five_boxes_around_its_inside(scene_data, write_scene):
     turn, floor = Rotation.from_euler("z", 20, degrees=True), np.array([0, 0, 0.004])
     inside = turn.apply([[0, 0, 0.001], [0.059, 0.044, 0.049], [-0.059, 0.044, 0.001]]) + floor
     walls = turn.apply([[0, 0, -0.002], [0.062, 0, 0.02], [0, -0.047, 0.049]]) + floor
-    assert (Surface(mesh).signed_distances(np.array([*inside, *walls])) < 0).tolist() == [False] * 3 + [True] * 3
+    assert (DistanceSurface(mesh).signed_distances(np.array([*inside, *walls])) < 0).tolist() == [False] * 3 + [
+        True
+    ] * 3
 
 
 def test_a_pile_fills_a_bin(scene_data, write_scene):

@@ -30,9 +30,9 @@ pytestmark = pytest.mark.usefixtures("physics")
 
 
 def test_clearance_of_boxes():
-    from mitsplat.geometry.mesh_distance import PlacedSurface, Surface, clearance
+    from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface, clearance
 
-    box = Surface(trimesh.creation.box((0.02, 0.02, 0.02)))
+    box = DistanceSurface(trimesh.creation.box((0.02, 0.02, 0.02)))
     here = PlacedSurface("here", box)
 
     def from_here(pose):
@@ -279,10 +279,12 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
 @pytest.mark.parametrize(("size", "depth", "refused"), [(0.05, 3.5e-4, True), (0.2, 3.5e-4, False), (0.2, 7e-4, True)])
 def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
     """0.3 mm, or 0.3 % of its size: 0.6 mm of 200."""
-    from mitsplat.geometry.mesh_distance import Clearance, PlacedSurface, Surface
+    from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface
     from mitsplat.physics.drop import _fault
 
-    item, table = (PlacedSurface(name, Surface(trimesh.creation.box((size,) * 3))) for name in ("part", "table"))
+    item, table = (
+        PlacedSurface(name, DistanceSurface(trimesh.creation.box((size,) * 3))) for name in ("part", "table")
+    )
     fault = _fault([Clearance(item, table, -depth)], {item: 0.0}, [table])
     assert (fault is not None) == refused
 
@@ -343,13 +345,13 @@ def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
 
 def test_standoff_of_a_hull():
     """Pieces that are the mesh stand off by nothing; the hull of an L by half a leg, where its long face spans it."""
-    from mitsplat.geometry.mesh_distance import Surface, standoff
+    from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 
     floor, wall = trimesh.creation.box((0.022, 0.01, 0.002)), trimesh.creation.box((0.002, 0.01, 0.022))
     floor.apply_translation((0.009, 0, -0.001))
     wall.apply_translation((-0.001, 0, 0.009))
     bracket = trimesh.boolean.union([floor, wall])
-    surface = Surface(bracket)
+    surface = DistanceSurface(bracket)
     assert standoff(surface, [floor, wall]) < 1e-5
     # The middle of the hull's long face, from (20, 0) to (0, 20) mm, is 10 mm from both plates.
     assert standoff(surface, [bracket.convex_hull]) == pytest.approx(0.01, abs=2e-4)
@@ -358,9 +360,9 @@ def test_standoff_of_a_hull():
 def test_standoff_is_the_largest_signed_distance_of_all_points():
     """What is deep inside is farther from the surface than what stands off, and must not count."""
     from mitsplat.geometry.mesh import contact_points
-    from mitsplat.geometry.mesh_distance import _SAMPLES, Surface, standoff
+    from mitsplat.geometry.mesh_distance import _SAMPLES, DistanceSurface, standoff
 
-    surface = Surface(trimesh.creation.box((0.04, 0.04, 0.04)))
+    surface = DistanceSurface(trimesh.creation.box((0.04, 0.04, 0.04)))
     inside = trimesh.creation.icosphere(3, 0.005)
     bump = trimesh.creation.icosphere(2, 0.002).apply_translation((0.02, 0.003, 0.001))
     assert standoff(surface, [inside]) == 0

@@ -18,7 +18,7 @@ from mitsplat.capture.capture_photos import CaptureResult, CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult, make_asset, make_photo_asset, read_fit
 from mitsplat.reconstruct.asset_report import _directions
@@ -63,7 +63,7 @@ def test_mesh_and_splats_share_the_frame_of_the_truth(
     assert asset.mesh is not None
     assert asset.mesh.is_volume
     assert len(asset.pieces) == 1
-    distance = np.abs(Surface(known_object.mesh).signed_distances(np.asarray(asset.mesh.sample(3000, seed=0))))
+    distance = np.abs(DistanceSurface(known_object.mesh).signed_distances(np.asarray(asset.mesh.sample(3000, seed=0))))
     assert distance.mean() < 0.004 * known_object.mesh.scale
     assert asset.check() == ()
     found = done.verdict

@@ -16,7 +16,7 @@ from mitsplat.asset import read_mesh
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import prepare_mesh
-from mitsplat.geometry.mesh_distance import Surface
+from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.surface import SurfaceSettings, _sealed, reconstruct_surface, simplify_surface
@@ -42,10 +42,10 @@ def test_surface_is_that_of_the_solid(known_object: KnownObject, surface: trimes
 
 def test_depth_opens_the_pocket_that_no_silhouette_shows(known_object: KnownObject, surface: trimesh.Trimesh) -> None:
     middle = np.array([[-0.01, 0.0, 0.035]])
-    assert Surface(known_object.mesh.convex_hull).signed_distances(middle)[0] < -0.005
-    depth = float(Surface(known_object.mesh).signed_distances(middle)[0])
+    assert DistanceSurface(known_object.mesh.convex_hull).signed_distances(middle)[0] < -0.005
+    depth = float(DistanceSurface(known_object.mesh).signed_distances(middle)[0])
     assert depth > 0.009
-    assert Surface(surface).signed_distances(middle)[0] == pytest.approx(depth, abs=0.001)
+    assert DistanceSurface(surface).signed_distances(middle)[0] == pytest.approx(depth, abs=0.001)
 
 
 def test_the_table_ends_what_no_camera_looks_under(known_object: KnownObject) -> None:
@@ -65,7 +65,7 @@ def test_the_table_ends_what_no_camera_looks_under(known_object: KnownObject) ->
 def test_surroundings_need_no_masks(known_object: KnownObject) -> None:
     cameras, _ = views_of(known_object)
     found = reconstruct_surface(known_object.splats, cameras, settings=SurfaceSettings(voxels=64))
-    assert np.abs(Surface(known_object.mesh).signed_distances(np.asarray(found.vertices))).mean() < 0.002
+    assert np.abs(DistanceSurface(known_object.mesh).signed_distances(np.asarray(found.vertices))).mean() < 0.002
 
 
 def test_simplified_surfaces_stay_watertight() -> None:

@@ -58,7 +58,7 @@ def twin(encoded: np.ndarray, points: np.ndarray, matrix: np.ndarray, wear: floa
 
 def test_colours_and_dirt_are_those_of_the_slow_twin() -> None:
     ensure_variant()
-    from mitsplat.renderer.splatting.splat_appearance import Appearance, changed
+    from mitsplat.renderer.splatting.splat_appearance import SplatAppearance, changed
 
     rng = np.random.default_rng(1)
     encoded, points = rng.uniform(0, 1.2, (300, 3)), rng.uniform(-0.05, 0.05, (300, 3))
@@ -68,7 +68,7 @@ def test_colours_and_dirt_are_those_of_the_slow_twin() -> None:
         (np.eye(3), 1.0, 8388607, 0.07),
         (3 * MATRIX, 0.5, 12345, 0.1),
     ):
-        row = [mi.Float(v) for v in Appearance(tuple(matrix.ravel()), wear, seed, size).row]
+        row = [mi.Float(v) for v in SplatAppearance(tuple(matrix.ravel()), wear, seed, size).row]
         point = mi.Vector3f(*points.T.astype(np.float32))
         seen = changed([mi.Float(c.astype(np.float32)) for c in encoded.T], row, point)
         expected = twin(encoded, points, matrix, wear, seed, size)

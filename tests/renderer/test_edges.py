@@ -109,11 +109,11 @@ def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -
 def test_chosen_tiles_are_counted_as_by_hand() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.tile_subset import ChosenTiles
+    from mitsplat.renderer.splatting.tile_subset import TileSubset
 
     view, random = view_of(make_sensor(CAMERA)), np.random.default_rng(1)
     flags = random.random((view.tiles_y, view.tiles_x)) < 0.1
-    chosen = ChosenTiles.of(mi.Bool(flags.ravel()), view)
+    chosen = TileSubset.of(mi.Bool(flags.ravel()), view)
     assert np.array_equal(np.array(chosen.number), np.flatnonzero(flags))
     (x0, x1), (y0, y1) = (np.sort(random.integers(0, n + 1, (2, 200)), axis=0) for n in (view.tiles_x, view.tiles_y))
     found = np.array(chosen.any_in(*(mi.UInt32(v.astype(np.uint32)) for v in (x0, x1, y0, y1))))
@@ -129,13 +129,13 @@ def test_chosen_tiles_are_counted_as_by_hand() -> None:
 def test_a_box_of_tiles_counts_as_the_same_tiles_chosen_one_by_one() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.tile_subset import ChosenTiles, TileBox
+    from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
     view = view_of(make_sensor(CAMERA))
     box = TileBox.around(mi.UInt32([3, 5, 2, 4, 2, 4, 3, 7]), view)
     flags = np.zeros((view.tiles_y, view.tiles_x), bool)
     flags[2:7, 2:5] = True
-    chosen = ChosenTiles.of(mi.Bool(flags.ravel()), view)
+    chosen = TileSubset.of(mi.Bool(flags.ravel()), view)
     assert (box.count, np.array(box.number).tolist()) == (15, np.array(chosen.number).tolist())
     begin, size = (mi.UInt32([row * view.tiles_x + 3 for row in range(2, 7)]), mi.UInt32([2, 1, 0, 2, 1]))
     for own, other in zip(box.among(begin, size), chosen.among(begin, size), strict=True):

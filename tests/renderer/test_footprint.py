@@ -14,8 +14,8 @@ from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.light import light_points as footprint
 from mitsplat.renderer.light.light_filter import GAIN, SMALL, Estimate, LightFilter
 from mitsplat.renderer.light.light_points import OFFSETS
-from mitsplat.renderer.light.lit_surface import Surface
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.light.lit_surface import LitSurface
+from mitsplat.renderer.rays.camera_rays import CameraView
 from tests.renderer.test_light import down_camera, floor, render
 
 SIZE, FINER = 24, 4
@@ -68,7 +68,7 @@ def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch
 def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
     make_integrator()
     camera = down_camera(size=9)
-    view = View(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    view = CameraView(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
     count, up = 81, mi.Vector3f(0, 0, 1)
     pixel = dr.arange(mi.UInt32, count)
     estimate = Estimate(
@@ -77,10 +77,10 @@ def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
     )
 
     def wanted(trait: Any) -> float:
-        fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+        fields: dict[str, Any] = dict.fromkeys(LitSurface.__dataclass_fields__, mi.Float(0))
         fields |= {"position": dr.zeros(mi.Point3f, count), "normal": up, "trait": mi.Float(trait)}
         fields |= {"offset": mi.Float(1), "known": dr.full(mi.Bool, True, count)}
-        rays = LightFilter(Surface(**fields), view, pixel).rays_for(estimate, 0.03, mi.Float(1))
+        rays = LightFilter(LitSurface(**fields), view, pixel).rays_for(estimate, 0.03, mi.Float(1))
         return float(np.array(rays)[40])
 
     def twin(like: float, gain: float) -> float:
@@ -96,12 +96,12 @@ def test_rays_follow_how_light_looks() -> None:
     """In equal steps of the display: fewest where it is bright, and where a dark picture is exposed for, more."""
     make_integrator()
     camera = down_camera(size=9)
-    view = View(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    view = CameraView(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
     count = 81
-    fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+    fields: dict[str, Any] = dict.fromkeys(LitSurface.__dataclass_fields__, mi.Float(0))
     fields |= {"position": dr.zeros(mi.Point3f, count), "normal": mi.Vector3f(0, 0, 1), "offset": mi.Float(1)}
     fields |= {"known": dr.full(mi.Bool, True, count)}
-    light_filter = LightFilter(Surface(**fields), view, dr.arange(mi.UInt32, count))
+    light_filter = LightFilter(LitSurface(**fields), view, dr.arange(mi.UInt32, count))
 
     def wanted(unshadowed: float, share: float = 0.5, **options: Any) -> float:
         estimate = Estimate(

@@ -20,8 +20,8 @@ ensure_variant()
 from mitsplat.renderer.light.light_filter import Estimate, LightFilter  # noqa: E402
 from mitsplat.renderer.light.light_planes import SAMPLES, Planes, between_samples  # noqa: E402
 from mitsplat.renderer.light.light_tiles import BLOCK  # noqa: E402
-from mitsplat.renderer.light.lit_surface import Surface  # noqa: E402
-from mitsplat.renderer.rays.camera_rays import View  # noqa: E402
+from mitsplat.renderer.light.lit_surface import LitSurface  # noqa: E402
+from mitsplat.renderer.rays.camera_rays import CameraView  # noqa: E402
 from mitsplat.renderer.rays.device_arrays import plain_mesh  # noqa: E402
 
 PLAIN = 0x40000001
@@ -110,14 +110,14 @@ def test_pixels_beside_a_coarse_tile_see_the_same_in_every_column() -> None:
     make_integrator()
     size = 2 * BLOCK
     camera = Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=size, height=size, fov_x=20)
-    view = View(size, size, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    view = CameraView(size, size, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
     y, x = np.mgrid[:size, :size]
     coarse = y < BLOCK
     index = np.flatnonzero((~coarse | ((x | y) & 1 == 0)).ravel()).astype(np.uint32)
-    fields: dict[str, Any] = dict.fromkeys(Surface.__dataclass_fields__, mi.Float(0))
+    fields: dict[str, Any] = dict.fromkeys(LitSurface.__dataclass_fields__, mi.Float(0))
     fields |= {"position": dr.zeros(mi.Point3f, len(index)), "normal": mi.Vector3f(0, 0, 1), "offset": mi.Float(1)}
     fields |= {"known": dr.full(mi.Bool, True, len(index))}
-    light_filter = LightFilter(Surface(**fields), view, mi.UInt32(index), mi.Bool(coarse.ravel()))
+    light_filter = LightFilter(LitSurface(**fields), view, mi.UInt32(index), mi.Bool(coarse.ravel()))
     values = mi.Float((index // size).astype(np.float32) ** 2)
     averaged = np.zeros(size * size)
     averaged[index] = np.array(light_filter.average([values])[0])

@@ -16,7 +16,7 @@ from mitsplat.dataset.preflight import doubts
 from mitsplat.errors import InputError
 from mitsplat.frames.frame import light_properties
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.layout_surroundings import Finish, draw_place, environment_at
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_place, environment_at
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
@@ -87,7 +87,7 @@ def test_every_value_of_a_material_is_within_its_range(
 
 
 def test_a_further_material_shifts_no_other_draw(scene_data: SceneData, write_scene: WriteScene) -> None:
-    def finishes() -> list[Finish]:
+    def finishes() -> list[MaterialDraw]:
         scene = load_scene(write_scene(scene_data))
         return [draw_place(scene.spec, index).finishes["table"] for index in range(12)]
 

@@ -25,16 +25,16 @@ from mitsplat.renderer.textures import (
     texture_image,
     with_gain,
 )
-from mitsplat.scene.planning.layout_surroundings import Finish
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Box, Shape
 from mitsplat.scene.walls import stated_pose
 
 COLOURS = ((0.8, 0.6, 0.4), (0.4, 0.3, 0.2))
 
 
-def finish(kind: str, **values: object) -> Finish:
+def finish(kind: str, **values: object) -> MaterialDraw:
     made = {"kind": kind, "colours": COLOURS, "scale": 0.05, "seed": 3, **values}
-    return Finish(**made)  # type: ignore[arg-type]
+    return MaterialDraw(**made)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["noise", "wood", "brushed_metal", "checker", "stripes"])
@@ -80,7 +80,7 @@ def test_a_pixel_shows_the_mean_of_what_it_covers(tmp_path: Path, distance: floa
     ensure_variant()
     cells = np.indices((64, 64)).sum(axis=0) % 2
     cv2.imwrite(str(tmp_path / "a.png"), (np.stack([cells] * 3, axis=2) * 200 + 20).astype(np.uint8))
-    tiles = Finish(kind="image", scale=0.64, rotate=20.0, image="a", gain=1.0)
+    tiles = MaterialDraw(kind="image", scale=0.64, rotate=20.0, image="a", gain=1.0)
     image = texture_image(tiles, {"a": tmp_path / "a.png"})
     assert image is not None
     shape = Shape(name="a", box=Box(size=(20, 20, 1), position=(0, 0, -0.5)), visible=True)

@@ -13,7 +13,7 @@ from mitsplat.images.colour import hue_matrix, saturation_matrix
 from mitsplat.physics.settle import _scene_hash
 from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.object_appearance import Appearance, draw_appearances
+from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
 from tests.conftest import WriteScene
 
@@ -84,7 +84,7 @@ def test_what_is_absent_stays_as_it_was(varied: Any) -> None:
 
 
 def test_properties_are_those_of_the_shape() -> None:
-    one = Appearance(1, 0, 30.0, 0.5, 0.8, (1.0, 0.9, 1.2), 0.3, 0.05, 0.0, 7)
+    one = ObjectAppearance(1, 0, 30.0, 0.5, 0.8, (1.0, 0.9, 1.2), 0.3, 0.05, 0.0, 7)
     matrix = np.array(one.properties()["colours"].split(), dtype=float).reshape(3, 3)
     colour = np.array([0.2, 0.5, 0.7])
     expected = 0.8 * np.array([1.0, 0.9, 1.2]) * (saturation_matrix(0.5) @ (hue_matrix(30) @ colour))

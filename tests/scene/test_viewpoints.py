@@ -20,7 +20,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
-from mitsplat.scene.planning.visibility_prediction import Sight
+from mitsplat.scene.planning.visibility_prediction import VisibilityPredictor
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.camera_spec import Occlusion, Truncation
 from mitsplat.storage.field_types import StrictModel
@@ -185,7 +185,7 @@ def test_prediction_agrees_with_rays_through_every_pixel(scene: Scene, wall: boo
             across = np.radians(azimuth)
             eye = 0.75 * np.array([np.cos(across), np.sin(across), 0.3])
             camera = Camera.look_at(eye, (0.05, 0, 0.02 * index), width=64, height=48, fov_x=32)
-            sight = Sight.of(scene, layout)
+            sight = VisibilityPredictor.of(scene, layout)
             found = sight.prospect(sight.framed(camera), None, None, 1)
             visible, beyond = twin(camera, placed(scene, layout), list(scene.shape_meshes))
             errors += [*np.abs(found.visible - visible)[beyond < 1], *np.abs(found.beyond - beyond)]
@@ -197,7 +197,7 @@ def test_prediction_agrees_with_rays_through_every_pixel(scene: Scene, wall: boo
 def test_prediction_counts_what_is_hidden_and_cut(scene: Scene) -> None:
     layout = layouts(scene)[0]
     camera = Camera.look_at((0.1, -0.7, 0.2), (0.1, 0, 0), width=64, height=48, fov_x=25)
-    sight = Sight.of(scene, layout)
+    sight = VisibilityPredictor.of(scene, layout)
     found = sight.prospect(sight.framed(camera), Occlusion(share=1), Truncation(share=1), 1)
     visible, beyond = twin(camera, placed(scene, layout), [])
     shown = (visible > 0) & (beyond < 1)
@@ -252,7 +252,7 @@ def test_shares_of_hidden_and_cut_objects_are_reached(scene: Scene) -> None:
         there = load_scene(scene.path, overrides={"camera": HEMISPHERE | asked, "output.layouts": 8})
         seen = hidden = cut = 0.0
         for plan, layout in views(there):
-            sight = Sight.of(there, layout)
+            sight = VisibilityPredictor.of(there, layout)
             found = sight.prospect(sight.framed(plan.camera), Occlusion(share=1), Truncation(share=1), 16)
             seen, hidden, cut = seen + found.in_view, hidden + found.hidden, cut + found.cut
         return hidden / seen, cut / seen

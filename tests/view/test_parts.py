@@ -16,11 +16,11 @@ from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, PointLight, SpotLight
 from mitsplat.view.scene_parts import (
-    Cloud,
     Frustum,
     Lines,
-    Part,
-    Surface,
+    ShownMesh,
+    ShownPart,
+    ShownSplats,
     asset_parts,
     base_colours,
     bounds_of,
@@ -42,7 +42,7 @@ def layout_at(scene: Scene, *heights: float) -> Layout:
     return Layout.of_poses(scene, {"nut": [pose_at((0.1 * i, 0, z)) for i, z in enumerate(heights)]})
 
 
-def named(parts) -> dict[str, Part]:
+def named(parts) -> dict[str, ShownPart]:
     return {part.name: part for part in parts}
 
 
@@ -127,12 +127,12 @@ def test_a_large_cloud_is_thinned_and_covers_as_much():
         opacities=np.full(count, 0.5),
         sh=np.zeros((count, 1, 3)),
     )
-    kept = Cloud(splats).thinned(25)
+    kept = ShownSplats(splats).thinned(25)
     assert len(kept) == 25
     assert np.diff(kept.means[:, 0] / 3) == pytest.approx(np.full(24, 4), abs=1.01)  # evenly
     area, whole = (float(np.prod(some.scales[:, :2], axis=1).sum()) for some in (kept, splats))
     assert area == pytest.approx(whole)
-    assert Cloud(splats).thinned(count) is splats
+    assert ShownSplats(splats).thinned(count) is splats
 
 
 def test_colours_are_those_from_all_sides_on_average():
@@ -153,11 +153,14 @@ def test_an_asset_shows_its_splats_mesh_pieces_and_keypoints():
 def test_things_that_look_the_same_are_not_sent_again():
     pose = look_at_pose((1, 0, 1), (0, 0, 0))
     line = np.zeros((1, 2, 3))
-    one = {"a": Part("/a/a", Lines(line, (1, 2, 3)), pose), "b": Part("/b/b", Surface(box_asset("x").mesh, (1, 1, 1)))}
+    one = {
+        "a": ShownPart("/a/a", Lines(line, (1, 2, 3)), pose),
+        "b": ShownPart("/b/b", ShownMesh(box_asset("x").mesh, (1, 1, 1))),
+    }
     other = {
-        "a": Part("/a/a", Lines(line.copy(), (1, 2, 3)), pose.copy()),
-        "b": Part("/b/b", Surface(box_asset("x").mesh, (1, 1, 1))),
+        "a": ShownPart("/a/a", Lines(line.copy(), (1, 2, 3)), pose.copy()),
+        "b": ShownPart("/b/b", ShownMesh(box_asset("x").mesh, (1, 1, 1))),
     }
     assert changes(one, other) == ([], [], [])
-    other["b"] = replace(other["b"], thing=Surface(box_asset("x", (0.1, 0.1, 0.1)).mesh, (1, 1, 1)))
+    other["b"] = replace(other["b"], thing=ShownMesh(box_asset("x", (0.1, 0.1, 0.1)).mesh, (1, 1, 1)))
     assert changes(one, other)[0] == ["b"]

@@ -7,7 +7,7 @@ captures.
 
 from __future__ import annotations
 
-from mitsplat.capture.isolation.object_choice import ChosenObject, Pick, View, choose_object
+from mitsplat.capture.isolation.object_choice import ChosenObject, PhotoView, Pick, choose_object
 from mitsplat.capture.isolation.occluding_points import hidden_part
 
-__all__ = ["ChosenObject", "Pick", "View", "choose_object", "hidden_part"]
+__all__ = ["ChosenObject", "PhotoView", "Pick", "choose_object", "hidden_part"]

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from mitsplat.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from mitsplat.capture.isolation.support import Support, find_support
+from mitsplat.capture.isolation.support import SupportSurface, find_support
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 
@@ -40,7 +40,7 @@ _LOW = 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PhotoView:
     """A camera, and which of the points it observes.
 
     Attributes:
@@ -63,7 +63,7 @@ class Pick:
     """
 
     name: str
-    view: View
+    view: PhotoView
     pixel: tuple[float, float]
 
 
@@ -84,7 +84,7 @@ class ChosenObject:
 
 def choose_object(
     points: Float64Array,
-    views: Sequence[View],
+    views: Sequence[PhotoView],
     *,
     picks: Sequence[Pick] = (),
     picks_not: Sequence[Pick] = (),
@@ -184,7 +184,7 @@ def _picked(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
     return int(thing[shown[int(gaps.argmin())]])
 
 
-def _feet(own: Float64Array, height: Float64Array, support: Support) -> Float64Array:
+def _feet(own: Float64Array, height: Float64Array, support: SupportSurface) -> Float64Array:
     """Where the lowest points stand; all, if few are low. Points as low as the support cannot be told from it."""
     low = own[height < _LOW * height.max()]
     feet = (low if len(low) >= 5 else own).copy()

@@ -28,7 +28,7 @@ _BELOW = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
+class SupportSurface:
     """A surface z = h(x, y) over a square.
 
     Attributes:
@@ -48,7 +48,7 @@ class Support:
         return np.asarray(_interpolation(points, self.low, self.cell, len(self.heights)) @ self.heights.ravel())
 
 
-def find_support(points: Float64Array, middle: Float64Array, radius: float) -> Support:
+def find_support(points: Float64Array, middle: Float64Array, radius: float) -> SupportSurface:
     """The surface that things stand on within ``radius`` of ``middle`` (3,), z up.
 
     Args:
@@ -74,7 +74,7 @@ def find_support(points: Float64Array, middle: Float64Array, radius: float) -> S
         gap = points[:, 2] - sample @ heights
     inside = np.abs(gap) < tolerance
     roughness = float(np.sqrt((gap[inside] ** 2).mean())) if inside.any() else tolerance
-    return Support(low, cell, heights.reshape(nodes, nodes), roughness)
+    return SupportSurface(low, cell, heights.reshape(nodes, nodes), roughness)
 
 
 def _interpolation(points: Float64Array, low: Float64Array, cell: float, nodes: int) -> csr_array:

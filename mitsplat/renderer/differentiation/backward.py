@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import KERNELS, Quality
-from mitsplat.renderer.rays.camera_rays import TILE_WIDTH, View
+from mitsplat.renderer.rays.camera_rays import TILE_WIDTH, CameraView
 from mitsplat.renderer.splatting.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.renderer.splatting.march import march
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
@@ -34,7 +34,7 @@ PAIRS_AT_ONCE = 1 << 20
 """Pairs of a Gaussian and a tile whose gradients are held at once, 512 bytes each."""
 
 
-def render_differentiable(cloud: Cloud, view: View, quality: Quality) -> tuple[list[Any], Any]:
+def render_differentiable(cloud: Cloud, view: CameraView, quality: Quality) -> tuple[list[Any], Any]:
     """Display-encoded colour (three flat row-major arrays, times alpha) and alpha, with gradients to the cloud.
 
     Args:
@@ -67,7 +67,7 @@ _RED, _DEPTH = 6, 9
 """Places in a view record."""
 
 
-def _check(view: View, quality: Quality) -> None:
+def _check(view: CameraView, quality: Quality) -> None:
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
         raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
     if quality.extends:
@@ -93,7 +93,7 @@ class Eye:
         numbers: What cameras of its kind differ in, on the device.
     """
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: CameraView) -> None:
         nothing = CloudSet((1,), (0,), None, None, None, 0, 0)
         table, _, _ = placement_table(nothing, [_PLACE], view)
         self.view, self.numbers = view, view.numbers | {"table": table}
@@ -110,7 +110,9 @@ def project_cloud(
         numbers: Those of an :class:`Eye`.
         quality: Cut-offs and SH degree.
     """
-    projector = Projector(_only(cloud), numbers["table"], View.of_numbers(kind, numbers), quality, at_camera=False)
+    projector = Projector(
+        _only(cloud), numbers["table"], CameraView.of_numbers(kind, numbers), quality, at_camera=False
+    )
     return projector.every_record(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))[:4]
 
 
@@ -146,7 +148,7 @@ def _send_back(values: Any, gradient: Any) -> None:
     dr.traverse(dr.ADMode.Backward)
 
 
-class Rendering:
+class RenderOp:
     """An image of view records, and the way back from its gradients to theirs.
 
     Args:
@@ -159,7 +161,7 @@ class Rendering:
         alpha: Opacity.
     """
 
-    def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
+    def __init__(self, lists: TileLists, view: CameraView, quality: Quality) -> None:
         self._lists, self._view, self._quality = lists, view, quality
         tiles = Table(lists.entries), lists.records, lists.start, lists.stop
         self.rgb, self.alpha, self._slopes = _image(view.kind, view.numbers, quality, *tiles)
@@ -186,7 +188,7 @@ def _image(
     kind: tuple[Any, ...], numbers: dict[str, Any], quality: Quality, entries: Any, records: Any, start: Any, stop: Any
 ) -> tuple[list[Any], Any, Any]:
     """Colours and alpha of the rays of a view, and their slopes if its lens distorts them."""
-    view = View.of_numbers(kind, numbers)
+    view = CameraView.of_numbers(kind, numbers)
     lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
     # The way back needs them again, and to undo a lens's distortion takes longer than a march.
     slopes = Lanes(lists, view).centre_slopes() if view.distortion else None
@@ -211,7 +213,7 @@ def _way_back(
     slopes: Any,
 ) -> Any:
     """Gradient of the view records from those of colours and alpha, with room for so many pairs."""
-    view = View.of_numbers(kind, numbers)
+    view = CameraView.of_numbers(kind, numbers)
     lists = _bare_lists(entries, slots, first, records, start, stop, room)
     return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
 
@@ -222,12 +224,12 @@ def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, 
     return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACE.instance, None)
 
 
-class DepthRendering(Rendering):
+class DepthRendering(RenderOp):
     """A rendering and the sum ``moment`` of the centres' depths [m] by their weights in alpha."""
 
-    def __init__(self, lists: TileLists, view: View, quality: Quality) -> None:
+    def __init__(self, lists: TileLists, view: CameraView, quality: Quality) -> None:
         super().__init__(lists, view, quality)
-        self._depths = Rendering(replace(lists, records=_tinted(lists.records)), view, quality)
+        self._depths = RenderOp(replace(lists, records=_tinted(lists.records)), view, quality)
         self.moment = self._depths.rgb[0]
 
     def gradient_of_moment(self, moment: Any) -> Any:
@@ -241,8 +243,8 @@ class DepthRendering(Rendering):
 
 
 def render_records(
-    records: Any, least: Any, box: Any, view: View, quality: Quality, *, depth: bool = False
-) -> Rendering:
+    records: Any, least: Any, box: Any, view: CameraView, quality: Quality, *, depth: bool = False
+) -> RenderOp:
     """The image of what :func:`project_cloud` found; a :class:`DepthRendering` if it is to have depth.
 
     Raises:
@@ -251,7 +253,7 @@ def render_records(
     """
     _check(view, quality)
     lists = bin_records(records, None, least, box, view, quality, _PLACE.instance, for_gradients=True)
-    return (DepthRendering if depth else Rendering)(lists, view, quality)
+    return (DepthRendering if depth else RenderOp)(lists, view, quality)
 
 
 def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, bands: int) -> Cloud:
@@ -287,9 +289,9 @@ def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, ban
 class _March(dr.CustomOp):
     """The march as a function of the view records."""
 
-    def eval(self, records: Any, context: Callable[[], tuple[TileLists, View, Quality]]) -> tuple[Any, ...]:
+    def eval(self, records: Any, context: Callable[[], tuple[TileLists, CameraView, Quality]]) -> tuple[Any, ...]:
         lists, view, quality = context()
-        self.rendering = Rendering(replace(lists, records=records), view, quality)
+        self.rendering = RenderOp(replace(lists, records=records), view, quality)
         return (*self.rendering.rgb, self.rendering.alpha)
 
     def backward(self) -> None:
@@ -303,7 +305,7 @@ class _March(dr.CustomOp):
 
 def march_backward(
     lists: TileLists,
-    view: View,
+    view: CameraView,
     quality: Quality,
     seen: list[Any],
     gradient: list[Any],
@@ -365,7 +367,7 @@ def _parts(lists: TileLists) -> Iterator[tuple[TileLists, Any]]:
 
 def _gradient(
     lists: TileLists,
-    view: View,
+    view: CameraView,
     quality: Quality,
     seen: list[Any],
     gradient: list[Any],

@@ -23,7 +23,7 @@ import trimesh
 from mitsplat.geometry.camera import Camera, Lens
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
-from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, View
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 from mitsplat.renderer.splatting.gaussian import RECORD
 from mitsplat.renderer.splatting.pairs import CrowdedError
@@ -44,7 +44,7 @@ _INVERTED = 0.01
 
 
 def splat_silhouettes(
-    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality
+    clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality
 ) -> dict[int, Silhouette]:
     """Silhouettes of the instances above 0 by their splats; instances without any pixel are absent."""
     objects = [placement for placement in placements if placement.instance > 0]
@@ -58,7 +58,7 @@ def splat_silhouettes(
 
 
 def _cover(
-    clouds: CloudSet, objects: Sequence[Placement], canvas: View, quality: Quality, ids: np.ndarray
+    clouds: CloudSet, objects: Sequence[Placement], canvas: CameraView, quality: Quality, ids: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tile, instance (as position in ``ids``) and covered pixels of every run, see :func:`_covered`.
 
@@ -87,7 +87,7 @@ def _cover(
 
 
 def proxy_silhouettes(
-    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: View
+    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: CameraView
 ) -> dict[int, Silhouette]:
     """The same by proxy meshes: (mesh, world_from_mesh) of every part of an instance, by the instance's id."""
     canvas, left, top = _canvas(view)
@@ -106,7 +106,7 @@ def proxy_silhouettes(
     return found
 
 
-def _canvas(view: View) -> tuple[View, int, int]:
+def _canvas(view: CameraView) -> tuple[CameraView, int, int]:
     """The view on a larger canvas, and where on it the image begins."""
     share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion, view.lens)
     left, top = int(share * view.width), int(share * view.height)
@@ -188,7 +188,7 @@ def _runs(lists: TileLists) -> _Runs:
     return _Runs(place, slot, start, stop)
 
 
-def _covered(lists: TileLists, view: View, quality: Quality, runs: _Runs) -> Any:
+def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) -> Any:
     """For every run and each column of its tile, the pixels that the instance covers, as bits from the top."""
     lane = dr.arange(mi.UInt32, dr.width(runs.place) * TILE_WIDTH)
     run, column = lane // TILE_WIDTH, lane % TILE_WIDTH
@@ -225,7 +225,7 @@ def _covered(lists: TileLists, view: View, quality: Quality, runs: _Runs) -> Any
 
 
 def _assemble(
-    tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: View, left: int, top: int
+    tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: CameraView, left: int, top: int
 ) -> dict[int, Silhouette]:
     """Masks of whole instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)
@@ -250,7 +250,7 @@ def _assemble(
     return found
 
 
-def _window(view: View, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
+def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
     """Box of pixels on the canvas that meshes may cover, or None."""
     camera = view.camera
     points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
@@ -262,7 +262,7 @@ def _window(view: View, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> 
     return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (high > low).all() else None
 
 
-def _trace_alone(view: View, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray) -> Any:
+def _trace_alone(view: CameraView, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray) -> Any:
     """Whether the rays of a window of pixels meet a mesh."""
     x0, y0, x1, y1 = window
     lane = dr.arange(mi.UInt32, (x1 - x0) * (y1 - y0))

@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.lit_surface import Surface
+from mitsplat.renderer.light.lit_surface import LitSurface
 
 CAPTURED_SPECULAR = 0.08
 """Reflectance up to which the light tent's mirror image counts as part of a captured colour, to be replaced by that of
@@ -42,7 +42,7 @@ class Lobe:
     specular: Any
 
     @classmethod
-    def of(cls, surface: Surface) -> Lobe:
+    def of(cls, surface: LitSurface) -> Lobe:
         """The lobes of visible points."""
         alpha = dr.square(dr.maximum(surface.roughness, LEAST_ROUGHNESS))
         return cls(surface.normal, surface.to_camera, alpha, surface.specular)
@@ -89,7 +89,7 @@ class Lobe:
         return dr.select(self.specular > 0, dr.fma(1 - self.specular, grazing, self.specular), 0)
 
 
-def mirrored_tent(surface: Surface) -> Any:
+def mirrored_tent(surface: LitSurface) -> Any:
     """Part of the captured colour that is light of the tent, mirrored: the lobe's reflectance under even light.
 
     Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60 degrees: colours

@@ -32,11 +32,11 @@ from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
 from mitsplat.renderer.light.highlight import Lobe, mirrored_tent
 from mitsplat.renderer.light.light_filter import NOWHERE, RADIUS, Estimate, LightFilter, packed
 from mitsplat.renderer.light.light_planes import LEAST_ROWS, Planes, between_samples, plane_codes
-from mitsplat.renderer.light.light_points import Points
+from mitsplat.renderer.light.light_points import LightPoints
 from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, Tiles, block_order, parity
-from mitsplat.renderer.light.lit_surface import Surface, VisibleSurfaces
+from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
 from mitsplat.renderer.occluders.proxies import Proxies, Stopper
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
 from mitsplat.renderer.splatting.sorting import stable_order
 
@@ -156,7 +156,7 @@ def light_factor(
     dr.eval(here)
     light_filter = LightFilter(here, view, index, plane and plane.coarse)
     order = _blockwise(light_filter.place, view)
-    points = Points.of(visible, here, index, light_filter.place, order)
+    points = LightPoints.of(visible, here, index, light_filter.place, order)
     pixels = dr.gather(mi.UInt32, index, points.owner)
     tracer = _Tracer(emitters, proxies, points.surface, pixels, view, seed, plane and plane.lattice)
     estimate = Estimate.nothing(dr.width(points.owner))
@@ -225,7 +225,7 @@ def light_factor(
     return light, highlight
 
 
-def _open_light(emitters: Emitters, points: Points, special: Any) -> tuple[Any, Any, Any]:
+def _open_light(emitters: Emitters, points: LightPoints, special: Any) -> tuple[Any, Any, Any]:
     """Means over the points of pixels, without occluders: irradiance, mirrored light, and what the tent's takes."""
     rows = points.rows(special)
     own = gathered(points.surface, rows)
@@ -312,7 +312,7 @@ def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
     return level, extra
 
 
-def _blockwise(place: Any, view: View) -> Any:
+def _blockwise(place: Any, view: CameraView) -> Any:
     """What an image ``place`` holds, less where it is NOWHERE, in the order of :func:`block_order`."""
     pixel, inside = block_order(view)
     ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), NOWHERE)
@@ -331,9 +331,9 @@ class _Tracer:
 
     emitters: Emitters
     proxies: Proxies
-    surface: Surface
+    surface: LitSurface
     pixel: Any
-    view: View
+    view: CameraView
     seed: int
     lattice: Any = None
 
@@ -484,12 +484,12 @@ class _Tracer:
         return start + _bayer(x, y)
 
 
-def _origin(surface: Surface) -> Any:
+def _origin(surface: LitSurface) -> Any:
     """Where shadow rays start: on the smooth surface that the proxy stands for, and off the triangle itself."""
     return surface.position + surface.lift + surface.face * surface.offset
 
 
-def _packed_rays(surface: Surface, chosen: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
+def _packed_rays(surface: LitSurface, chosen: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
     """Origins of shadow rays, normals, offsets and instances at pixels in any order, of the points of all of them.
 
     The offset is 0 where no point is ``chosen``. Together in memory, because fetching them takes half of the time.

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 
 RADIUS = 4
 """Of the filter [px]."""
@@ -100,7 +100,7 @@ class LightFilter:
     the known neighbours that show the same thing.
     """
 
-    def __init__(self, here: Any, view: View, index: Any, coarse: Any = None, stride: int = 1) -> None:
+    def __init__(self, here: Any, view: CameraView, index: Any, coarse: Any = None, stride: int = 1) -> None:
         """A filter at the pixels ``index`` of an image, which show the points ``here``.
 
         Neighbours are ``stride`` pixels apart. Where ``coarse`` is true of a pixel of the image, its neighbours are two

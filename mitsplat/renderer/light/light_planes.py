@@ -16,8 +16,8 @@ import mitsuba as mi
 
 from mitsplat.renderer.light.light_filter import Estimate
 from mitsplat.renderer.light.light_tiles import BLOCK
-from mitsplat.renderer.light.lit_surface import Surface
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.light.lit_surface import LitSurface
+from mitsplat.renderer.rays.camera_rays import CameraView
 
 SAMPLES = (BLOCK // 2) ** 2
 """Pixels that stand for a coarse tile."""
@@ -39,7 +39,7 @@ _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1)
 _NEEDED, _PLAIN = 0x80000000, 0x40000000
 
 
-def plane_codes(surface: Surface, eye: Any) -> Any:
+def plane_codes(surface: LitSurface, eye: Any) -> Any:
     """A number for the plane and the material at every pixel, 0 where light may not be even: on objects, or shiny.
 
     Normals and the camera's distance to the plane are rounded, off the values that drawn planes have.
@@ -69,10 +69,10 @@ class Planes:
 
     number: Any
     place: Any
-    view: View
+    view: CameraView
 
     @classmethod
-    def of(cls, codes: Any, needed: Any, view: View) -> Planes:
+    def of(cls, codes: Any, needed: Any, view: CameraView) -> Planes:
         """The tiles of which light is needed and all pixels have one code, as those right of it and below have."""
         across, down = -(-view.width // BLOCK), -(-view.height // BLOCK)
         tile = dr.arange(mi.UInt32, across * down)
@@ -163,7 +163,7 @@ class Planes:
         return -(-self.view.width // BLOCK)
 
 
-def between_samples(light: Any, coarse: Any, view: View) -> Any:
+def between_samples(light: Any, coarse: Any, view: CameraView) -> Any:
     """Light (Color3f), in coarse tiles linear between their samples."""
     pixel = dr.arange(mi.UInt32, view.width * view.height)
     x, y = pixel % view.width, pixel // view.width

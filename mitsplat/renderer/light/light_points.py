@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.renderer.light.light_filter import NOWHERE, Estimate
-from mitsplat.renderer.light.lit_surface import Surface, VisibleSurfaces
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated, gathered, wrapped
 
 OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
@@ -28,7 +28,7 @@ EVEN = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class LightPoints:
     """The points of some pixels: in row i the middle of pixel i, then the first of those of bent ones, their second...
 
     Attributes:
@@ -38,14 +38,14 @@ class Points:
         count, bent: Number of pixels, and of bent ones among them.
     """
 
-    surface: Surface
+    surface: LitSurface
     owner: Any
     slot: Any
     count: int
     bent: int
 
     @classmethod
-    def of(cls, visible: VisibleSurfaces, here: Surface, index: Any, place: Any, order: Any) -> Points:
+    def of(cls, visible: VisibleSurfaces, here: LitSurface, index: Any, place: Any, order: Any) -> LightPoints:
         """The points of the pixels ``index``, whose middles show ``here``.
 
         ``place`` says of all pixels where in ``index`` they are, ``order`` in which order to trace them.
@@ -74,8 +74,8 @@ class Points:
             found |= dr.gather(mi.Bool, around.valid, place_of + dr.opaque(mi.UInt32, start))
         middle = (number == 0) & ~found
         own = gathered(here, owner)
-        columns = [(getattr(here, f.name), getattr(around, f.name), getattr(own, f.name)) for f in fields(Surface)]
-        surface = Surface(*[concatenated([a, dr.select(middle, c, b)]) for a, b, c in columns])
+        columns = [(getattr(here, f.name), getattr(around, f.name), getattr(own, f.name)) for f in fields(LitSurface)]
+        surface = LitSurface(*[concatenated([a, dr.select(middle, c, b)]) for a, b, c in columns])
         owner = concatenated([dr.arange(mi.UInt32, count), owner])
         dr.eval(surface, owner, slot)
         return cls(surface, owner, slot, count, bent)
@@ -123,7 +123,7 @@ class Points:
         return [dr.opaque(mi.UInt32, self.count + number * self.bent) for number in range(len(OFFSETS))]
 
 
-def _bends(here: Surface, index: Any, place: Any, view: View) -> Any:
+def _bends(here: LitSurface, index: Any, place: Any, view: CameraView) -> Any:
     """Whether pixels border on others that show another thing, or, of objects, one in another direction."""
     x, y = mi.Int32(index % view.width), mi.Int32(index // view.width)
     thing, bends = here.instance > 0, mi.Bool(False)

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 
 BLOCK = 8
 """Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
@@ -21,7 +21,7 @@ TOGETHER = 3
 """Rays that are stopped in a quarter of a tile from which on this is a shadow, and no chance."""
 
 
-def block_order(view: View) -> tuple[Any, Any]:
+def block_order(view: CameraView) -> tuple[Any, Any]:
     """Pixels in an order for tracing, and whether they lie in the image.
 
     Those that share their place in a block, in blocks of one :func:`parity`, take the same point of the low-discrepancy
@@ -61,10 +61,10 @@ class Tiles:
     known: Any
     around: Any
     uneven: Any
-    view: View
+    view: CameraView
 
     @classmethod
-    def of(cls, arriving: Any, lost: Any, view: View) -> Tiles:
+    def of(cls, arriving: Any, lost: Any, view: CameraView) -> Tiles:
         """Of light (Color3f) that arrives without dynamic objects, and that they take, in :func:`block_order`.
 
         Sums are made in a fixed order, so that they do not depend on threads.

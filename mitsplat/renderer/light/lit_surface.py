@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mitsplat.renderer.light.light_traits import Traits
 from mitsplat.renderer.occluders.proxies import Hit, Proxies
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
 
 AGREEMENT = 0.02
@@ -18,7 +18,7 @@ AGREEMENT = 0.02
 
 
 @dataclass(eq=False)
-class Surface:
+class LitSurface:
     """Visible points.
 
     Attributes:
@@ -84,18 +84,18 @@ class VisibleSurfaces:
     """
 
     traits: Traits
-    view: View
+    view: CameraView
     proxies: Proxies
     eye: Any
     seen: Seen
     hit: Hit
     static: Hit
 
-    def at(self, pixel: Any) -> Surface:
+    def at(self, pixel: Any) -> LitSurface:
         """Points in the middle of pixels: on the proxy where it agrees with what is seen, else at the seen depth."""
         return self._surface(gathered(self.seen, pixel), gathered(self.hit, pixel), gathered(self.static, pixel))
 
-    def beside(self, pixel: Any, offset: Any) -> Surface:
+    def beside(self, pixel: Any, offset: Any) -> LitSurface:
         """Points ``offset`` [px] (Point2f) off the middles of pixels, valid where a proxy of the same instance is."""
         row = pixel // self.view.width
         x, y = mi.Float(pixel - row * self.view.width) + 0.5, mi.Float(row) + 0.5
@@ -107,7 +107,7 @@ class VisibleSurfaces:
         dr.eval(surface)
         return surface
 
-    def _surface(self, seen: Seen, hit: Hit, static: Hit) -> Surface:
+    def _surface(self, seen: Seen, hit: Hit, static: Hit) -> LitSurface:
         ray, depth, instance = mi.Ray3f(self.eye, seen.direction), seen.depth, seen.instance
         cosine = self.view.cosine(ray)
         met = hit.distance < dr.inf
@@ -124,7 +124,7 @@ class VisibleSurfaces:
         position = ray(z / cosine)
         valid = (seen.alpha > 1 / 255) & (z > 0)
         reach = dr.max(dr.abs(position))
-        return Surface(
+        return LitSurface(
             position=position,
             normal=mi.Vector3f(dr.select(same, shown[0], towards)),
             face=mi.Vector3f(dr.select(same, shown[1], towards)),

@@ -21,7 +21,7 @@ import numpy as np
 from mitsplat.renderer.light.emitter_sampling import receiver
 from mitsplat.renderer.meshes.mirrored_splats import Glimpse, SplatMirror
 from mitsplat.renderer.occluders.proxies import Hit, Proxies
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered, ray_scene, wrapped
 from mitsplat.renderer.splatting.gaussian import srgb_to_linear
 
@@ -132,7 +132,7 @@ class VisibleMeshes:
             return hit.is_valid()
         return dr.gather(mi.Bool, self.plain, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
 
-    def trace(self, view: View, rays: Any, at: tuple[Any, Any] | None = None) -> Behind:
+    def trace(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None) -> Behind:
         """What camera rays meet: those through positions ``at`` [px], or through the centres of all pixels."""
         hit = self.scene.ray_intersect_preliminary(rays, coherent=True)
         si = hit.compute_surface_interaction(rays)
@@ -145,7 +145,7 @@ class VisibleMeshes:
         dr.eval(behind)
         return behind
 
-    def _reflectance(self, view: View, rays: Any, at: tuple[Any, Any] | None, si: Any, active: Any) -> Any:
+    def _reflectance(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None, si: Any, active: Any) -> Any:
         """Diffuse albedo (Color3f) where rays meet meshes; of patterns, its mean over the pixel's footprint.
 
         The footprint is the parallelogram of ray differentials (Igehy 1999), sampled at ``FOOTPRINT`` squared points.
@@ -182,7 +182,7 @@ class SeenLights:
     everywhere: bool
 
     @classmethod
-    def trace(cls, scene: Any, view: View, rays: Any) -> SeenLights | None:
+    def trace(cls, scene: Any, view: CameraView, rays: Any) -> SeenLights | None:
         """What the camera's rays see of a scene's emitters; None if it has none that can be seen."""
         sky = scene.environment()
         if any(shape.is_emitter() for shape in scene.shapes()):
@@ -243,7 +243,7 @@ class PathTracer:
     bounce: bool
     seed: int
 
-    def radiance(self, view: View, ray: Any, hit: Any, pixel: Any, samples: int) -> Any:
+    def radiance(self, view: CameraView, ray: Any, hit: Any, pixel: Any, samples: int) -> Any:
         """Mean (Color3f) over ``samples`` paths from each of some pixels, in the picture's scale.
 
         ``ray`` through the pixel's centre meets a mesh at ``hit``. Other rays of the pixel start paths where they do.
@@ -269,7 +269,7 @@ class PathTracer:
             done += own
         return total / samples
 
-    def _beside(self, view: View, dice: _Dice, ray: Any, hit: Any) -> tuple[Any, Any]:
+    def _beside(self, view: CameraView, dice: _Dice, ray: Any, hit: Any) -> tuple[Any, Any]:
         """Rays through random points of the pixels and what they meet; through the centres where that is plain."""
         row = dice.pixel // view.width
         other = mi.Ray3f(ray)

@@ -24,7 +24,7 @@ Kind = tuple[int, int, int, Lens, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """Intrinsics, lens distortion and pose of one camera, see :class:`mitsplat.geometry.camera.Camera`.
 
     Attributes:
@@ -91,7 +91,7 @@ class View:
         return self._opaque | ({"extent": self._extent} if self.distortion else {})
 
     @classmethod
-    def of_numbers(cls, kind: Kind, numbers: Mapping[str, Any]) -> View:
+    def of_numbers(cls, kind: Kind, numbers: Mapping[str, Any]) -> CameraView:
         """A view that knows no more than its kind and :attr:`numbers`: enough to project, not to march."""
         view = object.__new__(cls)
         width, height, coefficients, lens, samples, zoom = kind
@@ -112,11 +112,11 @@ class View:
         """Number of tiles along y."""
         return -(-self.height // TILE_HEIGHT)
 
-    def sampled(self, samples: int) -> View:
+    def sampled(self, samples: int) -> CameraView:
         """The same view with ``samples`` x ``samples`` rays per pixel."""
         return self if samples == self.samples else replace(self, samples=samples)
 
-    def finer(self, zoom: int) -> View:
+    def finer(self, zoom: int) -> CameraView:
         """The same view in ``zoom`` x ``zoom`` pixels for each of its own."""
         numbers: dict[str, Any] = {n: zoom * getattr(self, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
         return replace(self, zoom=zoom * self.zoom, **numbers)
@@ -136,7 +136,7 @@ class View:
             self.focus_distance,
         )
 
-    def apertures(self, rings: int) -> list[View]:
+    def apertures(self, rings: int) -> list[CameraView]:
         """Views through evenly spaced points of the aperture, the centre first: a hexagon and so many rings around it.
 
         All of them see the plane at ``focus_distance`` at the same pixels. A pinhole has one.
@@ -151,7 +151,7 @@ class View:
             points += [(radius * np.cos(angle), radius * np.sin(angle)) for angle in angles]
         return [self._through(float(x), float(y)) for x, y in points]
 
-    def _through(self, x: float, y: float) -> View:
+    def _through(self, x: float, y: float) -> CameraView:
         pose = self.world_from_camera.copy()
         pose[:3, 3] += pose[:3, 0] * x + pose[:3, 1] * y
         du, dv = x / self.focus_distance, y / self.focus_distance
@@ -159,7 +159,7 @@ class View:
             return replace(self, world_from_camera=pose, shift=(du, dv))
         return replace(self, world_from_camera=pose, cx=self.cx + self.fx * du, cy=self.cy + self.fy * dv)
 
-    def rows(self, start: int, stop: int) -> View:
+    def rows(self, start: int, stop: int) -> CameraView:
         """The part of the view from pixel row ``start`` up to ``stop``."""
         return replace(self, height=stop - start, cy=self.cy - start)
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 
 SMALLEST_APERTURE = 1e-6
 """Radius of a lens up to which it is a pinhole [m]."""
@@ -17,7 +17,7 @@ SMALLEST_APERTURE = 1e-6
 _PERSPECTIVE = ("PerspectiveCamera", "ThinLensCamera")
 
 
-def view_of(sensor: Any) -> View:
+def view_of(sensor: Any) -> CameraView:
     """The camera of a sensor: ``opencv_camera``, or Mitsuba's own ``perspective`` or ``thinlens``.
 
     Raises:
@@ -41,7 +41,7 @@ def view_of(sensor: Any) -> View:
     # Mitsuba makes an aperture of 0 the smallest number that it calculates with.
     radius = number("aperture_radius")
     pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-    view = View(
+    view = CameraView(
         width,
         height,
         focal,
@@ -56,7 +56,7 @@ def view_of(sensor: Any) -> View:
     return cropped(view, sensor.film())
 
 
-def cropped(view: View, film: Any) -> View:
+def cropped(view: CameraView, film: Any) -> CameraView:
     """The part of a view that the crop window of a film leaves."""
     (width, height), (x, y) = film.crop_size(), film.crop_offset()
     return replace(view, width=int(width), height=int(height), cx=view.cx - int(x), cy=view.cy - int(y))

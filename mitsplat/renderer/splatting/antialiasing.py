@@ -21,11 +21,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import Quality
-from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
 from mitsplat.renderer.splatting.march import Image, march_apart
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.tile_subset import ChosenTiles
+from mitsplat.renderer.splatting.tile_subset import TileSubset
 from mitsplat.renderer.splatting.tiles import bin_gaussians
 
 ZOOM = 2
@@ -47,12 +47,12 @@ class Edges:
         chosen: Its tiles.
     """
 
-    view: View
-    fine: View
-    chosen: ChosenTiles
+    view: CameraView
+    fine: CameraView
+    chosen: TileSubset
 
     @classmethod
-    def find(cls, key: Any, view: View) -> Edges | None:
+    def find(cls, key: Any, view: CameraView) -> Edges | None:
         """Where pixels differ in ``key`` (UInt32, row-major) from one of the eight around them; None if nowhere."""
         fine = view.finer(ZOOM)
         block = dr.arange(mi.UInt32, fine.tiles_x * fine.tiles_y)
@@ -62,7 +62,7 @@ class Edges:
         for dx, dy in np.ndindex(BLOCK_WIDTH + 2, BLOCK_HEIGHT + 2):
             differs |= dr.gather(mi.UInt32, key, _pixel(x + (dx - 1), y + (dy - 1), view)) != own
         dr.eval(differs)
-        chosen = ChosenTiles.of(differs, fine)
+        chosen = TileSubset.of(differs, fine)
         return cls(view, fine, chosen) if chosen.count else None
 
     def rays(self) -> Any:
@@ -127,7 +127,7 @@ class Edges:
         return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
 
 
-def _pixel(x: Any, y: Any, view: View) -> Any:
+def _pixel(x: Any, y: Any, view: CameraView) -> Any:
     """Number of a pixel, the nearest one in the image."""
     return mi.UInt32(dr.clip(y, 0, view.height - 1) * view.width + dr.clip(x, 0, view.width - 1))
 
@@ -135,8 +135,8 @@ def _pixel(x: Any, y: Any, view: View) -> Any:
 def _trace(
     clouds: CloudSet,
     placements: Sequence[Placement],
-    view: View,
-    chosen: ChosenTiles,
+    view: CameraView,
+    chosen: TileSubset,
     quality: Quality,
     z_max: Any | None,
 ) -> Image:

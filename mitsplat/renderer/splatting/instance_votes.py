@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import Order, Quality
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.tiles import TileLists
 from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, walk
 
@@ -59,7 +59,7 @@ def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
 
 
 def settle_instances(
-    instance: Any, unsure: Any, lists: TileLists, view: View, quality: Quality, order: Order, z_max: Any | None
+    instance: Any, unsure: Any, lists: TileLists, view: CameraView, quality: Quality, order: Order, z_max: Any | None
 ) -> Any:
     """The instance image (UInt32, row-major) with the right ids where it is ``unsure`` (Bool).
 

@@ -41,7 +41,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import Order, Quality
-from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, View
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, CameraView
 from mitsplat.renderer.splatting.instance_votes import add_to_tally, new_tally, settle_instances, winner_of_tally
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
@@ -85,7 +85,7 @@ class Image:
         rest.append(dr.concat([part.error for part in parts]) if known else None)
         return cls(rgb, *rest)
 
-    def with_tiles(self, part: Image, lists: TileLists, view: View) -> Image:
+    def with_tiles(self, part: Image, lists: TileLists, view: CameraView) -> Image:
         """This image with the tiles of ``lists`` from another."""
         changed = dr.zeros(mi.Bool, view.width * view.height)
         lanes = Lanes(lists, view)
@@ -203,7 +203,7 @@ def _amended(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -
 
 
 def trace(
-    clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, *, z_max: Any | None = None
+    clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, *, z_max: Any | None = None
 ) -> Image:
     """Image of all placements; one that is too crowded for the memory is made in parts.
 
@@ -234,7 +234,7 @@ def trace(
 
 def march(
     lists: TileLists,
-    view: View,
+    view: CameraView,
     quality: Quality,
     *,
     z_max: Any | None = None,
@@ -266,7 +266,7 @@ def march(
 
 def _march(
     lists: TileLists,
-    view: View,
+    view: CameraView,
     quality: Quality,
     order: Order,
     z_max: Any | None,
@@ -348,7 +348,7 @@ def _tiles_of(flags: Any, lanes: Lanes) -> Any:
     return dr.compress(reduce(or_, [dr.gather(mi.Bool, flags, lane + k) for k in range(per_tile)]))
 
 
-def march_apart(lists: TileLists, view: View, quality: Quality, z_max: Any | None = None) -> Image:
+def march_apart(lists: TileLists, view: CameraView, quality: Quality, z_max: Any | None = None) -> Image:
     """The pixels of some tiles, tile after tile, by one ray through the centre of each.
 
     Arguments are those of :func:`march`, but nothing is repaired: the order is per tile or per ray.

@@ -12,10 +12,10 @@ import numpy as np
 
 from mitsplat.errors import MissingResourceError
 from mitsplat.quality import Quality
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.gaussian import RECORD, conic_touches_rectangle, ellipse_spans
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depths_by_tile, level_of
-from mitsplat.renderer.splatting.tile_subset import ChosenTiles, TileBox
+from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
 NUMBER_BITS = 26
 """Bits of the number of a record or pair in what pairs are sorted by."""
@@ -61,9 +61,9 @@ def pair_records(
     near: Any | None,
     least: Any,
     box: Any,
-    view: View,
+    view: CameraView,
     quality: Quality,
-    chosen: ChosenTiles | TileBox | None,
+    chosen: TileSubset | TileBox | None,
     numbered: bool,
     groups: Any | None = None,
 ) -> Pairs | None:
@@ -155,7 +155,7 @@ def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
     return begin, totals[0]
 
 
-def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: View) -> Callable[[Any], tuple[Any, Any]]:
+def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: CameraView) -> Callable[[Any], tuple[Any, Any]]:
     """Function from a row of tiles to the half-open range of its tiles that a record's cut-off ellipse meets.
 
     Gaussians at the camera's plane take their whole box. Under lens distortion, rows are no bands of slopes: the tiles

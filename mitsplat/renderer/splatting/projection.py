@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import KERNELS, Quality
-from mitsplat.renderer.rays.camera_rays import Kind, View
+from mitsplat.renderer.rays.camera_rays import CameraView, Kind
 from mitsplat.renderer.rays.device_arrays import concatenated, wrapped
 from mitsplat.renderer.splatting.gaussian import (
     LOG2_E_HALF,
@@ -24,8 +24,8 @@ from mitsplat.renderer.splatting.gaussian import (
     project_gaussian,
     rotation_axes,
 )
-from mitsplat.renderer.splatting.splat_appearance import ROW, Appearance, changed, rows_of
-from mitsplat.renderer.splatting.tile_subset import ChosenTiles
+from mitsplat.renderer.splatting.splat_appearance import ROW, SplatAppearance, changed, rows_of
+from mitsplat.renderer.splatting.tile_subset import TileSubset
 from mitsplat.runtime.recorded_kernels import Table, recorded
 
 PLACEMENT = 32
@@ -50,7 +50,7 @@ class Placement:
     cloud: int
     world_from_cloud: np.ndarray
     instance: int
-    appearance: Appearance | None = None
+    appearance: SplatAppearance | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ _ADJOINT = dr.ReduceMode.NoConflicts
 default would write the number of Gaussians into the kernels, and compile them anew whenever it changes."""
 
 
-def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: View) -> tuple[Any, Any, Any]:
+def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: CameraView) -> tuple[Any, Any, Any]:
     """Placement rows on the device, and for every Gaussian of every placement its row and its number in the clouds."""
     rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
     if placements:
@@ -154,7 +154,7 @@ class Projector:
     """Gaussians of placements as the projection kernels read them; ``changed`` is whether any has an appearance."""
 
     def __init__(
-        self, clouds: CloudSet, table: Any, view: View, quality: Quality, at_camera: bool, changed: bool = False
+        self, clouds: CloudSet, table: Any, view: CameraView, quality: Quality, at_camera: bool, changed: bool = False
     ) -> None:
         self.clouds, self.table, self.view, self.quality, self.at_camera = clouds, table, view, quality, at_camera
         self.changed = changed
@@ -231,7 +231,7 @@ class Projector:
             visible &= ~near
         return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
-    def cull(self, owner: Any, local: Any, chosen: ChosenTiles | None = None) -> tuple[Any, Any]:
+    def cull(self, owner: Any, local: Any, chosen: TileSubset | None = None) -> tuple[Any, Any]:
         """Whether Gaussians are in view, or near some tiles of it, and whether they reach the camera's plane."""
         g = self._load(owner, local)
         _, _, _, near, visible, box, _ = self._bounds(g)
@@ -358,7 +358,7 @@ def _every_record(
     quality, at_camera, changed, sh_count, sh_stride = shape
     geometry, scales, sh, table = arrays
     clouds = CloudSet((dr.width(owner),), (0,), geometry, scales, sh, sh_count, sh_stride)
-    projector = Projector(clouds, table, View.of_numbers(kind, numbers), quality, at_camera, changed)
+    projector = Projector(clouds, table, CameraView.of_numbers(kind, numbers), quality, at_camera, changed)
     records, least, boxes, _, near = projector.every_record(owner, local)
     return records, least, boxes, near
 

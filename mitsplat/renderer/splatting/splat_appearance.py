@@ -36,7 +36,7 @@ _PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x9E3779B1)
 
 
 @dataclass(frozen=True)
-class Appearance:
+class SplatAppearance:
     """What a placement's colours are changed by.
 
     Attributes:
@@ -57,7 +57,7 @@ class Appearance:
         return [1.0, *self.matrix, self.wear, float(self.seed), CELLS / self.size]
 
 
-def rows_of(appearances: list[Appearance | None]) -> np.ndarray:
+def rows_of(appearances: list[SplatAppearance | None]) -> np.ndarray:
     """Rows of :data:`ROW` floats, of zeros where there is none."""
     return np.array([[0.0] * ROW if one is None else one.row for one in appearances], np.float32).reshape(-1, ROW)
 

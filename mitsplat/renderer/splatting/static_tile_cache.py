@@ -14,14 +14,14 @@ from typing import Any
 import drjit as dr
 
 from mitsplat.quality import Quality
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.march import Image, march
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, merge_lists
 
 
 @dataclass(frozen=True, eq=False)
-class StillLayer:
+class StaticTileCache:
     """Static splats as one camera sees them.
 
     Attributes:
@@ -34,8 +34,8 @@ class StillLayer:
 
     @classmethod
     def of(
-        cls, clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, z_max: Any | None
-    ) -> StillLayer:
+        cls, clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, z_max: Any | None
+    ) -> StaticTileCache:
         """The layer of some placements; arguments as of :func:`mitsplat.renderer.splatting.march.trace`.
 
         Raises:
@@ -48,7 +48,7 @@ class StillLayer:
         return cls(lists, image)
 
     def with_objects(
-        self, clouds: CloudSet, placements: Sequence[Placement], view: View, quality: Quality, z_max: Any | None
+        self, clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, z_max: Any | None
     ) -> Image:
         """The picture with more placements in it.
 

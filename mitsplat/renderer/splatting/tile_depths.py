@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import Quality
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.gaussian import LOG2_E_HALF, RECORD, general_depth
 
 DEPTH_BITS = 16
@@ -24,20 +24,20 @@ _BITS_OF_1 = 0x3F800000
 """The float 1 as an integer."""
 
 
-def level_of(depth: Any, view: View) -> Any:
+def level_of(depth: Any, view: CameraView) -> Any:
     """Sort key of a depth: the leading bits of its ratio to the near plane, which grow with it."""
     ratio = dr.clip(depth / view.near_plane, 1.0, 0.9999 * 2.0**32)
     return (dr.reinterpret_array(mi.UInt32, ratio) - _BITS_OF_1) >> (23 + 5 - DEPTH_BITS)
 
 
-def depth_of_level(level: Any, view: View) -> Any:
+def depth_of_level(level: Any, view: CameraView) -> Any:
     """Least depth that has a level; what is nearer than the near plane has level 0."""
     ratio = dr.reinterpret_array(mi.Float, (level << (23 + 5 - DEPTH_BITS)) + _BITS_OF_1)
     return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
 
 def depths_by_tile(
-    record: Any, near: Any | None, ellipsoid: Any, first: Any, view: View, quality: Quality
+    record: Any, near: Any | None, ellipsoid: Any, first: Any, view: CameraView, quality: Quality
 ) -> Callable[[Any], Any]:
     """Function from a tile in the row of tiles of the ``first`` one to a record's depth there, by which it is sorted.
 

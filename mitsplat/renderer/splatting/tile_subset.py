@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 
 
 @dataclass(frozen=True, eq=False)
-class ChosenTiles:
+class TileSubset:
     """Tiles of a view that are looked at apart from all others.
 
     Attributes:
@@ -32,7 +32,7 @@ class ChosenTiles:
     columns: int
 
     @classmethod
-    def of(cls, flags: Any, view: View) -> ChosenTiles:
+    def of(cls, flags: Any, view: CameraView) -> TileSubset:
         """Those of a view's tiles that are flagged (Bool)."""
         columns, rows = view.tiles_x + 1, view.tiles_y + 1
         number = dr.compress(flags)
@@ -59,14 +59,14 @@ class ChosenTiles:
         dr.eval(number, before, above)
         return cls(number, dr.width(number), before, above, columns)
 
-    def halves(self, view: View) -> tuple[ChosenTiles, ChosenTiles]:
+    def halves(self, view: CameraView) -> tuple[TileSubset, TileSubset]:
         """The first and the second half of them."""
         middle, tiles = self.count // 2, dr.width(self.before) - 1
         flags = [dr.zeros(mi.Bool, tiles) for _ in range(2)]
         place = dr.arange(mi.UInt32, self.count)
         for flag, mine in zip(flags, (place < middle, place >= middle), strict=True):
             dr.scatter(flag, mi.Bool(True), self.number, mine)
-        first, second = (ChosenTiles.of(flag, view) for flag in flags)
+        first, second = (TileSubset.of(flag, view) for flag in flags)
         return first, second
 
     def any_in(self, x0: Any, x1: Any, y0: Any, y1: Any, active: Any = True) -> Any:
@@ -85,7 +85,7 @@ class ChosenTiles:
 
 @dataclass(frozen=True, eq=False)
 class TileBox:
-    """All tiles of a view in a box of them, as :class:`ChosenTiles` that need no tables.
+    """All tiles of a view in a box of them, as :class:`TileSubset` that need no tables.
 
     Attributes:
         number: Theirs in the view, ascending.
@@ -102,7 +102,7 @@ class TileBox:
     across: int
 
     @classmethod
-    def around(cls, boxes: Any, view: View) -> TileBox:
+    def around(cls, boxes: Any, view: CameraView) -> TileBox:
         """The smallest around half-open ranges (x0, x1, y0, y1), four numbers each, none of which is empty."""
         x0, x1, y0, y1 = dr.gather(mi.Array4u, boxes, dr.arange(mi.UInt32, dr.width(boxes) // 4))
         ends = np.array(dr.concat([dr.min(x0), dr.max(x1), dr.min(y0), dr.max(y1)])).tolist()

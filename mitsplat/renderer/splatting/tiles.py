@@ -17,14 +17,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import Quality
-from mitsplat.renderer.rays.camera_rays import View
+from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated
 from mitsplat.renderer.splatting.gaussian import RECORD
 from mitsplat.renderer.splatting.pairs import NUMBER_BITS, Pairs, pair_records, prefix_ranges
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
 from mitsplat.renderer.splatting.sorting import numpy_sorts_slowly, sort_in_threads, stable_order
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
-from mitsplat.renderer.splatting.tile_subset import ChosenTiles, TileBox
+from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
 AT_ONCE = 1 << 22
 """Most Gaussians that are projected without a look at which of them are seen: records take 84 bytes each."""
@@ -70,11 +70,11 @@ class TileLists:
 def bin_gaussians(
     clouds: CloudSet,
     placements: Sequence[Placement],
-    view: View,
+    view: CameraView,
     quality: Quality,
     *,
     at_camera: bool = True,
-    chosen: ChosenTiles | None = None,
+    chosen: TileSubset | None = None,
     fitted: bool = False,
     groups: Any | None = None,
     for_gradients: bool = False,
@@ -114,7 +114,7 @@ def bin_gaussians(
         records, near_rows, least, box = source.records(owner, local, near)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
-    listed: ChosenTiles | TileBox | None = TileBox.around(box, view) if fitted else chosen
+    listed: TileSubset | TileBox | None = TileBox.around(box, view) if fitted else chosen
     if groups is not None:
         row = dr.arange(mi.UInt32, dr.width(least)) * RECORD
         groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, row + (RECORD - 1))))
@@ -136,10 +136,10 @@ def bin_records(
     near: Any,
     least: Any,
     box: Any,
-    view: View,
+    view: CameraView,
     quality: Quality,
     only: int | None,
-    chosen: ChosenTiles | TileBox | None = None,
+    chosen: TileSubset | TileBox | None = None,
     *,
     groups: Any | None = None,
     for_gradients: bool = False,
@@ -165,7 +165,7 @@ def _listed(
     least: Any,
     visible: int,
     tiles: int,
-    view: View,
+    view: CameraView,
     only: int | None,
     own: Any = None,
 ) -> TileLists:
@@ -197,12 +197,12 @@ def _listed(
     )
 
 
-def _numbered(view: View, chosen: ChosenTiles | TileBox | None) -> tuple[int, Any]:
+def _numbered(view: CameraView, chosen: TileSubset | TileBox | None) -> tuple[int, Any]:
     """How many tiles have lists, and their numbers in the view unless they are all of it."""
     return (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
 
 
-def _empty(view: View, chosen: ChosenTiles | TileBox | None, records: Any | None = None) -> TileLists:
+def _empty(view: CameraView, chosen: TileSubset | TileBox | None, records: Any | None = None) -> TileLists:
     tiles, own = _numbered(view, chosen)
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
@@ -213,7 +213,7 @@ def _empty(view: View, chosen: ChosenTiles | TileBox | None, records: Any | None
     return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, own, none)
 
 
-def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: View) -> TileLists:
+def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraView) -> TileLists:
     """The lists of some tiles of a view with the Gaussians of both, as if they had been binned together.
 
     Raises:
@@ -244,7 +244,7 @@ def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
     return replace(lists, start=start, stop=stop, tiles=tiles)
 
 
-def in_ray_order(lists: TileLists, chosen: Any, view: View) -> TileLists:
+def in_ray_order(lists: TileLists, chosen: Any, view: CameraView) -> TileLists:
     """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
     place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
     tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import KERNELS, Order, Quality
-from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, View
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
 from mitsplat.renderer.splatting.gaussian import RECORD, general_depth
 from mitsplat.renderer.splatting.tiles import TileLists
 
@@ -55,7 +55,7 @@ class Lanes:
         start, stop: Range of the tile's list.
     """
 
-    def __init__(self, lists: TileLists, view: View, rows: int = TILE_HEIGHT, *, apart: bool = False) -> None:
+    def __init__(self, lists: TileLists, view: CameraView, rows: int = TILE_HEIGHT, *, apart: bool = False) -> None:
         """Lanes of ``rows`` pixels each, a divisor of a tile's height.
 
         Tiles that are taken ``apart`` from their view have pixels of their own, tile after tile and row by row.
@@ -134,7 +134,7 @@ class Rays:
     def through(
         cls,
         lists: TileLists,
-        view: View,
+        view: CameraView,
         quality: Quality,
         slopes: tuple[list[Any], list[Any]],
         far: list[Any],

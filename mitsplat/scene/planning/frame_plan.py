@@ -16,7 +16,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt, belt_of
 from mitsplat.scene.planning.frame_lights import lights_at
-from mitsplat.scene.planning.viewpoints import View, view_of
+from mitsplat.scene.planning.viewpoints import Viewpoint, view_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.image_spec import Randomise
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
@@ -45,7 +45,7 @@ class FramePlan:
         lights: Lights as they are in this frame: paths and random factors applied.
         draws: Random values by name, see :func:`mitsplat.frames.camera_response.develop`.
         seed: Seed of the pixel noise.
-        viewpoint: What the camera was drawn or chosen by, see :class:`mitsplat.scene.planning.viewpoints.View`.
+        viewpoint: What the camera was drawn or chosen by, see :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
         belt: The conveyor at the moment of the frame, if the scene has one.
     """
 
@@ -120,7 +120,7 @@ def plan_frame(
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
-    here = view_of(scene, index, layout) if camera is None else View(camera)
+    here = view_of(scene, index, layout) if camera is None else Viewpoint(camera)
     if next_camera is None and camera is not None:
         next_camera = None if next_layout is None else camera
     elif next_camera is None and view + 1 < spec.output.views:

@@ -26,7 +26,7 @@ Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Finish:
+class MaterialDraw:
     """A material as one layout has it.
 
     Attributes:
@@ -57,7 +57,7 @@ class Finish:
 
 
 @dataclass(frozen=True)
-class Backing:
+class BackgroundDraw:
     """An image behind everything, as one frame shows it.
 
     Attributes:
@@ -80,7 +80,7 @@ class Backing:
 
 
 @dataclass(frozen=True)
-class Place:
+class LayoutSurroundings:
     """What was drawn for the surroundings of a frame.
 
     Attributes:
@@ -90,10 +90,10 @@ class Place:
     """
 
     environment: int = 0
-    finishes: Mapping[str, Finish] = field(default_factory=dict)
-    background: Backing | None = None
+    finishes: Mapping[str, MaterialDraw] = field(default_factory=dict)
+    background: BackgroundDraw | None = None
 
-    def finish_of(self, shape: str) -> Finish | None:
+    def finish_of(self, shape: str) -> MaterialDraw | None:
         """Material of a shape by its name, if it draws one."""
         return self.finishes.get(finish_name(shape))
 
@@ -109,7 +109,7 @@ class Place:
         return told
 
 
-def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> Place:
+def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
     """The place of frame ``index``, of a layout of one's own where its number is given."""
     layout = index // spec.output.views if layout is None else layout
     materials = {finish_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
@@ -117,15 +117,15 @@ def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> Place:
     background = None
     if spec.background is not None:
         background = draw_backing(spec.background, spec.seed, index if spec.background.per == "frame" else layout)
-    return Place(draw_environment(spec, layout), finishes, background)
+    return LayoutSurroundings(draw_environment(spec, layout), finishes, background)
 
 
-def environment_at(scene: Scene, place: Place) -> Asset | None:
+def environment_at(scene: Scene, place: LayoutSurroundings) -> Asset | None:
     """The surroundings of a place."""
     return scene.environments[place.environment] if scene.environments else None
 
 
-def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int) -> Finish:
+def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:
     """One of some materials, with its ranges drawn."""
     rng = random_stream(seed, f"material {name}", layout)
     material = materials[int(rng.integers(len(materials)))]
@@ -133,7 +133,7 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
     # All are drawn, so that none depends on which others a material has.
     hue, saturation, value, contrast, scale, rotate, other, u, v, which = map(float, rng.random(10))
     if isinstance(material, ImageMaterial):
-        return Finish(
+        return MaterialDraw(
             kind=material.kind,
             scale=_between(material.scale, scale),
             rotate=_between(material.rotate, rotate),
@@ -145,8 +145,8 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
     bright = _between(material.value, value)
     first = colorsys.hsv_to_rgb(*tint, bright)
     if isinstance(material, ColourMaterial):
-        return Finish(kind=material.kind, colours=(first,))
-    return Finish(
+        return MaterialDraw(kind=material.kind, colours=(first,))
+    return MaterialDraw(
         kind=material.kind,
         colours=(first, colorsys.hsv_to_rgb(*tint, bright * (1 - _between(material.contrast, contrast)))),
         scale=_between(material.scale, scale),
@@ -157,11 +157,11 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
     )
 
 
-def draw_backing(background: Background, seed: int, number: int) -> Backing:
+def draw_backing(background: Background, seed: int, number: int) -> BackgroundDraw:
     """What is behind frame or layout ``number``."""
     rng = random_stream(seed, "background", number)
     which, crop, x, y, rotate, gain = map(float, rng.random(6))
-    return Backing(
+    return BackgroundDraw(
         image=background.images[int(which * len(background.images))],
         crop=_between(background.crop, crop),
         place=(x, y),

@@ -20,7 +20,7 @@ WEAR_SEEDS = 1 << 23
 
 
 @dataclass(frozen=True)
-class Appearance:
+class ObjectAppearance:
     """What was drawn of an object's appearance.
 
     Attributes:
@@ -62,7 +62,7 @@ class Appearance:
         return found
 
 
-def draw_appearances(scene: Scene, layout: Layout) -> dict[int, Appearance]:
+def draw_appearances(scene: Scene, layout: Layout) -> dict[int, ObjectAppearance]:
     """Appearances of the objects of a layout whose entries leave them open, by instance id."""
     if not any(entry.appearance for entry in scene.spec.objects):
         return {}
@@ -71,7 +71,7 @@ def draw_appearances(scene: Scene, layout: Layout) -> dict[int, Appearance]:
     return {one.id: one for one in found if one is not None}
 
 
-def _draw(scene: Scene, layout: int, instance: Instance, entry: int) -> Appearance | None:
+def _draw(scene: Scene, layout: int, instance: Instance, entry: int) -> ObjectAppearance | None:
     """Appearance of one object of an entry."""
     ranges, asset = scene.spec.objects[entry].appearance, scene.assets[instance.asset]
     if ranges is None:
@@ -84,7 +84,7 @@ def _draw(scene: Scene, layout: int, instance: Instance, entry: int) -> Appearan
         return own if bounds is None else float(stream(name).uniform(*bounds))
 
     red, green, blue = stream("gain").uniform(*ranges.gain, 3).tolist()
-    return Appearance(
+    return ObjectAppearance(
         id=instance.id,
         entry=entry,
         hue=uniform("hue", ranges.hue, 0.0),

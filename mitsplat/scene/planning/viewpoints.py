@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, direction, interpolate_poses, look_at_pose
-from mitsplat.scene.planning.visibility_prediction import Prospect, Sight
+from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor
 from mitsplat.scene.spec.camera_spec import (
     CameraHemisphere,
     CameraOrbit,
@@ -47,7 +47,7 @@ _WAVES, _FASTEST = 8, 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Viewpoint:
     """Where an image is taken from.
 
     Attributes:
@@ -132,7 +132,7 @@ class _Turn:
 
 
 @lru_cache(maxsize=4)
-def view_of(scene: Scene, index: int, layout: Layout | None = None) -> View:
+def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint:
     """Where frame ``index`` is taken from; with its layout, what looks at or is chosen by what lies there.
 
     Raises:
@@ -149,14 +149,14 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> View:
         left = view_of(scene, index - 1, layout)
         pose = left.camera.world_from_camera.copy()
         pose[:3, 3] += camera.stereo.baseline * pose[:3, 0]
-        return View(replace(left.camera, world_from_camera=pose), {**left.drawn, "side": "right"})
+        return Viewpoint(replace(left.camera, world_from_camera=pose), {**left.drawn, "side": "right"})
     turns = 1 + (spec.output.views - 1 - seat) // len(seats)
     here = _Turn(spec.seed, index, number, camera, spec.output, number_of_layout, turn, turns)
     own: dict[str, Any] = {"camera": number} if spec.cameras else {}
     own |= {"side": "left"} if camera.stereo else {}
     if isinstance(camera, CameraHemisphere):
         found = _hemisphere_view(scene, here, camera, layout)
-        return View(found.camera, {**own, **found.drawn})
+        return Viewpoint(found.camera, {**own, **found.drawn})
     if isinstance(camera, CameraWalk):
         pose = _walk_pose(camera, here)
     else:
@@ -167,7 +167,7 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> View:
             pose = interpolate_poses(keys, here.time)[0]
         pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
     eye, drawn = here.take(pose)
-    return View(eye, own | drawn)
+    return Viewpoint(eye, own | drawn)
 
 
 def moved_by(motion: Sequence[float]) -> Float64Array:
@@ -228,18 +228,24 @@ def _pose_around(target: Float64Array, azimuth: float, sine: float, radius: floa
     return look_at_pose(target + radius * direction(azimuth, sine), target)
 
 
-def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout: Layout | None) -> View:
+def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
     """The first try that is accepted, or of all that are the one that comes nearest to the shares aimed at."""
     spec, index = scene.spec, here.index
-    sight = None if layout is None or (camera.look_at == "target" and not camera.chosen) else Sight.of(scene, layout)
+    sight = (
+        None
+        if layout is None or (camera.look_at == "target" and not camera.chosen)
+        else VisibilityPredictor.of(scene, layout)
+    )
     if sight is None or not camera.chosen:
         target, seen = _target(camera, spec.seed, index, 0, sight)
         pose, target = _hemisphere_pose(camera, here, 0, target)
         eye, drawn = here.take(pose)
-        return View(eye, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen})
+        return Viewpoint(
+            eye, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen}
+        )
     shares = (camera.occlusion, camera.truncation)
     fate = random_stream(spec.seed, "camera shares", index).uniform(size=2)
-    best: tuple[float, View] | None = None
+    best: tuple[float, Viewpoint] | None = None
     refused: list[tuple[float, str]] = []
     for number in range(camera.tries):
         target, seen = _target(camera, spec.seed, index, number, sight)
@@ -256,7 +262,7 @@ def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout
         drawn = {"target": target.tolist(), "object": seen, "attempt": number, "predicted": prospect.to_json()} | held
         cost = _cost(prospect, [0.0 if share is None else share.share for share in shares], fate)
         if best is None or cost < best[0]:
-            best = cost, View(eye, drawn)
+            best = cost, Viewpoint(eye, drawn)
         if cost == 0:
             break
     if best is None:
@@ -267,7 +273,7 @@ def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout
     return best[1]
 
 
-def _cost(prospect: Prospect, shares: list[float], fate: Float64Array) -> float:
+def _cost(prospect: PredictedView, shares: list[float], fate: Float64Array) -> float:
     """How far a view is from the shares of objects that are aimed at.
 
     A share of few objects is seldom a whole number: it is rounded up or down by the frame's random numbers ``fate``, so
@@ -281,7 +287,7 @@ def _cost(prospect: Prospect, shares: list[float], fate: Float64Array) -> float:
 
 
 def _target(
-    camera: CameraHemisphere, seed: int, index: int, number: int, sight: Sight | None
+    camera: CameraHemisphere, seed: int, index: int, number: int, sight: VisibilityPredictor | None
 ) -> tuple[Float64Array, int | None]:
     """What a try looks at [m] but for its jitter, and the object that it is the middle of."""
     if sight is None or camera.look_at == "target" or not sight.labelled.any():

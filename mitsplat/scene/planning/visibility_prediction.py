@@ -36,7 +36,7 @@ _TESTS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Framed:
+class ProjectedPoints:
     """Where the surfaces of a layout are in a camera's image.
 
     Attributes:
@@ -61,7 +61,7 @@ class Framed:
 
 
 @dataclass(frozen=True, eq=False)
-class Prospect:
+class PredictedView:
     """What a view is predicted to show of the labelled objects of a layout.
 
     Attributes:
@@ -82,7 +82,7 @@ class Prospect:
         return {"in_view": self.in_view, "hidden": self.hidden, "cut": self.cut}
 
 
-class Sight:
+class VisibilityPredictor:
     """The surfaces of a layout.
 
     Attributes:
@@ -119,11 +119,11 @@ class Sight:
 
     @staticmethod
     @lru_cache(maxsize=2)
-    def of(scene: Scene, layout: Layout) -> Sight:
+    def of(scene: Scene, layout: Layout) -> VisibilityPredictor:
         """The surfaces of a layout, kept for its next frame."""
-        return Sight(scene, layout)
+        return VisibilityPredictor(scene, layout)
 
-    def framed(self, camera: Camera) -> Framed:
+    def framed(self, camera: Camera) -> ProjectedPoints:
         """Where the surfaces are in a camera's image."""
         count, owner = len(self.ids), self._owner
         pixel, depth = camera.project(self._points)
@@ -144,11 +144,11 @@ class Sight:
         if front.any():
             away = max(float(np.median(depth[front])), camera.near)
             edge = _CELL * self._spacing * max(camera.fx, camera.fy) / away
-        return Framed(camera, x, y, depth, raster, edge, within, extents, 1.0 - in_raster)
+        return ProjectedPoints(camera, x, y, depth, raster, edge, within, extents, 1.0 - in_raster)
 
     def prospect(
-        self, framed: Framed, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
-    ) -> Prospect:
+        self, framed: ProjectedPoints, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
+    ) -> PredictedView:
         """What a view would show of the labelled objects."""
         visible, beyond, seen = self._cells(framed)
         beyond = framed.lost + (1.0 - framed.lost) * beyond
@@ -159,9 +159,9 @@ class Sight:
         if truncation is not None:
             cut = int(np.count_nonzero(shown & _among(beyond, truncation.cut)))
         ours = self.labelled
-        return Prospect(visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut)
+        return PredictedView(visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut)
 
-    def _cells(self, framed: Framed) -> tuple[Float64Array, Float64Array, Int64Array]:
+    def _cells(self, framed: ProjectedPoints) -> tuple[Float64Array, Float64Array, Int64Array]:
         """Visible fraction and share beyond the border of each object, by cells of the raster; its seen cells."""
         count, camera, edge, depth = len(self.ids), framed.camera, framed.edge, framed.depth
         across = int(3 * camera.width / edge) + 2
@@ -188,7 +188,7 @@ class Sight:
         beyond = np.where(everywhere > 0, 1.0 - own / np.maximum(everywhere, 1), 1.0)
         return seen_cells / np.maximum(own, 1), beyond, seen_cells
 
-    def faults(self, framed: Framed, rules: Acceptance) -> list[tuple[float, str]]:
+    def faults(self, framed: ProjectedPoints, rules: Acceptance) -> list[tuple[float, str]]:
         """By what share a view misses each rule that it does not fulfil, and the same in words."""
         found, eye = [], framed.camera.centre
         within, extents = framed.within[self.labelled], framed.extents[self.labelled]

@@ -9,7 +9,7 @@ from PIL import Image
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.isolation import View
+from mitsplat.capture.isolation import PhotoView
 from mitsplat.geometry.camera import Camera
 
 THINGS = ((0.0, 0.0), (0.16, 0.02), (-0.03, 0.18))
@@ -21,7 +21,7 @@ def ground(places: Float64Array) -> Float64Array:
     return np.asarray(0.006 * np.sin(40 * places[:, 0]) * np.cos(30 * places[:, 1]) + 0.05 * places[:, 0])
 
 
-def three_balls() -> tuple[Float64Array, Int64Array, list[View]]:
+def three_balls() -> tuple[Float64Array, Int64Array, list[PhotoView]]:
     """Points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
     rng = np.random.default_rng(0)
     flat = rng.uniform(-0.4, 0.4, (3000, 3))
@@ -43,7 +43,7 @@ def three_balls() -> tuple[Float64Array, Int64Array, list[View]]:
     for camera in cameras:
         pixels, depth = camera.project(points)
         inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (320, 240)).all(axis=1)
-        views.append(View(camera, np.flatnonzero(inside).astype(np.int32)))
+        views.append(PhotoView(camera, np.flatnonzero(inside).astype(np.int32)))
     return points, np.concatenate(labels), views
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsplat.arrays import Float64Array, Int64Array
-from mitsplat.capture.isolation import Pick, View, choose_object
+from mitsplat.capture.isolation import PhotoView, Pick, choose_object
 from mitsplat.capture.isolation.object_choice import focus_of
 from mitsplat.capture.isolation.support import find_support
 from mitsplat.errors import InputError
@@ -14,19 +14,19 @@ from tests.capture.isolation.balls import THINGS, ground, three_balls
 
 
 @pytest.fixture(scope="module")
-def place() -> tuple[Float64Array, Int64Array, list[View]]:
+def place() -> tuple[Float64Array, Int64Array, list[PhotoView]]:
     """Points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
     return three_balls()
 
 
-def ball_of(points: Float64Array, place: tuple[Float64Array, Int64Array, list[View]]) -> set[int]:
+def ball_of(points: Float64Array, place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> set[int]:
     """Labels of the points that were chosen."""
     every, labels, _ = place
     row = {tuple(point): int(label) for point, label in zip(every.tolist(), labels, strict=True)}
     return {row[tuple(point)] for point in points.tolist()}
 
 
-def pick(place: tuple[Float64Array, Int64Array, list[View]], thing: int) -> Pick:
+def pick(place: tuple[Float64Array, Int64Array, list[PhotoView]], thing: int) -> Pick:
     """A pixel of the first photo on the top of a ball."""
     view = place[2][0]
     x, y = THINGS[thing - 1]
@@ -35,7 +35,7 @@ def pick(place: tuple[Float64Array, Int64Array, list[View]], thing: int) -> Pick
     return Pick("one.jpg:1,2", view, (float(u), float(v)))
 
 
-def test_uneven_ground_is_found_under_things(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+def test_uneven_ground_is_found_under_things(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, labels, views = place
     support = find_support(points, focus_of([view.camera for view in views])[0], 0.28)
     near = (labels == 0) & (np.abs(points[:, :2]) < 0.2).all(axis=1)
@@ -44,7 +44,7 @@ def test_uneven_ground_is_found_under_things(place: tuple[Float64Array, Int64Arr
     assert support.roughness < 0.002
 
 
-def test_what_the_cameras_look_at_is_chosen(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+def test_what_the_cameras_look_at_is_chosen(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, labels, views = place
     found = choose_object(points, views)
     assert sorted(sorted(ball_of(other, place)) for other in found.others) == [[2], [3]]
@@ -54,7 +54,7 @@ def test_what_the_cameras_look_at_is_chosen(place: tuple[Float64Array, Int64Arra
     assert np.abs(feet[:, 2] - ground(feet)).max() < 0.006
 
 
-def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, _, views = place
     assert ball_of(choose_object(points, views, picks=[pick(place, 3)]).above, place) == {3}
     both = choose_object(points, views, picks=[pick(place, 1), pick(place, 2)])
@@ -64,7 +64,7 @@ def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[
     assert ball_of(boxed.above, place) == {2}
 
 
-def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Array, list[View]]) -> None:
+def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, labels, views = place
     one = pick(place, 1)
     with pytest.raises(InputError, match=r"also said not to be the object \(one.jpg:1,2\)"):
@@ -73,6 +73,8 @@ def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Arra
         choose_object(points, views, picks=[Pick("one.jpg:0,0", views[0], (0.0, 0.0))])
     bare = np.flatnonzero(labels == 0)
     place_of = {int(old): new for new, old in enumerate(bare)}
-    fewer = [View(v.camera, np.array([place_of[i] for i in v.seen.tolist() if i in place_of], np.int32)) for v in views]
+    fewer = [
+        PhotoView(v.camera, np.array([place_of[i] for i in v.seen.tolist() if i in place_of], np.int32)) for v in views
+    ]
     with pytest.raises(InputError, match="no object stands out of its support"):
         choose_object(points[bare], fewer)

@@ -472,6 +472,16 @@ class TestMeshes:
             with pytest.raises(InputError, match="escapes resolver root"):
                 read_mesh(tmp_path / "in/a.gltf")
 
+    @pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.glb"])
+    def test_a_file_of_gigabytes_is_not_read(self, tmp_path, name):
+        size = 84 + 50 * (1 << 25)
+        (tmp_path / name).write_bytes(bytes(80) + struct.pack("<I", 1 << 25))
+        os.truncate(tmp_path / name, size)
+        with pytest.raises(
+            InputError, match=rf"{name}: must be a mesh file of at most 1073741824 bytes \(got {size}\)"
+        ):
+            read_mesh(tmp_path / name)
+
     def test_plain_triangles_take_no_process(self, tmp_path, monkeypatch):
         monkeypatch.setattr(untrusted_meshes, "run_bounded", None)
         box = trimesh.creation.box()

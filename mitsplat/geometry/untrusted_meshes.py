@@ -22,6 +22,8 @@ _SECONDS = 120
 _MEMORY = 1 << 30
 _SWELLS = 100
 """Memory that a reader may take for a byte of a file."""
+_LARGEST = 1 << 30
+"""Size of the largest file: 21 million triangles as binary STL [bytes]."""
 _HEADER = 4096
 _PLAIN_PLY = re.compile(
     rb"ply\r?\nformat binary_little_endian 1\.0\r?\n(?:comment [^\n]*\n)*element vertex (\d{1,12})\r?\n"
@@ -38,7 +40,7 @@ def check_mesh(path: Path) -> None:
     their size. What else a reader refuses is left for it to say.
 
     Raises:
-        InputError: Also for an archive.
+        InputError: Also for an archive, and a file that is too large.
     """
     if path.suffix.lower() in ARCHIVES:
         raise InputError(f"{path}: must be a mesh file, not an archive: unpack it")
@@ -46,6 +48,8 @@ def check_mesh(path: Path) -> None:
         raise InputError(f"{path}: no such file")
     try:
         status = path.stat()
+        if status.st_size > _LARGEST:
+            raise InputError(f"{path}: must be a mesh file of at most {_LARGEST} bytes (got {status.st_size})")
         plain = _is_plain(path, status.st_size)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error

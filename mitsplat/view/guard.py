@@ -9,6 +9,7 @@ both, and no cookie is needed, which every port of a host would be sent.
 from __future__ import annotations
 
 import http
+import logging
 import re
 import secrets
 import socket
@@ -135,8 +136,8 @@ def guarded(guard: Guard) -> Iterator[Pool]:
             return response
 
         started.append(True)
-        connect = partial(Connection, pool=pool)
-        return start(*args, **options | {"process_request": ask, "create_connection": connect, "max_size": LARGEST})
+        own = {"process_request": ask, "create_connection": partial(Connection, pool=pool), "logger": _logger()}
+        return start(*args, **options | own | {"max_size": LARGEST})
 
     server.serve = serve
     try:
@@ -145,6 +146,17 @@ def guarded(guard: Guard) -> Iterator[Pool]:
         server.serve = start
     if not started:
         raise MissingResourceError("this viser cannot be guarded: install the one that mitsplat[view] asks for")
+
+
+def _logger() -> logging.Logger:
+    """Return the server's logger, without the traceback that each visitor who asks for no page would print."""
+    logger = logging.getLogger(__name__)
+    logger.addFilter(_is_no_handshake)
+    return logger
+
+
+def _is_no_handshake(record: logging.LogRecord) -> bool:
+    return record.msg != "opening handshake failed"
 
 
 def check_address(host: str, port: int) -> None:

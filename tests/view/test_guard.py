@@ -178,6 +178,15 @@ def test_an_odd_request_is_refused_and_no_fault_of_the_server(page):
     assert status(page, get, host, b"Upgrade: h2c") in (400, 426)
 
 
+def test_who_asks_for_nothing_is_not_logged(page, caplog):
+    for data in (b"", b"\r\n", b"\xff\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", b"GET / HTTP/1.1\r\nHost: "):
+        with closing(socket.create_connection(("127.0.0.1", page.port), timeout=20)) as connection:
+            connection.sendall(data)
+    assert answer(page, place(page)).status == 200
+    page.close()
+    assert [record for record in caplog.records if record.exc_info] == []
+
+
 def test_only_so_many_browsers_are_connected(page):
     with ExitStack() as opened:
         first = [opened.enter_context(browser(page, place(page))) for _ in range(MOST_BROWSERS)]

@@ -1,9 +1,9 @@
 """mitsplat: labelled training images of robot workcells from Gaussian splats, settled parts and traced light.
 
-Conventions (frames, units, colour) are stated in :mod:`mitsplat.gaussians.splat_cloud`. Importing this package points
-Dr.Jit at a usable LLVM and registers the Mitsuba plugins ``splats``, ``splat_proxy`` and ``opencv_camera`` for the
-current and any later variant, once Mitsuba is imported; heavy modules, Mitsuba among them, load when a name is first
-used.
+The conventions for frames, units and colour are stated in :mod:`mitsplat.gaussians.splat_cloud`. Importing this package
+selects an LLVM library for Dr.Jit. After Mitsuba is imported, the plugins ``splats``, ``splat_proxy`` and
+``opencv_camera`` are registered for the current variant and for every later one. Heavy modules, including Mitsuba, are
+imported at the first use of a name.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mitsplat.runtime.llvm import use_bundled_llvm
 from mitsplat.runtime.plugin_registration import register_plugins, set_registration
 from mitsplat.version import __version__ as __version__
 
-# Dr.Jit must be told, before it is imported, which LLVM to load, and which GPUs not.
+# The LLVM library and the visible GPUs must be set before Dr.Jit is imported.
 use_bundled_llvm()
 hide_full_gpus()
 
@@ -90,8 +90,8 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        # By one thread at a time: Mitsuba puts another module in its place as it is imported, and modules that wait for
-        # each other in several threads are refused as a deadlock.
+        # The lock admits one thread at a time: Mitsuba replaces its module object during import, and Python reports a
+        # deadlock when threads wait for each other's imports.
         with _importing:
             if not _HOME[name].startswith("detector."):
                 importlib.import_module("mitsuba")
@@ -110,20 +110,20 @@ def _register(variant: str | None) -> None:
 
 
 def _follow_variants() -> None:
-    import mitsuba as mi  # already imported when this is called
+    import mitsuba as mi  # Mitsuba is already imported at this point
 
-    # Import nothing before a variant is chosen: another thread may be importing a module that imports Mitsuba.
+    # Nothing is imported before a variant is set: another thread may be importing a module that imports Mitsuba.
     mi.detail.add_variant_callback(lambda _old, new: register_plugins(new))
     if mi.variant():
         register_plugins(mi.variant())
 
 
 def _remove_current_folder_from_plugin_paths() -> None:
-    """Remove the current folder from the folders in which Mitsuba looks for native plugins.
+    """Remove the current folder from Mitsuba's search path for native plugins.
 
-    Mitsuba still finds other files there: relative paths start at the current folder.
+    Mitsuba still finds other files there, because relative paths are resolved against the current folder.
     """
-    import mitsuba as mi  # already imported when this is called
+    import mitsuba as mi  # Mitsuba is already imported at this point
 
     folders, here = mi.file_resolver(), str(mi.filesystem.current_path())
     for number in reversed(range(len(folders))):

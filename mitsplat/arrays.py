@@ -1,4 +1,4 @@
-"""Names of array types: what an annotation can say of an array; its shape and unit stand in docstrings."""
+"""Aliases of NumPy array types for annotations; shapes and units are stated in docstrings."""
 
 from __future__ import annotations
 
@@ -11,4 +11,4 @@ Float64Array = npt.NDArray[np.float64]
 Int32Array = npt.NDArray[np.int32]
 Int64Array = npt.NDArray[np.int64]
 ByteImage = npt.NDArray[np.uint8]
-"""Display-encoded RGB, (H, W, 3), unless said otherwise."""
+"""Display-encoded RGB image, shape (H, W, 3), unless stated otherwise."""

@@ -39,7 +39,7 @@ from mitsplat.storage.yaml_input import FieldError, key_place, load_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 Length = Annotated[float, Field(ge=1e-9, le=1e9)]
-"""No more than a number of 32 bits holds the cube of."""
+"""Positive length. The bounds keep its cube within the range of a float32."""
 
 ASSET_FILE = "asset.yaml"
 _Z_UP_FROM = {
@@ -50,18 +50,21 @@ _Z_UP_FROM = {
     "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-"""The smallest rotation that takes each axis to +z."""
+"""Smallest rotation that maps each axis to +z."""
 
 _SPZ_UNITS = 1e-3
-"""Metres per unit of ``.spz`` assets: the format holds no scale below 4.5e-5 units, a coarse 45 um in metres."""
+"""Metres per unit of ``.spz`` assets.
+
+The smallest scale of the format is 4.5e-5 units. In metres this would be 45 um, which is too coarse.
+"""
 
 _OPAQUE = 0.5
 _OFF_BY = 0.05
-"""Share of an asset's size by which its splats, mesh and pieces may differ unnoticed."""
+"""Tolerated difference between the bounds of splats, mesh and pieces, as a fraction of the asset's size."""
 
 
 class AssetSpec(BaseModel):
-    """Keys of ``asset.yaml``. Files are inside its folder and share units and axes."""
+    """Keys of ``asset.yaml``. All named files lie inside its folder and share units and axes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
@@ -106,24 +109,25 @@ class Asset:
     """One object or one environment in metres, z up.
 
     Attributes:
-        name: Name of the asset; several of a scene may have one.
-        class_name: Class that detectors learn.
+        name: Name of the asset. Several assets of a scene may have the same name.
+        class_name: Class name in the labels.
         splats: Appearance, in the asset's frame.
-        mesh: Proxy surface in the same frame, or None (an environment may lack one).
-        pieces: Convex pieces of the mesh for physics; empty until made.
-        kind: Whether physics moves it (``object``) or not (``environment``).
-        density: Mass density [kg/m^3]; ignored where ``mass`` is given.
+        mesh: Proxy surface in the same frame, or None (optional for an environment).
+        pieces: Convex pieces of the mesh for physics; empty before decomposition.
+        kind: ``object`` (moved by physics) or ``environment`` (static).
+        density: Mass density [kg/m^3]; ignored if ``mass`` is given.
         mass: Mass [kg] or None.
         friction: Coulomb friction coefficient.
         roughness: GGX roughness of the highlight in (0, 1].
-        specular: Specular reflectance at normal incidence in [0, 1]; 0 turns the highlight off.
-        capture_light: Light under which the colours were captured: ``uniform`` (a light tent, a turntable in the
-            shade) is relit by the scene's lights, ``scene`` (already lit as it will be shown) is only shadowed.
+        specular: Specular reflectance at normal incidence in [0, 1]; 0 disables the highlight.
+        capture_light: Light under which the colours were captured. ``uniform`` (light tent, turntable in the shade):
+            the
+            scene's lights relight the asset. ``scene`` (already lit as displayed): the scene's lights only add shadows.
         keypoints: Named points in the asset's frame [m], for pose labels.
-        white: Irradiance [W/m^2] of the scene's lights under which a white surface has the colour 1 in an environment's
-            splats: pi where it was baked. None where the exposure is unknown, as in photographs.
-        units: Whether lengths are metres; if not, the size is arbitrary and a scene must give one.
-        folder: Where it was read from, or None.
+        white: Irradiance [W/m^2] of the scene's lights at which a white surface has the colour 1 in an environment's
+            splats: pi for baked environments, None if the exposure is unknown, as in photographs.
+        units: ``metre``, or ``unknown`` if the size is arbitrary; a scene must then set the size.
+        folder: Folder of the asset's files, or None.
     """
 
     name: str
@@ -145,7 +149,7 @@ class Asset:
 
     @classmethod
     def load(cls, folder: str | PathLike[str]) -> Asset:
-        """Read an asset folder, converted to metres and z up.
+        """Read an asset folder and convert it to metres and z up.
 
         Raises:
             InputError: If ``asset.yaml`` or a file that it names is missing or breaks a rule.
@@ -185,12 +189,12 @@ class Asset:
         """Write the asset as a folder: ``asset.yaml``, splats, ``mesh.ply`` and ``pieces.ply`` (shapes only, float32).
 
         Args:
-            folder: Made if need be; files of these names in it are replaced.
-            splats: Name of the splat file; its suffix is the format (``.ply``, ``.splat`` or ``.spz``).
+            folder: Target folder. It is created if it is missing; files of these names in it are replaced.
+            splats: Name of the splat file; its suffix selects the format (``.ply``, ``.splat`` or ``.spz``).
 
         Raises:
             InputError: If a value breaks a rule of :class:`AssetSpec` or the folder cannot be written.
-            MissingResourceError: If there is no room.
+            MissingResourceError: If the disk is full.
         """
         folder = Path(folder)
         units = _SPZ_UNITS if splats.lower().endswith(".spz") and self.units == "metre" else 1.0
@@ -220,7 +224,8 @@ class Asset:
             raise InputError(f"asset {self.name!r} cannot be saved: {rule}") from error
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            # Apart, so that an earlier asset is whole until all of this one is.
+            # Files are written to a temporary folder first, so that an earlier asset stays complete until the new one
+            # is.
             with TemporaryDirectory(prefix=".asset-", dir=folder) as apart:
                 new = Path(apart)
                 stored.splats.save(new / splats)
@@ -235,7 +240,9 @@ class Asset:
                     file.replace(folder / file.name)
 
     def transformed(self, matrix: npt.ArrayLike) -> Asset:
-        """The asset's splats, mesh and pieces after a similarity transform (4, 4); mass and density stay.
+        """Return the asset with splats, mesh, pieces and keypoints transformed by a similarity (4, 4).
+
+        Mass and density do not change.
 
         Raises:
             ValueError: If the matrix shears, mirrors or scales unevenly.
@@ -257,11 +264,11 @@ class Asset:
 
     @property
     def keypoint_array(self) -> Float64Array:
-        """The keypoints' positions in their order [m], shape (K, 3)."""
+        """Positions of the keypoints in their order [m], shape (K, 3)."""
         return np.array(list(self.keypoints.values()), dtype=np.float64).reshape(-1, 3)
 
     def scaled(self, factor: float) -> Asset:
-        """The asset made larger about its origin, of the same density: a given mass grows with the volume.
+        """Return the asset scaled about its origin at constant density; a given mass grows with the volume.
 
         Raises:
             ValueError: If ``factor`` is not finite and > 0.
@@ -272,10 +279,12 @@ class Asset:
         return larger if self.mass is None else replace(larger, mass=self.mass * factor**3)
 
     def factor_to(self, size: float) -> float:
-        """What to scale by for a longest extent [m] of the mesh, or of the opaque splats where there is none.
+        """Compute the scale factor for a longest extent ``size`` [m].
+
+        The extent is that of the mesh, or of the opaque splats if there is no mesh.
 
         Raises:
-            InputError: If it has no extent.
+            InputError: If the extent is zero.
         """
         points = opaque_core(self.splats) if self.mesh is None else self.mesh.vertices
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
@@ -287,10 +296,10 @@ class Asset:
         return size / extent
 
     def resized(self, size: float) -> Asset:
-        """An asset of unknown units in metres, by its longest extent [m]; a given mass stays.
+        """Convert an asset of unknown units to metres by its longest extent [m]; a given mass does not change.
 
         Raises:
-            InputError: If it is in metres already, or has no extent.
+            InputError: If the asset is already in metres, or has no extent.
         """
         if self.units == "metre":
             raise InputError(f"asset {self.name!r} is in metres: it takes a scale, not a size")
@@ -298,7 +307,7 @@ class Asset:
         return replace(self.transformed(np.diag([factor, factor, factor, 1.0])), units="metre")
 
     def check(self) -> tuple[str, ...]:
-        """What is questionable about the asset, a sentence each; nothing of it prevents its use."""
+        """Return warnings about the asset, one sentence each; none of them prevents its use."""
         if self.mesh is None:
             return ()
         findings = []
@@ -318,23 +327,23 @@ class Asset:
 
 
 def read_spec(folder: str | PathLike[str]) -> AssetSpec:
-    """What an asset folder's ``asset.yaml`` says.
+    """Read and validate the ``asset.yaml`` of an asset folder.
 
     Raises:
-        InputError: If it is missing, of a newer version or breaks a rule.
+        InputError: If the file is missing, has a newer format version or breaks a rule.
     """
     return load_yaml(Path(folder) / ASSET_FILE, AssetSpec, newest=FORMAT_VERSIONS[ASSET_FILE])
 
 
 def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
-    """Read any mesh file that trimesh knows; several parts become one mesh.
+    """Read a mesh file of any format that trimesh supports; several parts become one mesh.
 
     Args:
         path: The file.
-        merge: Whether vertices at the same place become one, without which an STL is never watertight.
+        merge: Merge vertices at the same position. Without merging, an STL is never watertight.
 
     Raises:
-        InputError: If the file is missing or damaged, or has no triangles or a vertex that is not finite.
+        InputError: If the file is missing or damaged, has no triangles, or has a vertex that is not finite.
     """
     check_mesh(path)
     try:
@@ -354,7 +363,7 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
 
 
 def _named_file(folder: Path, key: str, name: str) -> Path:
-    """A file that ``asset.yaml`` names, see :func:`mitsplat.storage.files.file_inside`."""
+    """Return the path of a file that ``asset.yaml`` names, see :func:`mitsplat.storage.files.file_inside`."""
     try:
         return file_inside(folder, name)
     except InputError as error:
@@ -362,14 +371,17 @@ def _named_file(folder: Path, key: str, name: str) -> Path:
 
 
 def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:
-    """Scale of an asset that is still in the units of its files."""
+    """Return the scale of an asset that is still in the units of its files."""
     if spec.size is not None:
         return asset.factor_to(spec.size)
     return spec.units if isinstance(spec.units, float) else 1.0
 
 
 def opaque_core(splats: Splats) -> Float32Array:
-    """Centres (M, 3) of opaque Gaussians, less the floaters: those far outside the bulk of 98 % along an axis."""
+    """Return the centres (M, 3) of opaque Gaussians without floaters.
+
+    Floaters lie more than a quarter of the range of the central 98 % outside that range along an axis.
+    """
     centres = splats.means[splats.opacities > _OPAQUE]
     if not len(centres):
         return centres
@@ -381,7 +393,7 @@ def opaque_core(splats: Splats) -> Float32Array:
 
 
 def _hull(points: npt.NDArray[np.floating], place: str) -> trimesh.Trimesh:
-    """Convex hull of points (N, 3); ``place`` begins the error when they span no volume."""
+    """Compute the convex hull of points (N, 3). An error for points without volume begins with ``place``."""
     try:
         hull: trimesh.Trimesh = trimesh.convex.convex_hull(points)
     except (QhullError, ValueError) as error:
@@ -390,13 +402,13 @@ def _hull(points: npt.NDArray[np.floating], place: str) -> trimesh.Trimesh:
 
 
 def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...]:
-    """Convex hulls of the connected parts of a mesh."""
+    """Read a mesh file and return the convex hulls of its connected parts."""
     parts = read_mesh(path, merge=False).split(only_watertight=False, repair=False)
     return tuple(_hull(part.vertices, str(path)) for part in parts)
 
 
 def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """The triangles of all meshes, without colours or textures, and without welding one to another."""
+    """Concatenate the triangles of all meshes, without colours, textures or vertex merging."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return trimesh.Trimesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

@@ -1,4 +1,4 @@
-"""What mitsplat raises when its input, not its code, is at fault."""
+"""Exceptions for bad input and missing resources, and their exit statuses."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import errno
 import re
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of the system's errors where there is no room for a file."""
+"""Error numbers of the operating system that mean that there is no space for a file."""
 
 _OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory|can.t allocate memory|insufficient memory", re.IGNORECASE)
 
 
 class InputError(ValueError):
-    """Bad input: one sentence that names file or place, rule and value. The command line exits with status 2."""
+    """Bad input: one sentence with file or place, rule and value. Exit status 2 of the command line."""
 
 
 class LateDeviceError(InputError):
-    """Another GPU is visible first to this process than the one it was to take.
+    """Request for a GPU after this process has already made another GPU its first visible one.
 
     Attributes:
-        environment: Variables with which a process can take it.
+        environment: Environment variables with which a new process uses the requested GPU.
     """
 
     def __init__(self, sentence: str, environment: dict[str, str]) -> None:
@@ -28,17 +28,19 @@ class LateDeviceError(InputError):
 
 
 class MissingResourceError(RuntimeError):
-    """Something that mitsplat needs of the machine is missing; the sentence says what to do. Exit status 3."""
+    """Missing resource of the machine, such as memory or a library; the message names the remedy. Exit status 3."""
 
 
 class PartialResultError(RuntimeError):
-    """A result was written, but it misses a threshold; the sentence says which, and what would help. Exit status 4."""
+    """Written result that misses a threshold; the message names the threshold and a remedy. Exit status 4."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the machine's memory has run out, or a GPU's, which Dr.Jit, PyTorch and OpenCV tell by a text.
+    """Return True if an error means that host or GPU memory is exhausted.
 
-    A `TypeError` is what that becomes where an array is made of values that do not fit.
+    Dr.Jit, PyTorch and OpenCV report exhausted memory only in the message text. A `TypeError` with such a text occurs
+    when
+    an array is built from values that do not fit into memory.
     """
     if isinstance(error, MissingResourceError | PartialResultError):
         return False
@@ -47,14 +49,14 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether someone has interrupted, which Dr.Jit wraps in an error of its own where it was at work."""
+    """Return True for a keyboard interrupt, including one that Dr.Jit has wrapped in an error of its own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def exit_status(error: BaseException) -> int | None:
-    """Status with which the command line exits for an error that is no bug of ours, else None."""
+    """Return the command line's exit status for an error, or None for an error that indicates a bug in mitsplat."""
     if isinstance(error, MissingResourceError) or is_out_of_memory(error):
         return 3
     if isinstance(error, OSError) and error.errno in FULL:
@@ -67,7 +69,7 @@ def exit_status(error: BaseException) -> int | None:
 
 
 def sentence_of(error: BaseException) -> str:
-    """What to tell of an error."""
+    """Return the user message of an error."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if is_out_of_memory(error):

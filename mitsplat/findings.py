@@ -1,4 +1,4 @@
-"""What a check found, and what to do about it."""
+"""Result type of checks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a report; ``remedy`` says what to do where ``ok`` is false."""
+    """One line of a check report; ``remedy`` is the recommended action if ``ok`` is false."""
 
     name: str
     ok: bool

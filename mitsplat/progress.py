@@ -1,11 +1,11 @@
-"""How long work tells of itself."""
+"""Progress callback types."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Progress = Callable[[int, int, str], None]
-"""Told how many steps are done, of how many, and in a few words what is being done."""
+"""Callback for progress: steps done, number of steps, short name of the current step."""
 
 Note = Callable[[str], None]
-"""Told in a few words what takes long."""
+"""Callback that receives a short description of a slow operation."""

@@ -1,4 +1,4 @@
-"""The version of the package, which files that it writes name."""
+"""Version of the package; written files record it."""
 
 from __future__ import annotations
 

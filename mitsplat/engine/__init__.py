@@ -1,8 +1,8 @@
-"""Frames made by processes, on this machine or on a Ray cluster.
+"""Parallel frame generation in worker processes, on this machine or on a Ray cluster.
 
-In: a function that makes a frame, and the frames of every layout. Out: what it returns, as it is finished. Processes
-that die are replaced and their frames made again; the arrays of a scene exist once in memory, however many processes
-read them. Nothing here knows what a frame is.
+Input: a function that makes a frame, and the frames of every layout. Output: the function's return values, in order of
+completion. Processes that die are replaced, and their frames are made again. All processes of a machine share one copy
+of a scene's arrays. This package does not depend on the type of a frame.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One frame of a scene, from its plan to picture and labels.
 
-In: a scene and the index of a frame. Out: a :class:`Frame`: the developed picture, its layers and its labels. A
-:class:`Renderer` holds what the frames of a scene share. Beside it: the camera's response, scenes as Mitsuba XML, and
-what the presets cost in time and error.
+Input: a scene and the index of a frame. Output: a :class:`Frame` with the developed picture, its layers and its labels.
+A :class:`Renderer` holds the data that the frames of a scene share. Further modules: the camera's response, scenes as
+Mitsuba XML, and a benchmark of the presets' time and error.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is behind everything that a scene has: a part of an image, turned and in the picture's size."""
+"""Background pictures: a rotated part of an image, resampled to the picture's size."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
 
 
 def background_picture(backing: BackgroundDraw, path: Path, width: int, height: int) -> Float32Array:
-    """Linear picture (H, W, 3) of what a backing shows of an image file."""
+    """Return the linear background picture (H, W, 3) from an image file."""
     return backing.gain * cut_out(read_image(path), backing, width, height)
 
 
 def cut_out(image: ByteImage, backing: BackgroundDraw, width: int, height: int) -> Float32Array:
-    """Linear colours (H, W, 3) of the part of an image that a backing says, in another size.
+    """Cut a rotated rectangle out of an image and resample it to linear colours (H, W, 3).
 
-    The part is a turned rectangle of the picture's proportions, all of which is inside of the image. Where it has more
-    pixels than the picture, these are means of theirs.
+    The rectangle has the picture's aspect ratio and lies entirely inside the image. If it has more pixels than the
+    picture,
+    the result averages them.
     """
     turn = np.radians(backing.rotate)
     cosine, sine = np.cos(turn), np.sin(turn)
-    bounds = np.abs([[cosine, sine], [sine, cosine]]) @ (width, height)  # of the turned picture, in its pixels
+    bounds = np.abs([[cosine, sine], [sine, cosine]]) @ (width, height)  # of the rotated picture [px of the picture]
     size = np.array(image.shape[1::-1])
-    step = float((size / bounds).min()) * backing.crop  # pixels of the image for one of the picture
+    step = float((size / bounds).min()) * backing.crop  # pixels of the image per pixel of the picture
     reach = step * bounds / 2
     middle = reach + np.array(backing.place) * (size - 2 * reach)
     low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int)
@@ -41,7 +42,7 @@ def cut_out(image: ByteImage, backing: BackgroundDraw, width: int, height: int) 
         small = np.maximum(np.rint((high - low) / step).astype(int), 1)
         part = cv2.resize(part, tuple(map(int, small)), interpolation=cv2.INTER_AREA)
     scale = np.array(part.shape[1::-1]) / (high - low)
-    # From the centre of a pixel of the picture to that of one of the part; centres of pixels are whole numbers.
+    # The map takes pixel centres of the picture to pixel centres of the part; OpenCV counts centres as whole numbers.
     linear = scale[:, None] * step * np.array([[cosine, -sine], [sine, cosine]])
     offset = scale * (middle - low) - linear @ (np.array([width, height]) / 2 - 0.5) - 0.5
     return np.asarray(

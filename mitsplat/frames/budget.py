@@ -1,8 +1,10 @@
-"""How much memory a process that makes frames of a scene takes at most, by which their number is chosen.
+"""Upper estimate of the memory of a worker process, which limits the number of workers.
 
-``python -m benchmarks.scale.workers budget`` measured the coefficients, and sets them beside peaks; they hold for the
-variant ``llvm_ad_rgb``, where the device's memory is the process's own. As long as nobody has measured it on a GPU, a
-worker there is taken to need as much of the GPU's memory, and as much of the machine's.
+``python -m benchmarks.scale.workers budget`` measured the coefficients and compares the estimate with measured peaks.
+The coefficients hold for the variant ``llvm_ad_rgb``, where the device's memory is the process's own. They have not
+been
+measured on a GPU. A GPU worker is therefore assumed to need this amount of GPU memory and the same amount of the
+machine's memory.
 """
 
 from __future__ import annotations
@@ -22,37 +24,40 @@ from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 
 BASE = 2**30
-"""Python, libraries, compiled kernels and the simulation of a layout [bytes]."""
+"""Memory of Python, libraries, compiled kernels and the simulation of a layout [bytes]."""
 
 PER_PLACED = 160
-"""For every Gaussian of every instance: what of it is in view, and its place in the lists of tiles [bytes]."""
+"""Memory per Gaussian of every instance: its visible data and its entry in the tile lists [bytes]."""
 
 COPIES = 2
-"""Copies of a Gaussian's numbers on the device: as uploaded, and beside all others."""
+"""Copies of a Gaussian's data on the device: the upload, and the concatenation of all splats."""
 
 PER_PAIR = 40
-"""For every pair of a Gaussian and a tile that it covers [bytes]."""
+"""Memory per pair of a Gaussian and a tile that it covers [bytes]."""
 
 PER_RAY = 400
-"""For every ray through the image, all layers of a pixel and what lights them [bytes]."""
+"""Memory per camera ray, with all layers of a pixel and its lighting [bytes]."""
 
 PER_OBJECT = 12 * 2**20
-"""For every object of a layout: its simulation, and what rays meet of it [bytes]."""
+"""Memory per object of a layout, for simulation and ray intersection [bytes]."""
 
 PER_SEEN = 2.25
-"""For every pixel and instance: which of them are seen alone, in tiles up to an image beyond each border [bytes]."""
+"""Memory per pixel and instance for silhouettes, rendered in tiles up to one image size beyond each border [bytes]."""
 
 _VIEWS = 5
 _TILE = np.array([TILE_WIDTH, TILE_HEIGHT])
 _SAMPLE = 50_000
-"""Gaussians of an asset that are looked at, of which the others are taken to be alike."""
+"""Maximum number of Gaussians of an asset that are sampled; the sample represents the others."""
 
 
 def worker_memory(scene: Scene) -> WorkerMemory:
-    """The most that workers take for frames of a scene.
+    """Estimate the maximum memory of workers for frames of a scene.
 
-    The sum of terms in the Gaussians of assets, those of all instances, the tiles that they cover as seen from some of
-    the scene's cameras (in the middle of the region, where they are dropped), rays, objects, and objects times pixels.
+    The estimate is a sum of terms in: Gaussians of assets, Gaussians of all instances, covered tiles, rays, objects,
+    and
+    objects times pixels. Covered tiles are counted from some of the scene's cameras, with dropped objects in the middle
+    of
+    the region.
     """
     spec = scene.spec
     most = [entry.most for entry in spec.objects]
@@ -84,9 +89,9 @@ def worker_memory(scene: Scene) -> WorkerMemory:
 
 
 def _pairs(splats: Splats, camera: Camera, quality: Quality, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:
-    """About how many tiles of 8 x 4 pixels Gaussians cover together, no fewer, of an asset that stands at a place [m].
+    """Estimate an upper bound of the (Gaussian, tile) pairs of an asset at a position [m]; a tile has 8 x 4 pixels.
 
-    Each reaches to where its opacity falls below the quality's cut, and as much wider as the kernel makes it.
+    The footprint of a Gaussian ends where its opacity falls below the quality's cut. The kernel's variance widens it.
     """
     step = 1 + len(splats) // _SAMPLE
     means = splats.means[::step] + np.asarray(tuple(at), dtype=np.float32)
@@ -94,7 +99,7 @@ def _pairs(splats: Splats, camera: Camera, quality: Quality, *, at: Iterable[flo
     above = splats.opacities[::step] / quality.alpha_min
     seen = (depth > camera.near) & (above > 1)
     slope = max(camera.fx, camera.fy) / np.maximum(depth[seen], 1e-6)
-    axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:] * slope[:, None]  # of the widest outline it can show
+    axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:] * slope[:, None]  # of the widest possible outline
     reach = np.sqrt(2 * np.log(above[seen]))[:, None] * np.sqrt(axes**2 + KERNELS[quality.kernel].variance)  # [px]
     tiles = np.prod(2 * reach / _TILE + 1, axis=1)
     image = np.array([camera.width, camera.height])

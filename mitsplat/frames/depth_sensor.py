@@ -1,7 +1,7 @@
-"""Depth as a camera for depth measures it: by stereo or by time of flight, with the errors that each is known for.
+"""Simulated depth cameras: stereo and time of flight, with their characteristic errors.
 
-The true depth stays what it is; this is a second one, for detectors that are shown measured depth. Its numbers depend
-on the frame's seed alone.
+The measured depth is an additional layer for detectors that use measured depth; the true depth does not change. Random
+errors depend only on the frame's seed.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from mitsplat.scene.streams import random_stream
 
 LIGHT_SPEED = 299_792_458.0
 WINDOW = 9
-"""Pixels along each side of what passive stereo matches."""
+"""Side length of the matching window of passive stereo [px]."""
 DARKEST = 0.02
-"""Least reflectance, for time of flight."""
+"""Minimum reflectance for time of flight."""
 
 
 def sensed_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
-    """A frame's depth along the optical axis [m] as the sensor measures it, 0 where it does not, (H, W)."""
+    """Simulate the measured depth of a frame along the optical axis [m], 0 for no measurement, (H, W)."""
     rng = random_stream(frame.plan.seed, "depth sensor")
     depth = frame.depth.astype(np.float64)
     if isinstance(sensor, StereoSensor):
@@ -36,20 +36,21 @@ def sensed_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
 def stereo_depth(
     depth: Float64Array, focal: float, sensor: StereoSensor, rng: np.random.Generator, picture: ByteImage
 ) -> Float32Array:
-    """Depth (H, W) by the disparity to a second camera, beside the first in +x.
+    """Simulate the depth (H, W) of a stereo pair whose second camera is displaced in +x.
 
-    Disparities d = focal baseline / z are measured a little beside where they belong, with an error, and in steps:
+    A disparity is d = focal baseline / z. The measured disparity has lateral shifts, additive noise and quantisation:
     step round((d(x + shift n1) + noise n2) / step), n normal, after Handa et al. (2014, "A benchmark for RGB-D visual
-    odometry, 3D reconstruction and SLAM"). So the standard deviation of depth grows with its square,
+    odometry, 3D reconstruction and SLAM"). The standard deviation of depth therefore grows with the square of depth:
     z^2 noise / (focal baseline) (Khoshelham and Elberink 2012, "Accuracy and resolution of Kinect depth data for indoor
-    mapping applications"). What the second camera does not see has no disparity, nor has what has no contrast.
+    mapping applications"). Pixels that are occluded in the second camera, and pixels without contrast, have no
+    disparity.
 
     Args:
-        depth: True depth along the optical axis [m], 0 where nothing is.
+        depth: True depth along the optical axis [m], 0 for no surface.
         focal: Focal length [px].
-        sensor: Its values.
-        rng: Where the errors come from.
-        picture: What is matched, display-encoded, (H, W, 3).
+        sensor: Sensor parameters.
+        rng: Generator of the errors.
+        picture: Display-encoded picture for matching, (H, W, 3).
     """
     height, width = depth.shape
     rows, columns = np.mgrid[:height, :width]
@@ -71,12 +72,15 @@ def stereo_depth(
 
 
 def hidden_from_second(disparity: Float64Array) -> BoolArray:
-    """Pixels that a second camera in +x, which is like the first, does not see: (H, W).
+    """Return a mask (H, W) of the pixels that an identical second camera in +x does not see.
 
-    Every pixel with a disparity lies that far to the left in its image. There, it covers both pixels that it falls
-    between, and hides what is there with a disparity smaller by more than a pixel: other surfaces, and one that it sees
-    so much from the side that disparities grow by more than 0.4 px a pixel, which no window matches either. What falls
-    beyond the left border is not seen.
+    A pixel with disparity d appears d pixels further left in the second image. There it covers the two pixels around
+    its
+    position. It hides every pixel of that place whose disparity is smaller by more than one pixel. Such pixels belong
+    to
+    other surfaces, or to a surface at a grazing angle, with disparities that grow by more than 0.4 px per pixel; no
+    window
+    matches the latter. Pixels beyond the left border are not visible either.
     """
     height, width = disparity.shape
     rows, columns = np.mgrid[:height, :width]
@@ -98,21 +102,23 @@ def time_of_flight_depth(
     reflectance: Float64Array,
     normal: Float32Array,
 ) -> Float32Array:
-    """Depth (H, W) by the phase of modulated light that comes back.
+    """Simulate the depth (H, W) of a time-of-flight camera from the phase of the returned modulated light.
 
-    A surface at distance r returns s = reflectance cos / r^2 (1 for a white one at 1 m that faces the sensor) with the
-    phase 2 pi r / u, where u = c / (2 modulation) is the longest distance that is told from 0. A pixel adds up what
-    falls on it, so that one at an edge measures neither surface but something between: a flying pixel. The standard
-    deviation of distances is noise sqrt(s + ambient) / s: shot noise of signal and ambient light (Lange and Seitz 2001,
-    "Solid-state time-of-flight range camera", for a constant modulation and exposure).
+    A surface at distance r returns the signal s = reflectance cos / r^2 (s = 1 for a white surface at 1 m that faces
+    the
+    sensor) with the phase 2 pi r / u. The unambiguous range is u = c / (2 modulation). A pixel sums all light that it
+    receives. At an edge, it therefore measures a distance between both surfaces (a flying pixel). The standard
+    deviation of
+    distances is noise sqrt(s + ambient) / s: shot noise of signal and ambient light (Lange and Seitz 2001, "Solid-state
+    time-of-flight range camera", for a constant modulation and exposure).
 
     Args:
-        depth: True depth along the optical axis [m], 0 where nothing is.
-        camera: Its rays.
-        sensor: Its values.
-        rng: Where the noise comes from.
-        reflectance: From 0 to 1, (H, W).
-        normal: In the world, 0 where it is unknown and taken to face the sensor, (H, W, 3).
+        depth: True depth along the optical axis [m], 0 for no surface.
+        camera: Camera, which defines the rays.
+        sensor: Sensor parameters.
+        rng: Generator of the noise.
+        reflectance: Reflectance from 0 to 1, (H, W).
+        normal: World-space normals, (H, W, 3). Zero means unknown; the surface is then assumed to face the sensor.
     """
     height, width = depth.shape
     rows, columns = np.mgrid[:height, :width]

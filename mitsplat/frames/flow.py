@@ -1,4 +1,4 @@
-"""Optical flow: where what a pixel shows is in the next image, if the camera moves, and objects do."""
+"""Optical flow to the next image, for moving cameras and moving objects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
 
 UNKNOWN_FLOW = 1e10
-"""Value of both components where there is no flow, as in Middlebury's files, which call anything above 1e9 unknown."""
+"""Value of both components where no flow exists, as in Middlebury's files (values above 1e9 mean unknown)."""
 
 
 def optical_flow(
@@ -25,19 +25,20 @@ def optical_flow(
     motions: Mapping[int, Float64Array | None] | None = None,
     belt: Belt | None = None,
 ) -> Float32Array:
-    """Motion of every pixel to the next image [px], (H, W, 2).
+    """Compute the motion of every pixel to the next image [px], (H, W, 2).
 
-    :data:`UNKNOWN_FLOW` where nothing is seen, or what is seen lies behind the next camera or is gone. Points that
-    something hides from the next camera have a flow like any other.
+    The flow is :data:`UNKNOWN_FLOW` where the pixel shows nothing, or where its point lies behind the next camera or
+    belongs
+    to an object that is removed. Points that become occluded in the next image have ordinary flow.
 
     Args:
-        depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
-        camera: Where it is seen from.
-        following: Where the next image is taken from.
-        ids: Instance of every pixel, (H, W); needed where objects move.
-        motions: Of each instance that moves, the transform (4, 4) of the world that takes it to its place in the next
-            image; None if it is not there any more. What is not named stays where it is.
-        belt: A conveyor's belt, whose surface moves too where no instance is; needs ``ids``.
+        depth: Depth along the optical axis [m], 0 for no surface, (H, W).
+        camera: Camera of the depth image.
+        following: Camera of the next image.
+        ids: Instance of every pixel, (H, W); required for moving objects.
+        motions: For each moving instance, the world transform (4, 4) from its present to its next pose, or None if the
+            instance is removed. Instances that are not listed do not move.
+        belt: Conveyor belt whose surface moves where no instance is visible; requires ``ids``.
     """
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -66,17 +67,19 @@ def swept_by(
     motion: Mapping[str, Any],
     moving: tuple[Belt, BoolArray] | None = None,
 ) -> tuple[Float32Array, Float32Array]:
-    """How far every pixel moves to the right and down [px] while the shutter is open, each (H, W).
+    """Compute the motion of every pixel to the right and down [px] during the exposure, each (H, W).
 
-    By the motion field in the middle of the exposure (Longuet-Higgins and Prazdny 1980, "The interpretation of a moving
-    retinal image"). What has no depth is infinitely far away.
+    The motion field is evaluated in the middle of the exposure (Longuet-Higgins and Prazdny 1980, "The interpretation
+    of a
+    moving retinal image"). Pixels without depth are treated as infinitely distant.
 
     Args:
-        depth: Depth along the optical axis [m], 0 where nothing is, (H, W).
-        camera: Where it is in the middle of the exposure.
-        motion: As :class:`mitsplat.scene.planning.viewpoints.Viewpoint` has it.
-        moving: A conveyor's belt, and which pixels show what it carries (H, W); those that show its surface follow
-            from their depth.
+        depth: Depth along the optical axis [m], 0 for no surface, (H, W).
+        camera: Camera in the middle of the exposure.
+        motion: Camera motion as in :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
+        moving: Conveyor belt, and a mask of the pixels that show carried objects (H, W). Pixels of the belt's surface
+            are
+            found from their depth.
     """
     height, width = depth.shape
     columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
@@ -94,7 +97,7 @@ def swept_by(
         rotation, centre = camera.world_from_camera[:3, :3], camera.centre
         seen = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
         runs = carried | belt.shows(seen.reshape(-1, 3)).reshape(height, width)
-        # What counts is the camera's motion relative to what a pixel shows.
+        # The motion field depends on the camera's motion relative to the pixel's surface.
         own = motion["exposure"] * (rotation.T @ belt.velocity)
         vx, vy, vz = (np.float32(v) - np.float32(w) * runs for v, w in zip((vx, vy, vz), own, strict=True))
     wx, wy, wz = np.radians(np.multiply(motion["exposure"], motion["rotation"])).astype(np.float32)
@@ -108,7 +111,7 @@ def swept_by(
 
 
 def motions_of(before: Layout, after: Layout) -> dict[int, Float64Array | None]:
-    """What becomes of the instances of a layout in the next one: for :func:`optical_flow`."""
+    """Compute the motions of instances between two layouts, for :func:`optical_flow`."""
     found: dict[int, Float64Array | None] = {}
     there = {instance.id: instance.world_from_object for instance in after.instances}
     for instance in before.instances:

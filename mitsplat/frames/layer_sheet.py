@@ -1,4 +1,4 @@
-"""A frame's layers side by side, to check it by."""
+"""Contact sheet of a frame's layers for visual inspection."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _GAP = 6
 
 
 def layer_sheet(frame: Frame) -> ByteImage:
-    """A frame's picture, labels, ids, depth, light and highlight side by side, each with a caption, RGB."""
+    """Draw a frame's picture, labels, ids, depth, light and highlight in a captioned grid, RGB."""
     tiles = [draw_layer(frame, name) for name in LAYERS]
     height, width = frame.image.shape[:2]
     sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)
@@ -41,7 +41,7 @@ def layer_sheet(frame: Frame) -> ByteImage:
 
 
 def draw_layer(frame: Frame, name: LayerName) -> tuple[str, ByteImage]:
-    """A caption, and one of :data:`LAYERS` as an RGB picture (H, W, 3)."""
+    """Draw one of :data:`LAYERS`; return its caption and an RGB picture (H, W, 3)."""
     if name == "picture":
         return name, frame.image
     if name == "labels":
@@ -60,7 +60,7 @@ def draw_layer(frame: Frame, name: LayerName) -> tuple[str, ByteImage]:
 
 
 def _id_colours(ids: npt.NDArray[np.uint16]) -> ByteImage:
-    """Ids as the colours of as many classes, 0 as black, (H, W, 3)."""
+    """Map ids to class colours and 0 to black, (H, W, 3)."""
     present, position = np.unique(ids, return_inverse=True)
     colours = np.array([class_colour(int(i)) if i else (0, 0, 0) for i in present], dtype=np.uint8)
     return np.asarray(colours[position].reshape(*ids.shape, 3))

@@ -1,7 +1,10 @@
-"""Images whose rows are exposed one after another, while the camera moves and a belt runs.
+"""Images with row-wise exposure (rolling shutter) while the camera moves and a belt runs.
 
-An image is taken in bands of rows, each at the moment of its middle. There are as many as keep what any row shows
-within a quarter of a pixel of its own moment; an image of which nothing moves by half a pixel is taken at once.
+An image is rendered in bands of rows. Each band shows the moment at which its middle row is exposed. The number of
+bands
+limits the displacement within a band to a quarter of a pixel from each row's own moment. An image in which nothing
+moves
+by half a pixel is rendered in one piece.
 """
 
 from __future__ import annotations
@@ -20,29 +23,33 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
 
 MOST_MOVED = 0.5
-"""How far what is seen may move while a band is read [px]."""
+"""Maximum image motion during the read-out of a band [px]."""
 
 MOST_BANDS = 64
-"""Beyond it bands are read for longer than that."""
+"""Maximum number of bands. With faster motion, the motion within a band exceeds `MOST_MOVED`."""
 
 MARGIN = 8
-"""Rows above and below a band that are rendered with it, so that light is averaged as it is within an image.
+"""Extra rows rendered above and below a band, so that light is averaged as inside an image.
 
-What is rendered begins at multiples of it, where patterns of rays and tiles begin anew."""
+Rendered bands begin at multiples of the margin, where the patterns of rays and tiles repeat.
+"""
 
 _ROUNDS = 8
-"""Until a point's row and its moment agree: each leaves the share of the image that all moves during the read-out."""
+"""Fixed-point iterations for a point's row and its moment.
+
+Each iteration reduces the error by the factor (image motion during read-out) / (image height).
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Rows of an image that are taken at one moment.
+    """Rows of an image that are rendered for one moment.
 
     Attributes:
-        camera: At that moment, of an image with these rows and a margin alone.
-        first, end: The rows, of the whole image.
-        top: The whole image's row that is the first one of the camera's.
-        time: Of the moment, since the image's middle row was exposed [s].
+        camera: Camera at that moment, for an image of only these rows and a margin.
+        first, end: Row range in the full image.
+        top: Row of the full image that is row 0 of the band's camera.
+        time: The moment, relative to the exposure of the image's middle row [s].
     """
 
     camera: Camera
@@ -53,17 +60,17 @@ class Band:
 
     @property
     def rows(self) -> slice:
-        """The band's rows among the camera's."""
+        """Rows of the band in the image of the band's camera."""
         return slice(self.first - self.top, self.end - self.top)
 
 
 def bands_of(camera: Camera, motion: Mapping[str, Any], swept: Sequence[npt.NDArray[np.floating[Any]]]) -> list[Band]:
-    """The bands of an image, none if it may be taken at once.
+    """Split an image into bands; return an empty list if one exposure suffices.
 
     Args:
-        camera: Where it is when the middle row is exposed.
-        motion: As :class:`mitsplat.scene.planning.viewpoints.Viewpoint` has it.
-        swept: How far pixels move during an exposure then [px], see :func:`mitsplat.frames.flow.swept_by`.
+        camera: Camera at the exposure of the middle row.
+        motion: Camera motion as in :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
+        swept: Image motion of the pixels during that exposure [px], see :func:`mitsplat.frames.flow.swept_by`.
     """
     readout = motion.get("readout", 0.0)
     farthest = max(float(np.abs(way).max()) for way in swept) * readout / motion["exposure"]
@@ -90,9 +97,9 @@ def _moved(camera: Camera, motion: Mapping[str, Any], time: float) -> Camera:
 
 
 def stacked_silhouettes(bands: Sequence[Band], parts: Sequence[Mapping[int, Silhouette]]) -> dict[int, Silhouette]:
-    """What instances cover in the whole image, from what they cover in each band's camera.
+    """Assemble the silhouettes of instances in the full image from those in the bands.
 
-    What is above the image or below it is as the first and the last row's moments show it.
+    Parts above and below the image are taken from the first and the last band.
     """
     found: dict[int, list[Silhouette]] = {}
     for number, (band, silhouettes) in enumerate(zip(bands, parts, strict=True)):
@@ -119,13 +126,13 @@ def _united(parts: Sequence[Silhouette]) -> Silhouette:
 def project_by_row(
     camera: Camera, motion: Mapping[str, Any], points: Float64Array, velocity: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Pixels (N, 2) and depths [m] (N,) of points in the world (N, 3), each at the moment of the row that shows it.
+    """Project world points to pixels (N, 2) and depths [m] (N,), at the moments of the rows that show the points.
 
     Args:
-        camera: Where it is when the middle row is exposed.
-        motion: As :class:`mitsplat.scene.planning.viewpoints.Viewpoint` has it.
-        points: Where they are then [m].
-        velocity: At which the points move [m/s], shape (3,).
+        camera: Camera at the exposure of the middle row.
+        motion: Camera motion as in :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
+        points: Positions of the points at that moment [m], shape (N, 3).
+        velocity: Velocity of the points [m/s], shape (3,).
     """
     rotation, lens = camera.world_from_camera[:3, :3], replace(camera, world_from_camera=np.eye(4))
     own = (points - camera.centre) @ rotation

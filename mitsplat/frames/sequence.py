@@ -1,4 +1,4 @@
-"""Frames one after the other, for a loop in Python: those of a scene, or a film whose objects and cameras are given."""
+"""Iteration over frames: the frames of a scene, or a film with given layouts and cameras."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from mitsplat.scene.spec.light_spec import LightEntry
 
 Item = TypeVar("Item")
 Shot = tuple[int, Layout | None, Camera | None]
-"""Index of a frame, and where its objects lie and its image is taken from if not as the scene says."""
+"""Frame index, and optional layout and camera in place of the scene's."""
 
 _ENDLESS = 1 << 40
-"""Layouts of a scene that does not end."""
+"""Number of layouts of an unlimited scene."""
 
 
 def render_frames(
@@ -40,29 +40,32 @@ def render_frames(
     quality: str | Quality | None = None,
     progress: bool = True,
 ) -> Iterator[Frame]:
-    """Render and label frames one after the other, each when it is asked for.
+    """Render and label frames lazily, one per iteration.
 
     ::
 
         for frame in ms.render_frames(scene):
             ...
 
-    A frame is that of :func:`mitsplat.render_frame` whichever others are rendered; a layout is settled when its first
-    frame is asked for. With ``layouts`` or ``cameras`` of your own the frames are a film: the flow of each leads to the
-    next one, along the way of objects that have the same id in both; the last one has none.
+    Each frame equals that of :func:`mitsplat.render_frame`, independent of the other frames. A layout is settled when
+    its
+    first frame is requested. With given ``layouts`` or ``cameras``, the frames form a film: the flow of each frame
+    leads to
+    the next one. Objects are matched by their id. The last frame has no flow.
 
     Args:
         scene: The scene.
-        frames: How many, or the index of each; those of the scene by default, or as many as there are layouts and
-            cameras. Indices may go on for as long as frames are asked for, as ``itertools.count()`` does.
-        layouts: Where the objects lie in each frame, or in all of them; as the scene settles them by default.
-        cameras: Where the image of each frame is taken from, or of all of them; those of the scene by default.
-        lights: As in :func:`mitsplat.render_frame`, for all of them.
-        quality: As there.
-        progress: Whether a bar tells of them, in a terminal or in a notebook that has ipywidgets.
+        frames: Number of frames, or their indices. By default, the frames of the scene; with given layouts or cameras,
+            the
+            shorter of these. Indices may be endless, such as ``itertools.count()``.
+        layouts: One layout per frame, or one for all frames; by default, the scene's settled layouts.
+        cameras: One camera per frame, or one for all frames; by default, those of the scene.
+        lights: As in :func:`mitsplat.render_frame`, for all frames.
+        quality: As in :func:`mitsplat.render_frame`.
+        progress: Show a progress bar in a terminal, or in a notebook with ipywidgets.
 
     Raises:
-        InputError: As there.
+        InputError: As in :func:`mitsplat.render_frame`.
     """
     if frames is None:
         given = any(isinstance(each, Iterable) for each in (layouts, cameras))
@@ -88,19 +91,19 @@ def render_frames(
             frame = renderer.render(
                 index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
             )
-            if next_camera is None:  # of the film, whatever view of the scene's comes next
+            if next_camera is None:  # the scene's next view is not part of the film
                 frame = replace(frame, plan=replace(frame.plan, next_camera=None))
             yield frame
 
 
 def without_end(scene: Scene) -> Scene:
-    """The scene with more layouts than anyone asks for; its first frames are the same."""
+    """Return the scene with a practically unlimited number of layouts; its first frames do not change."""
     output = scene.spec.output.model_copy(update={"layouts": _ENDLESS})
     return replace(scene, spec=scene.spec.model_copy(update={"output": output}))
 
 
 def _next(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Camera | None]:
-    """What the flow to the following image of a film has to know; nothing if that has other objects."""
+    """Return the next layout and camera for the flow of a film; (None, None) if the next image has other objects."""
     (index, layout, _), (next_index, next_layout, next_camera) = shot, following
     if layout is None and layout_of(scene, index) != layout_of(scene, next_index):
         return None, None
@@ -111,12 +114,12 @@ def _next(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Cam
 
 
 def _each(given: Item | Iterable[Item] | None) -> Iterator[Item | None]:
-    """One for every frame."""
+    """Return an iterator over the given items, or an endless repetition of a single item."""
     return iter(given) if isinstance(given, Iterable) else itertools.repeat(given)
 
 
 def _with_next(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
-    """Every item with the one that follows it."""
+    """Pair every item with its successor; None for the last one."""
     rest = iter(items)
     now = next(rest, None)
     while now is not None:
@@ -126,7 +129,7 @@ def _with_next(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
 
 
 def _told(steps: Iterable[Item], total: int | None, progress: bool) -> Iterator[Item]:
-    """The steps, with a bar where one can be shown."""
+    """Yield the steps, with a progress bar if the console can show one."""
     console = Console(stderr=True)
     if not progress or not (find_spec("ipywidgets") if console.is_jupyter else console.is_terminal):
         yield from steps

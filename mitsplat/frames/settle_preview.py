@@ -1,4 +1,4 @@
-"""Settled layouts to look at: certificates as a table, a drop as a moving picture."""
+"""Inspection of settled layouts: a table of certificates, and an animation of a drop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PAUSE = 1500  # on the last picture [ms]
 
 
 def certificate_table(layouts: Iterable[Layout]) -> Table:
-    """The rest certificates of layouts, a row each."""
+    """Build a table of rest certificates with one row per layout."""
     table = Table()
     for title in ("layout", "objects", "rest [s]", "speed [mm/s]", "spin [rad/s]", "motion in 1 s [mm]"):
         table.add_column(title, justify="right")
@@ -42,7 +42,7 @@ def certificate_table(layouts: Iterable[Layout]) -> Table:
 
 
 def write_preview(scene: Scene, layout: Layout, path: Path) -> int:
-    """Write the drop of a layout, seen as in its first frame, as an animated GIF; returns the number of pictures.
+    """Write the drop of a layout as an animated GIF from its first frame's camera; return the number of pictures.
 
     Raises:
         InputError: If the file cannot be written.

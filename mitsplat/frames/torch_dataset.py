@@ -1,4 +1,4 @@
-"""Endless labelled frames for PyTorch, rendered while a model learns from them. Needs the extra ``torch``.
+"""Endless stream of labelled frames for PyTorch, rendered during training. Needs the extra ``torch``.
 
 ::
 
@@ -27,15 +27,17 @@ from mitsplat.quality import Quality
 from mitsplat.scene.scene import Scene
 
 Sample = tuple[torch.Tensor, dict[str, torch.Tensor]]
-"""An image and what it shows."""
+"""Image and detection target."""
 
 
 class FrameStream(IterableDataset[Sample]):
-    """Frames of a scene without end, as detection models of torchvision take them.
+    """Endless frames of a scene in the format of torchvision's detection models.
 
-    A worker process of a ``DataLoader`` takes every so-many-th layout, so that none renders what another one does. The
-    scene's seed decides all of them: ``ms.load_scene(path, overrides={"seed": 1})`` gives others. Processes must be
-    spawned, as a renderer does not survive a fork.
+    With N worker processes of a ``DataLoader``, worker k renders the layouts k, k + N, k + 2 N and so on, so that no
+    layout
+    is rendered twice. The scene's seed determines all frames: ``ms.load_scene(path, overrides={"seed": 1})`` gives
+    others.
+    Workers must be spawned, because a renderer does not survive a fork.
 
     Each sample is an image, (3, H, W) float32 from 0 to 1, and a target:
 
@@ -48,7 +50,7 @@ class FrameStream(IterableDataset[Sample]):
     ======== ============================ ===================================
 
     Args:
-        scene: The scene; its number of layouts is of no account.
+        scene: The scene; its number of layouts is ignored.
         quality: As in :func:`mitsplat.render_frame`.
     """
 
@@ -66,12 +68,12 @@ class FrameStream(IterableDataset[Sample]):
 
     @staticmethod
     def collate(samples: Sequence[Sample]) -> tuple[list[torch.Tensor], list[dict[str, torch.Tensor]]]:
-        """A batch as lists, because images show different numbers of objects."""
+        """Collate a batch as lists, because images show different numbers of objects."""
         return [image for image, _ in samples], [target for _, target in samples]
 
 
 def sample_of(frame: Frame) -> Sample:
-    """A frame as an image and a target, see :class:`FrameStream`."""
+    """Convert a frame to an image and a target, see :class:`FrameStream`."""
     labels = frame.labels.instances
     masks = np.zeros((len(labels), *frame.image.shape[:2]), dtype=np.uint8)
     for mask, label in zip(masks, labels, strict=True):

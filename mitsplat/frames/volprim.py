@@ -1,4 +1,4 @@
-"""Mitsuba's own splat path, ``ellipsoids`` and ``volprim_rf_basic``, on the same splats and camera: a yardstick."""
+"""Reference renderer: Mitsuba's own ``ellipsoids`` and ``volprim_rf_basic`` with the same splats and camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mitsplat.runtime.variant import ensure_variant
 
 
 def volprim_scene(splats: Splats, camera: Camera) -> Any:
-    """Mitsuba scene of the splats as ``ellipsoids``, one sample per pixel, box filter."""
+    """Build a Mitsuba scene with the splats as ``ellipsoids``, one sample per pixel and a box filter."""
     ensure_variant()
     count, bands = len(splats), splats.sh.shape[1]
     data = np.concatenate([splats.means, splats.scales, splats.quats], axis=1).astype(np.float32)
@@ -45,5 +45,5 @@ def volprim_scene(splats: Splats, camera: Camera) -> Any:
 
 
 def render_volprim(scene: Any) -> np.ndarray:
-    """One linear image (H, W, 3), as the plugin gives it."""
+    """Render one linear image (H, W, 3)."""
     return np.array(mi.render(scene, spp=1))

@@ -1,7 +1,7 @@
 """Labels of a frame from its instance maps.
 
-In: ids, depth and silhouettes. Out: :class:`Labels`: for every instance an exclusive mask, polygons that rasterise
-back to it, boxes, visible fraction, truncation and keypoints; what a rule drops is counted.
+Input: ids, depth and silhouettes. Output: :class:`Labels` with an exclusive mask, polygons that rasterise back to the
+mask, boxes, visible fraction, truncation and keypoints for every instance, and counts of dropped instances per rule.
 """
 
 from __future__ import annotations

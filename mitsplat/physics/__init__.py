@@ -1,9 +1,9 @@
-"""Where objects come to rest.
+"""Physics simulation of resting poses.
 
-In: a :class:`~mitsplat.scene.scene.Scene` and the index of a layout. Out: a :class:`~mitsplat.scene.layout.Layout`
-with a certificate of what was measured of its rest on the true meshes. A layout is drawn, dropped and certified in
-:mod:`.drop`, declared at rest by :func:`.rest.run_to_rest`, and kept by the hash of all that decides it in
-:mod:`.settle`.
+Input: a :class:`~mitsplat.scene.scene.Scene` and the index of a layout. Output: a
+:class:`~mitsplat.scene.layout.Layout` with a certificate of its rest, measured on the original meshes. :mod:`.drop`
+draws, drops and certifies a layout. :func:`.rest.run_to_rest` detects rest. :mod:`.settle` caches layouts by the hash
+of all their inputs.
 """
 
 from __future__ import annotations

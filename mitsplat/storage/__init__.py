@@ -1,5 +1,5 @@
 """Files, the cache, content hashes, and validated YAML and JSON input.
 
-In: paths and values. Out: files that appear complete or not at all, and errors of one sentence that name the file and
-the key.
+Input: paths and values. Output: files that appear complete or not at all, and errors of one sentence that name the file
+and the key.
 """

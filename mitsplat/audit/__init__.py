@@ -1,7 +1,7 @@
-"""A dataset re-checked from its files alone.
+"""Independent audit of a dataset from its files alone.
 
-In: a dataset's folder. Out: every violation: files are read by the formats' own readers and compared with what masks,
-cameras and poses give anew (:mod:`.truth`). Nothing that wrote the dataset takes part.
+In: a dataset folder. Out: every violation. Files are read by the readers of their formats, and compared with values
+recomputed from masks, cameras and poses (:mod:`.truth`). The audit does not use the code that wrote the dataset.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""CAD meshes and scans to assets.
+"""Baking of CAD meshes and scans into assets.
 
-In: a mesh with its materials. Out: an :class:`~mitsplat.asset.Asset` whose flat Gaussians on its surface show what the
-path tracer saw, with a proxy mesh, convex pieces, and a report that shows the mesh beside the splats.
+In: a mesh with its materials. Out: an :class:`~mitsplat.asset.Asset` of flat Gaussians on the surface of the mesh,
+whose
+colours come from the path tracer, with a proxy mesh and convex pieces, and a report that compares mesh and splats.
 """
 
 from __future__ import annotations

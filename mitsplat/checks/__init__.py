@@ -1,6 +1,6 @@
-"""What is questionable about a machine, an asset or a scene, and what to do about it.
+"""Checks of a machine, an asset or a scene, with a remedy for every problem.
 
-In: a path, or nothing. Out: :class:`~mitsplat.findings.Finding` after finding.
+In: a path, or nothing. Out: an iterator of :class:`~mitsplat.findings.Finding`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A folder of labelled frames that survives whatever ends it.
+"""Dataset folders: writing, resuming, sharding, merging, splitting and re-rendering of single frames.
 
-In: a scene. Out: a dataset on disk, by any number of processes and machines, resumed or not, in shards or whole: the
-same bytes. Scenes that can come to nothing are refused before work starts (:mod:`.prospects`).
+In: a scene. Out: a folder of labelled frames on disk. The bytes are the same for any number of processes, machines,
+shards and resumed runs. Scenes that would produce no labels are refused before work starts (:mod:`.preflight`).
 """
 
 from __future__ import annotations

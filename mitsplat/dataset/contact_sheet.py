@@ -1,4 +1,4 @@
-"""A dataset's frames on one sheet, labels drawn."""
+"""Contact sheet: one picture of a dataset's frames with their labels drawn."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _GAP = 6
 
 
 def spread(total: int, count: int) -> set[int]:
-    """Up to ``count`` positions, evenly spread over ``total``."""
+    """Return up to ``count`` positions, evenly spread over ``range(total)``."""
     return {round(float(place)) for place in np.linspace(0, total - 1, min(count, total))}
 
 
 class ContactSheet:
-    """A picture of up to ``count`` frames, labels drawn, evenly spread over the ``total`` of a dataset in ``root``."""
+    """Picture of up to ``count`` labelled frames, evenly spread over the ``total`` frames of the dataset in ``root``."""
 
     def __init__(self, root: Path, total: int, *, count: int = 16) -> None:
         self._root = root
@@ -35,7 +35,7 @@ class ContactSheet:
         self._tiles: list[ByteImage] = []
 
     def add(self, record: Record) -> None:
-        """See the next frame.
+        """Count the next frame, and add a tile for it if its position was selected.
 
         Raises:
             OSError: If its image cannot be read.

@@ -1,4 +1,4 @@
-"""The folder of a dataset: who writes it, what is in it, and what may be there before."""
+"""Dataset folder: lock, permitted previous contents, description of the run, and completion."""
 
 from __future__ import annotations
 
@@ -60,21 +60,21 @@ if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
 
 IMPLIED = {FORMAT_VERSION: 1, "device": "cpu"}
-"""What ``dataset.json`` means where it does not say so."""
+"""Default values of keys that are absent in ``dataset.json``."""
 _LOCK_TEXT = 200
-"""Most characters of a lock that are shown."""
+"""Maximum number of characters of a lock file that an error message shows."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several parts of a dataset, made apart from the others.
+    """One of several separately rendered parts of a dataset.
 
     Attributes:
-        number: From 1.
-        count: Of all shards.
+        number: Number of the shard, starting at 1.
+        count: Number of all shards.
 
     Raises:
-        InputError: If there is no such part.
+        InputError: If ``number`` is not in 1 to ``count``.
     """
 
     number: int
@@ -86,14 +86,20 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """The shard that a text such as ``2/8`` names."""
+        """Parse a shard from a text such as ``2/8``."""
         number, _, count = text.partition("/")
         if not (number.isdecimal() and count.isdecimal()):
             raise InputError(f"a shard must be I/N, such as 2/8 (got {text})")
         return cls(int(number), int(count))
 
     def frames(self, total: int, views: int) -> range:
-        """Its frames of ``total``: neighbours, and whole layouts of ``views`` frames where there are enough of them.
+        """Return the contiguous range of frames of this shard.
+
+        The range contains whole layouts of ``views`` frames if there are at least as many layouts as shards.
+
+        Args:
+            total: Number of frames of the whole dataset.
+            views: Number of frames per layout.
 
         Raises:
             InputError: If there are fewer frames than shards.
@@ -106,7 +112,7 @@ class Shard:
         return range(first, min(last, total))
 
     def to_json(self, total: int) -> dict[str, int]:
-        """What ``shard.json`` says of this part of ``total`` frames."""
+        """Return the content of ``shard.json`` for this shard of a dataset of ``total`` frames."""
         return {"shard": self.number, "of": self.count, "frames": total}
 
 
@@ -131,19 +137,19 @@ def open_folder(
     overwrite: bool,
     any_device: bool = False,
 ) -> Iterator[Manifest]:
-    """Lock and prepare the folder of a dataset; its manifest, without the frames that miss a file.
+    """Lock and prepare the folder of a dataset, and yield its manifest without the frames that miss a file.
 
     Args:
-        out: The folder, made if missing.
-        content: For ``dataset.json``.
-        scene_file: Kept in ``scene/``.
-        shard: For ``shard.json``, or None.
-        resume: Whether a dataset may be there already.
-        overwrite: Remove it first.
-        any_device: Whether it may have been begun on another device.
+        out: Dataset folder; it is created if missing.
+        content: Content of ``dataset.json``.
+        scene_file: Scene file, copied to ``scene/``.
+        shard: Content of ``shard.json``, or None for a whole dataset.
+        resume: Accept a dataset that is already in the folder.
+        overwrite: Remove a dataset that is already in the folder.
+        any_device: Resume a dataset that was started on another kind of device.
 
     Raises:
-        InputError: If the folder cannot be written, is in use, or holds something else.
+        InputError: If the folder cannot be written, is in use, or holds other files.
         MissingResourceError: If the disk is full.
     """
     _check_own(out)
@@ -181,22 +187,22 @@ def _lock_sentence(out: Path, error: OSError) -> str:
 
 @contextmanager
 def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iterator[Manifest]:
-    """The manifest of a dataset that nobody is writing, and nobody is as long as this is open.
+    """Lock a finished dataset against writers and yield its manifest.
 
     Args:
-        out: The dataset. It may lie where nothing can be written, as on a share of another machine.
-        content: Of its ``dataset.json``.
-        write: Whether files are added to it. If not, nothing in it is changed or made.
+        out: Dataset folder. It may be on a read-only file system, such as a share of another machine.
+        content: Content of its ``dataset.json``.
+        write: Allow files to be added. If False, nothing in the folder is changed or created.
 
     Raises:
-        InputError: If it is in use or damaged, or a link would be written through.
+        InputError: If the dataset is in use or damaged, or if a write would go through a link.
     """
     lock: IO[str] | None = None
     try:
         if write:
             lock = open_in_place(out / LOCK, "a+")
         else:
-            with suppress(FileNotFoundError):  # nobody has begun to write it here
+            with suppress(FileNotFoundError):  # no run has written this dataset here
                 lock = io.TextIOWrapper(open_regular(out / LOCK), errors="replace")
     except OSError as error:
         raise InputError(_lock_sentence(out, error)) from error
@@ -209,9 +215,10 @@ def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iter
 
 
 def _take_lock(out: Path, lock: IO[str]) -> None:
-    """Refuse a folder that another run writes; the lock goes with the open file, however its process ends.
+    """Lock the folder, and refuse it if another run is writing it.
 
-    Who cannot write there shares it with others that read.
+    The lock belongs to the open file, so it is released however the process ends. A file that is open for reading only
+    gets a shared lock, so that several readers can use the folder.
     """
     try:
         fcntl.flock(lock, (fcntl.LOCK_EX if lock.writable() else fcntl.LOCK_SH) | fcntl.LOCK_NB)
@@ -221,7 +228,7 @@ def _take_lock(out: Path, lock: IO[str]) -> None:
 
 
 def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] = ()) -> None:
-    """Note that this process adds frames, how, and by what command, in the log of runs."""
+    """Append command, Python version, number of workers and device of this process to the log of runs."""
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     run = {"command": command, "python": platform.python_version(), "workers": workers, "device": device}
     append_line(out / RUNS, run | ({"gpus": list(gpus)} if gpus else {}))
@@ -234,14 +241,14 @@ def finish_folder(
     catalogue: Catalogue,
     hear: Callable[[Record], object],
 ) -> None:
-    """Sort the manifest and describe the whole dataset, all of whose frames are there, in one pass over its records.
+    """Sort the manifest, and write the contact sheet and the collection files in one pass over all records.
 
     Args:
-        out: The dataset.
-        manifest: Its records.
-        content: What ``dataset.json`` says.
-        catalogue: What the labels refer to.
-        hear: Is told every record.
+        out: Dataset folder; all its frames must be present.
+        manifest: Records of its frames.
+        content: Content of ``dataset.json``.
+        catalogue: Classes, keypoints and assets that the labels refer to.
+        hear: Callback that is called with every record.
 
     Raises:
         PartialResultError: If a file was removed in the meantime.
@@ -266,13 +273,15 @@ def finish_folder(
 
 
 def missing_file(out: Path, record: Record) -> Path | None:
-    """The first of a frame's files that is not there, or None."""
+    """Return the first missing file of a frame, or None if all are present."""
     missing = next((file for file in record["files"] if not os.path.isfile(f"{out}/{file}")), None)  # noqa: PTH113
     return None if missing is None else out / missing
 
 
 def _check_own(out: Path) -> None:
-    """Refuse a folder that holds something other than a dataset of mitsplat, which must not be mixed up or removed."""
+    """Refuse a folder that holds anything else than a mitsplat dataset, so that other files are not mixed up or
+    removed.
+    """
     present: Any = None
     try:
         present = read_json(out / CONTENT)
@@ -289,7 +298,7 @@ def _check_own(out: Path) -> None:
 def _check_resumable(
     out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool, any_device: bool
 ) -> None:
-    """Refuse to continue a dataset against the caller's will, or one that another scene or device began."""
+    """Refuse an existing dataset if ``resume`` is False, or if another scene, device or shard started it."""
     if not (out / CONTENT).exists():
         return
     if not resume:
@@ -314,10 +323,10 @@ def _check_resumable(
 
 
 def read_shard(out: Path) -> dict[str, int] | None:
-    """What ``shard.json`` says, None for a whole dataset.
+    """Read ``shard.json``; return None for a whole dataset.
 
     Raises:
-        InputError: If it is damaged.
+        InputError: If the file is damaged.
     """
     path = out / SHARD
     try:
@@ -331,7 +340,10 @@ def read_shard(out: Path) -> dict[str, int] | None:
 
 
 def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[str, int] | None) -> None:
-    """Make what describes the run, by which the folder is known for a dataset, then the rest; clear what is torn."""
+    """Write the files that describe the run, create the other files and folders, and remove unfinished files and lines.
+
+    ``dataset.json`` marks the folder as a dataset, so it is written before the other files.
+    """
     remove_partial(out)
     if not (out / CONTENT).exists():
         if shard is not None:
@@ -341,14 +353,14 @@ def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[s
     if not (out / "scene" / scene_file.name).exists():
         write_file(out / "scene" / scene_file.name, lambda temporary: _write_scene(scene_file, content, temporary))
     for file in (out / name for name in (MANIFEST, TIMINGS, RUNS)):
-        if file.is_file() and file.stat().st_nlink > 1:  # as in a copy by hard links, whose original must stay
+        if file.is_file() and file.stat().st_nlink > 1:  # the original of a hard-linked copy must not change
             write_file(file, partial(shutil.copyfile, file))
     cut_torn_line(out / TIMINGS)
     cut_torn_line(out / RUNS)
 
 
 def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
-    """Keep the scene file as it was given; of a scene made in Python, one that says the same."""
+    """Copy the scene file; write an equivalent file for a scene made in Python."""
     if scene_file.exists():
         shutil.copyfile(scene_file, path)
     else:
@@ -356,13 +368,16 @@ def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
 
 
 def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, Any]:
-    """What decides the bytes of a dataset, for comparison on resume, and the libraries, for the record."""
+    """Return the content of ``dataset.json``: everything that determines the bytes of a dataset, and library versions.
+
+    The library versions are informative only; they are not compared on resume.
+    """
     libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
     return {
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
         "device": device,
         "mitsplat": __version__,
-        # Frames may be added, and what a run bears changes none.
+        # Frames may be added on resume, and settle.incomplete changes no frame.
         "scene": scene.spec.model_dump(mode="json", exclude={"output": {"layouts"}, "settle": {"incomplete"}}),
         "classes": list(scene.class_names),
         "keypoints": [list(names) for names in catalogue.keypoint_names],
@@ -374,7 +389,10 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
 
 
 def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
-    """Dotted key and the two values, as JSON (null where there is none), where two JSON values differ first."""
+    """Return the first difference of two JSON values, or None if they are equal.
+
+    The difference is its dotted key and both values as JSON text; a missing value is ``null``.
+    """
     if isinstance(before, dict) and isinstance(now, dict):
         for name in sorted({*before, *now}):
             inner = first_difference(before.get(name), now.get(name), f"{key}.{name}" if key else name)

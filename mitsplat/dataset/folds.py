@@ -1,13 +1,14 @@
-"""Lists of a finished dataset's images for cross-validation: in each of k folds, another k-th of them validates.
+"""Image lists of a finished dataset for k-fold cross-validation.
 
 ::
 
     fold1_train.txt, fold1_val.txt, fold2_train.txt, ...        images, as ./images/train/000000.png
     folds/fold1.yaml                                            for Ultralytics; other tasks have both in their folders
-    folds/fold1_train.json, fold1_val.json                      COCO's, if the dataset has it; names are below images/
+    folds/fold1_train.json, fold1_val.json                      COCO, if the dataset has it; names are below images/
 
-Folds part layouts, because views of one layout show the same objects in the same places, and leave out the test split.
-Ultralytics takes paths that begin with ``./`` from the list's own folder, so that lists lie beside ``images/``.
+All views of a layout belong to the same fold, because they show the same objects in the same places. The test split is
+left out. Ultralytics resolves paths that begin with ``./`` from the folder of the list, so lists lie beside
+``images/``.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from mitsplat.storage.json_stream import ListsFile
 
 @dataclass(frozen=True)
 class Fold:
-    """What validates in one fold.
+    """Statistics of the validation part of one fold.
 
     Attributes:
-        layouts: How many layouts.
-        images: How many images of them.
-        instances: Labelled instances by class.
+        layouts: Number of layouts.
+        images: Number of images of these layouts.
+        instances: Number of labelled instances by class.
     """
 
     layouts: int
@@ -44,14 +45,14 @@ class Fold:
 
 
 def write_folds(root: str | Path, folds: int) -> list[Fold]:
-    """Write the lists of a dataset's images for cross-validation.
+    """Write the image lists of a dataset for cross-validation.
 
     Args:
-        root: The dataset, which nobody is writing.
-        folds: How many; layouts of each class are evenly spread over them as far as whole layouts allow.
+        root: Dataset folder that no run is writing.
+        folds: Number of folds. Layouts of each class are spread over them as evenly as whole layouts allow.
 
     Raises:
-        InputError: If it is no dataset, is being written, or has fewer layouts than folds.
+        InputError: If the folder is no dataset, is being written, or has fewer layouts than folds.
     """
     root = Path(root)
     content = read_content(root)
@@ -107,19 +108,21 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
 
 
 def assign_folds(layouts: Mapping[int, Counter[str]], folds: int) -> dict[int, int]:
-    """Fold of each layout, of which every fold has as many as the others, or one more.
+    """Assign each layout to a fold, so that the sizes of the folds differ by at most one layout.
 
-    Layouts with the rarest classes go first, as in the iterative stratification of Sechidis et al. (2011, "On the
-    stratification of multi-label data"), each to the fold where the squares of what is lacking fall most: of instances
-    of each class and of layouts, as shares of what a fold should have.
+    Layouts with the rarest classes are assigned first, as in the iterative stratification of Sechidis et al. (2011, "On
+    the
+    stratification of multi-label data"). Each layout goes to the fold where it reduces the sum of squared deficits
+    most.
+    Deficits are those of the instances of each class and of the layouts, as fractions of the target size of a fold.
 
     Args:
-        layouts: Instances by class of each layout.
-        folds: How many.
+        layouts: Number of instances by class, for each layout.
+        folds: Number of folds.
     """
     room = [len(layouts) // folds + (fold < len(layouts) % folds) for fold in range(folds)]
     total = sum(layouts.values(), Counter[str]())
-    lacking = [dict.fromkeys(total, 1.0) for _ in range(folds)]  # shares of a fold's own part
+    lacking = [dict.fromkeys(total, 1.0) for _ in range(folds)]  # as fractions of the target of the fold
     rarity = {layout: min((total[name], name) for name in found) for layout, found in layouts.items() if found}
     most = (total.total() + 1, "")
     fold_of: dict[int, int] = {}

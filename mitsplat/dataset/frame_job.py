@@ -1,4 +1,4 @@
-"""The engine's unit of work: one frame rendered, and its files written here or brought home from another machine."""
+"""Unit of work of the engine: rendering one frame and writing its files, locally or from another machine."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame
 
 Render = Callable[..., "Frame"]
-"""As :func:`mitsplat.frames.frame.render_frame`."""
+"""Function with the signature of :func:`mitsplat.frames.frame.render_frame`."""
 Settle = Callable[..., Layout]
-"""As :func:`mitsplat.physics.settle.settle_layout`."""
+"""Function with the signature of :func:`mitsplat.physics.settle.settle_layout`."""
 
 
 @dataclass
 class FrameMaker:
-    """Renders one frame and writes its files; the unit of work of the engine."""
+    """Callable that renders one frame and writes its files; the unit of work of the engine."""
 
     scene: Scene
     catalogue: Catalogue
@@ -54,7 +54,7 @@ class FrameMaker:
     _kept: Layout | None = None
 
     def __call__(self, index: int, note: Note, /) -> tuple[Record, dict[str, float]]:
-        """Make frame ``index``; its record and the seconds of its stages."""
+        """Make frame ``index``, and return its record and the seconds of its stages."""
         start = time.perf_counter()
         layout = self._layout(layout_of(self.scene, index), note)
         settled = time.perf_counter()
@@ -62,7 +62,7 @@ class FrameMaker:
         return record, {**seconds, "settle": round(settled - start, 4)}
 
     def write(self, index: int, layout: Layout) -> tuple[Record, dict[str, float]]:
-        """Make the files of a frame; its record and the seconds of its stages."""
+        """Render a frame and write its files, and return its record and the seconds of its stages."""
         frame = self.render(self.scene, index, layout=layout)
         rendered = time.perf_counter()
         with storage_errors(self.out):
@@ -71,7 +71,7 @@ class FrameMaker:
         return record, {stage: round(seconds, 4) for stage, seconds in stages.items()}
 
     def settled(self, index: int, note: Note) -> str:
-        """A layout as JSON."""
+        """Settle a layout and return it as JSON."""
         note(f"settling layout {index}")
         try:
             layout = self.settle(self.scene, index, progress=lambda text: note(f"layout {index}: {text}"))
@@ -80,22 +80,26 @@ class FrameMaker:
         return json.dumps(layout.to_json())
 
     def _layout(self, index: int, note: Note) -> Layout:
-        """The layout from its file, settled by the first process that asks while others wait for it."""
+        """Return the layout from its file.
+
+        If the file is missing, one process settles the layout, and other processes that need it wait.
+        """
         if self._kept is not None and self._kept.index == index:
             return self._kept
         path = self.out / f"layouts/{index:04d}.json"
         with storage_errors(self.out), open_in_place(path.parent / LOCK, "ab") as lock:
-            fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; freed with the file or the process
+            fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; released with the file or the process
             if not path.exists():
                 write_text(path, self.settled(index, note))
             with layout_errors(path), open_regular(path) as file:
                 return self.keep(file.read())
 
     def keep(self, text: str | bytes) -> Layout:
-        """The layout that JSON describes, the same object as before if it is the same.
+        """Parse a layout from JSON and cache it; return the cached object if the index is the same.
 
-        It is always read back, so that a resumed run works with the very same numbers, and stays the same object from
-        view to view, by which the renderer knows that nothing moved.
+        A layout is always parsed from its file, so a resumed run uses exactly the same numbers. All views get the same
+        object,
+        because the renderer detects an unchanged layout by object identity.
         """
         stored = parse_json(text.encode() if isinstance(text, str) else text)
         if self._kept is None or self._kept.index != stored["index"]:
@@ -105,7 +109,7 @@ class FrameMaker:
 
 @contextmanager
 def layout_errors(path: Path) -> Iterator[None]:
-    """Raise what is wrong with the file of a layout as an InputError."""
+    """Convert errors in the file of a layout to an InputError."""
     try:
         yield
     except (ValueError, KeyError, TypeError) as error:
@@ -114,13 +118,13 @@ def layout_errors(path: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Parcel:
-    """A frame that was made on another machine.
+    """Frame that was made on another machine.
 
     Attributes:
-        record: Its line in the manifest.
-        seconds: Of its stages.
+        record: Manifest record of the frame.
+        seconds: Seconds by stage.
         contents: Contents of its files, by SHA-256.
-        layout: The layout that it shows, as JSON.
+        layout: Layout of the frame, as JSON.
     """
 
     record: Record
@@ -129,11 +133,11 @@ class Parcel:
     layout: str
 
     def unpack(self, out: Path) -> Record:
-        """Write the files into a dataset's folder; equal ones are one file with several names.
+        """Write the files into a dataset folder; files with equal contents become hard links.
 
         Raises:
             OSError: If they cannot be written.
-            PartialResultError: If they were damaged on their way.
+            PartialResultError: If a file was damaged in transfer.
         """
         layout = out / f"layouts/{self.record['layout']:04d}.json"
         if not layout.exists():
@@ -151,10 +155,10 @@ class Parcel:
 
 
 class RemoteFrames:
-    """Settles layouts and makes frames where no file of the caller is: what is made is returned instead.
+    """Settling of layouts and rendering of frames on a machine without the caller's files; results are returned.
 
     Args:
-        maker: Makes the frames.
+        maker: Callable that makes the frames.
     """
 
     def __init__(self, maker: FrameMaker) -> None:
@@ -163,12 +167,12 @@ class RemoteFrames:
         self._unpacked = False
 
     def known(self, layout: int) -> str | None:
-        """A layout that the dataset's folder has already; asked where the folder is."""
+        """Return a layout from the dataset folder, or None; must be called on the machine that has the folder."""
         path = self.maker.out / f"layouts/{layout:04d}.json"
         return path.read_text() if path.exists() else None
 
     def settle(self, layout: int) -> str:
-        """A layout as JSON."""
+        """Settle a layout and return it as JSON."""
         return self.maker.settled(layout, lambda text: None)
 
     def make(self, index: int, layout: str) -> Parcel:
@@ -181,7 +185,10 @@ class RemoteFrames:
         return Parcel(record, seconds, contents, layout)
 
     def _unpack_images(self) -> None:
-        """Write the images of lights, which Mitsuba reads from files, into a folder that goes with this object."""
+        """Write the images of lights into a temporary folder, because Mitsuba reads them from files.
+
+        The folder is removed together with this object.
+        """
         if self._unpacked or not self._images:
             return
         folder = Path(tempfile.mkdtemp(prefix="mitsplat-"))

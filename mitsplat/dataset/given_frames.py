@@ -1,4 +1,4 @@
-"""A dataset of frames that were made in Python: with layouts, cameras and lights of one's own."""
+"""Dataset of frames that were made in Python, with the caller's own layouts, cameras and lights."""
 
 from __future__ import annotations
 
@@ -30,19 +30,21 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
 
         ms.write_frames(scene, "out/film", ms.render_frames(scene, layouts=simulate(), cameras=camera))
 
-    Frames are numbered as they come, and each counts as a layout of its own, by which it belongs to a split. The audit
-    then holds pictures, labels, layouts and cameras against each other, but not cameras against the scene. What was
-    begun cannot be resumed.
+    Frames are numbered in the order of the iterable. Each frame counts as a layout of its own, which determines its
+    split.
+    The audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras with the
+    scene. An interrupted run cannot be resumed.
 
     Args:
-        scene: The scene that all of them are of; sizes and formats are in ``scene.spec``.
-        out: Folder, made if missing. It must be empty.
-        frames: Of :func:`mitsplat.render_frames`, :func:`mitsplat.render_frame` or a :class:`mitsplat.Renderer`.
-        overwrite: Remove a dataset that is there first.
+        scene: Scene of all frames; image size and formats are in ``scene.spec``.
+        out: Folder; it is created if missing. It must be empty.
+        frames: Frames of :func:`mitsplat.render_frames`, :func:`mitsplat.render_frame` or a :class:`mitsplat.Renderer`.
+        overwrite: Remove a dataset that is already in the folder.
 
     Raises:
-        InputError: If there are no frames, a frame is not of the scene's image size, flow is among the formats, which
-            is of views of one layout, or the folder holds something else.
+        InputError: If there are no frames, a frame does not have the scene's image size, or the folder holds other
+            files.
+            Also if flow is among the formats, because flow relates views of one layout.
     """
     out, output = Path(out), scene.spec.output
     if "flow" in output.formats:
@@ -63,7 +65,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
             split = split_of(index, output.validation, output.test)
-            # What the camera's pose and lens do not say of how it was drawn.
+            # Only the motion is kept: the camera's pose and lens contain the other drawn values.
             moved = {name: drawn for name, drawn in frame.plan.viewpoint.items() if name == "motion"}
             plan = replace(
                 frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint=moved

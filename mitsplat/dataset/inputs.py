@@ -1,6 +1,7 @@
-"""What a scene read, for comparison when a dataset is resumed: by the place that reads it, never by a name.
+"""Description of all inputs of a scene, compared when a dataset is resumed.
 
-Names are the users' to give twice, and one asset differs from entry to entry by its size, scale and class.
+Inputs are keyed by their place in the scene file, not by name. Names need not be unique, and one asset may have another
+size, scale or class in each entry.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
 
 _NO_CONTENT = frozenset({"folder"})
-"""Fields of an asset that say where it is and not what."""
+"""Fields of an asset that describe its location instead of its content."""
 
 
 def describe_inputs(scene: Scene) -> dict[str, Any]:
-    """What each entry of a scene file came to, by its key: ``objects[1]``, ``environment``, ``lights[0].image``.
+    """Return a description of each input by its key, such as ``objects[1]``, ``environment`` or ``lights[0].image``.
 
-    Of assets all values, and SHA-256 of splats and meshes, with the entry's size, scale and class applied.
+    Assets are described by all their fields, after size, scale and class of the entry were applied. Splats, meshes and
+    images are described by their SHA-256.
     """
     described = _Describer()
     found: dict[str, Any] = {}
@@ -54,17 +56,17 @@ def describe_inputs(scene: Scene) -> dict[str, Any]:
 
 
 class _Describer:
-    """Describes assets; splats and meshes that several of them share are hashed once."""
+    """Descriptions of assets; splats and meshes that several assets share are hashed once."""
 
     def __init__(self) -> None:
         self._known: dict[int, tuple[object, str]] = {}
 
     def asset(self, asset: Asset) -> dict[str, Any]:
-        """Every field, so that none which is added later is forgotten."""
+        """Describe every field of an asset, so that fields added later are included."""
         return {f.name: self.value(getattr(asset, f.name)) for f in fields(asset) if f.name not in _NO_CONTENT}
 
     def value(self, value: Any) -> Any:
-        """A field as JSON."""
+        """Convert a field to JSON."""
         if isinstance(value, Splats | trimesh.Trimesh):
             if id(value) not in self._known:
                 columns = [f.name for f in fields(value)] if isinstance(value, Splats) else ["vertices", "faces"]

@@ -1,6 +1,6 @@
-"""Files of one JSON record per line that only grow while a dataset is made.
+"""Append-only files with one JSON record per line.
 
-Every line of a manifest ends in a checksum of the rest of it, ``"check"``: the first 64 bits of its SHA-256.
+Every line of a manifest ends in ``"check"``, a checksum of the rest of the line: the first 64 bits of its SHA-256.
 """
 
 from __future__ import annotations
@@ -19,23 +19,27 @@ from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import Record, open_in_place, open_regular, write_file
 
 LONGEST_LINE = 1 << 26
-"""Most bytes of a line that are read at once; no frame needs as many."""
+"""Maximum number of bytes of a line that are read at once; larger than any record of a frame."""
 _CHECKED = re.compile(rb'(\{.*),"check":"([0-9a-f]{16})"\}')
 
 
 class Manifest:
-    """The records of a dataset's frames, on disk; only their places in the file are held in memory, 8 bytes for each.
+    """Records of a dataset's frames on disk.
 
-    Iteration is by ascending frame index. Where two lines have one index, the later counts.
+    Only the offsets of the lines are held in memory, 8 bytes per frame. Iteration is by ascending frame index. If two
+    lines
+    have the same index, the later one counts.
 
     Args:
-        path: The file; made if missing. A last line that is not whole is cut off: whoever wrote it was stopped.
-        keep: Whether a record counts, asked once while the file is read; all do if None.
-        check: Raises ValueError for a line that is as it was written, but no record of the dataset.
-        grow: Whether the file may be changed. If not, a last line that is not whole stays, and does not count.
+        path: Manifest file; it is created if missing. An incomplete last line, left by an interrupted run, is cut off.
+        keep: Predicate that is called once per record while the file is read. If it returns False, the record is
+            ignored.
+            All records count if None.
+        check: Function that raises ValueError if a line with a valid checksum is no record of the dataset.
+        grow: Allow the file to be changed. If False, an incomplete last line stays in the file, but is ignored.
 
     Raises:
-        InputError: If any other line is not as it was written.
+        InputError: If any other line is damaged.
     """
 
     def __init__(
@@ -99,10 +103,10 @@ class Manifest:
         return (index for index, _ in self._places)
 
     def append(self, record: Record) -> None:
-        """Add a record; it is on disk when this returns.
+        """Add a record; it is on disk when this method returns.
 
         Raises:
-            InputError: If someone else changed or removed the file.
+            InputError: If another process changed or removed the file.
         """
         line = encode_line(record)
         place = _append(self.path, line)
@@ -117,9 +121,9 @@ class Manifest:
         self._last = max(self._last, record["index"])
 
     def sort(self, hear: Callable[[Record], object] = lambda record: None) -> None:
-        """Leave the file with one line per frame, by ascending index, and tell the records on the way.
+        """Sort the file to one line per frame by ascending index, and call ``hear`` with every record in that order.
 
-        It is rewritten if that is needed, after all records were told.
+        A file that is sorted already is not rewritten. Otherwise it is replaced after the last call of ``hear``.
         """
         if self._in_order:
             for record in self:
@@ -143,7 +147,7 @@ class Manifest:
         with open_regular(self.path) as file:
             position = 0
             for index, place in self._places:
-                if place != position:  # seeking throws away what was read ahead
+                if place != position:  # a seek discards the read buffer
                     file.seek(place)
                 line = file.readline()
                 position = place + len(line)
@@ -166,10 +170,11 @@ def _index_of(record: Record) -> int:
 
 
 class _Places:
-    """Where each frame's line begins, by frame index; iterated by ascending index.
+    """Sparse map from frame index to the offset of its line, iterated by ascending index.
 
-    Pages of places, because frames are numbered without gaps, but a shard's do not begin at 0, and a file that is not
-    to be trusted may name any index.
+    Offsets are stored in pages. Frame indices are contiguous, but those of a shard do not start at 0, and an untrusted
+    file
+    may contain any index.
     """
 
     _PAGE = 4096
@@ -203,16 +208,16 @@ class _Places:
 
 
 def encode_line(record: Record) -> bytes:
-    """The line of a frame's record, with its checksum."""
+    """Return the manifest line of a record, with its checksum."""
     text = json.dumps(record, separators=(",", ":")).encode()
     return text[:-1] + f',"check":"{_checksum(text)}"}}\n'.encode()
 
 
 def parse_line(line: bytes) -> Record:
-    """The record of a line, without its checksum.
+    """Parse the record of a line, without its checksum.
 
     Raises:
-        ValueError: If it is not as it was written.
+        ValueError: If the checksum does not match the line.
     """
     found = _CHECKED.fullmatch(line.rstrip(b"\n"))
     if found is None:
@@ -228,12 +233,12 @@ def parse_line(line: bytes) -> Record:
 
 
 def read_lines(file: IO[bytes]) -> Iterator[bytes]:
-    """Lines of a file; one of more than :data:`LONGEST_LINE` comes in pieces."""
+    """Iterate over the lines of a file; a line longer than :data:`LONGEST_LINE` is split into pieces."""
     return iter(partial(file.readline, LONGEST_LINE), b"")
 
 
 def append_line(path: Path, record: Mapping[str, Any]) -> None:
-    """Append a record without a checksum; it is on disk when this returns."""
+    """Append a record without a checksum; it is on disk when this function returns."""
     _append(path, json.dumps(record, separators=(",", ":")).encode() + b"\n")
 
 
@@ -242,7 +247,7 @@ def _checksum(text: bytes) -> str:
 
 
 def _append(path: Path, line: bytes) -> int:
-    """Append a line; it is on disk when this returns its place in the file."""
+    """Append a line and flush it to disk, and return its offset in the file."""
     with open_in_place(path, "ab") as file:
         place = file.tell()
         file.write(line)
@@ -252,7 +257,7 @@ def _append(path: Path, line: bytes) -> int:
 
 
 def cut_torn_line(path: Path) -> None:
-    """Make the file if it is missing; cut it behind its last newline if a line was not written to its end."""
+    """Create the file if it is missing, and cut off an incomplete last line."""
     with open_in_place(path, "a+b") as file:
         size = end = file.seek(0, os.SEEK_END)
         tail = b""

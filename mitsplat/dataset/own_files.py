@@ -1,6 +1,6 @@
-"""The files that mitsplat writes into a dataset's folder: their names, and which of them may be removed.
+"""Names of the files that mitsplat writes into a dataset folder, and removal of these files.
 
-Nothing else in that folder is removed, and nothing outside of it is reached: its folders must not be links.
+Other files in that folder are never removed. Folders of a dataset must not be links, so nothing outside is changed.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ SHARD = "shard.json"
 LOCK = ".lock"
 _ENTRIES = ("images", "layouts", "scene", "report.html", SHEET, MANIFEST, TIMINGS, RUNS, CONTENT, SHARD, LOCK)
 _UNFINISHED = re.compile(r"\.lock|shard\.json|\.(dataset|shard)\.json\.\d+\.part")
-"""Names of what may be in a folder before ``dataset.json`` is."""
+"""Names of files that may be in a folder before ``dataset.json`` exists."""
 _PARTIAL = re.compile(r"\..+\.\d+\.part")
-"""Of what :func:`mitsplat.storage.files.write_file` has not finished."""
+"""Names of unfinished files of :func:`mitsplat.storage.files.write_file`."""
 
 _SPLIT = f"(?:{'|'.join(SPLITS)})"
 _TASK = f"(?:{'|'.join(task.folder for task in TASKS.values() if task.folder)})?"
@@ -38,7 +38,7 @@ _WRITTEN = re.compile(
         (
             rf"{_TASK}images/{_SPLIT}/{_IMAGE}",
             rf"{_TASK}labels/{_SPLIT}/{_FRAME}\.txt",
-            rf"{_TASK}labels/{_SPLIT}\.cache",  # Ultralytics' copy of these labels
+            rf"{_TASK}labels/{_SPLIT}\.cache",  # label cache of Ultralytics
             rf"{_TASK}(?:data\.yaml|{_FOLD_LIST})",
             rf"{_TASK}folds/fold\d+(?:\.yaml|_(?:train|val)\.json)",
             r"layouts/(?:\d{4,}\.json|\.lock)",
@@ -58,27 +58,28 @@ _WRITTEN = re.compile(
         )
     )
 )
-"""Files in the folders of a dataset, relative to it."""
+"""Names of all files that mitsplat writes into the subfolders of a dataset, relative to the dataset."""
 
 
 def is_unfinished(name: str) -> bool:
-    """Whether a file may be in a folder before it is known for a dataset."""
+    """Return True if a file of this name may be in a folder before ``dataset.json`` exists."""
     return _UNFINISHED.fullmatch(name) is not None
 
 
 def is_written(name: str) -> bool:
-    """Whether mitsplat writes a file of this name, relative to a dataset, into one of its folders."""
+    """Return True if mitsplat writes a file of this name, relative to the dataset, into a subfolder of a dataset."""
     return _WRITTEN.fullmatch(name) is not None
 
 
 def refuse_links(out: Path) -> None:
-    """Refuse a dataset parts of which lie elsewhere: to write or remove them would change what is not its own.
+    """Refuse a dataset with linked folders, because writes and removals would change files outside of the dataset.
 
-    The dataset's folder may be reached through a link. Files of single frames may be links, too: a new file replaces
+    The path of the dataset itself may contain a link. Files of single frames may be links too, because a new file
+    replaces
     the link.
 
     Raises:
-        InputError: If one of its folders, or a file in its own folder, is a link.
+        InputError: If a folder of the dataset, or a file directly in its folder, is a link.
     """
     for name in sorted({*_ENTRIES, *_entries_of_all(), "folds"}):
         top = out / name
@@ -90,7 +91,7 @@ def refuse_links(out: Path) -> None:
 
 
 def remove_dataset(out: Path) -> None:
-    """Remove what mitsplat writes and nothing else; its mark last, so that an interruption can be repeated."""
+    """Remove only files that mitsplat writes; ``dataset.json`` goes last, so an interrupted removal can be repeated."""
     remove_folds(out)
     for name in sorted({*_entries(out), *_ENTRIES} - {LOCK, CONTENT}):
         entry = out / name
@@ -102,18 +103,18 @@ def remove_dataset(out: Path) -> None:
 
 
 def _remove_written(out: Path, top: Path) -> None:
-    """Remove the files in a folder of a dataset that mitsplat writes, and those folders that hold nothing else."""
+    """Remove the files that mitsplat writes from a folder of a dataset, and its subfolders that are then empty."""
     for folder, _, names in os.walk(top, topdown=False):
         for name in names:
             file = Path(folder, name)
             if is_written(file.relative_to(out).as_posix()):
                 file.unlink()
-        with suppress(OSError):  # it holds other files
+        with suppress(OSError):  # the folder holds other files
             Path(folder).rmdir()
 
 
 def _entries(out: Path) -> list[str]:
-    """What the formats of a dataset have in its folder, or all formats where it does not say which it has."""
+    """Return the top-level entries of a dataset's formats, or of all formats if ``dataset.json`` cannot be read."""
     try:
         formats = read_json(out / CONTENT)["scene"]["output"]["formats"]
         return [entry for name in formats for entry in TABLE[name].entries]
@@ -126,7 +127,7 @@ def _entries_of_all() -> list[str]:
 
 
 def remove_folds(out: Path) -> bool:
-    """Remove the lists of a division for cross-validation; whether there were any."""
+    """Remove the image lists for cross-validation, and return True if there were any."""
     found = False
     for folder in {out / task.folder for task in TASKS.values()}:
         for file in folder.glob("fold*_*.txt"):
@@ -139,7 +140,7 @@ def remove_folds(out: Path) -> bool:
 
 
 def remove_partial(out: Path) -> None:
-    """Remove what was not finished."""
+    """Remove unfinished files."""
     for folder, _, names in os.walk(out):
         for name in names:
             if _PARTIAL.fullmatch(name):

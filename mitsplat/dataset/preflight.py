@@ -1,8 +1,8 @@
-"""What can be known of a scene before work starts: why a run could end in nothing, or in more than the machine holds.
+"""Preflight checks: reasons why a run would produce no labels or exceed this machine.
 
-Each function yields the faults that it finds, as :class:`mitsplat.findings.Finding`; ``mitsplat check`` tells all of
-them, and commands refuse the first (:func:`refuse`). Only what is certain is a fault: bounds are generous everywhere,
-for a scene that is refused wrongly cannot be rendered at all.
+Each function yields the faults that it finds, as :class:`mitsplat.findings.Finding`. ``mitsplat check`` prints all of
+them; other commands refuse the scene for the first one (:func:`refuse`). Only certain failures are faults. All bounds
+are generous, because a scene that is refused by mistake cannot be rendered at all.
 """
 
 from __future__ import annotations
@@ -33,30 +33,32 @@ from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
 
 MOST_OBJECTS = 65535
-"""Instance ids have 16 bits."""
+"""Maximum number of objects of a layout; instance ids have 16 bits."""
 MOST_FRAMES = 2**31 - 1
 MOST_STEPS = 1_000_000
-"""Of a simulation; 30 objects take a second for 250 or 1000 of them, as they are stepped."""
+"""Maximum number of simulation steps of a layout; 250 to 1000 steps of 30 objects take one second."""
 VIEWS = 48
-"""Views that are looked at, spread over the run."""
+"""Maximum number of views that are tested, spread evenly over the run."""
 NARROWEST = 0.01
-"""Share of the smallest object that an image must show at least."""
+"""Minimum width of the field of view at the largest depth, as a fraction of the extent of the smallest object."""
 PIXEL_BYTES, PROCESS_GIB = 500, 0.5
-"""Least memory of a pixel at the peak of a frame, and of a process besides; the workcell takes 1.0 GiB at 640x360,
-2.6 at 2000x2000 and 8.4 at 4000x4000."""
+"""Minimum peak memory per pixel of a frame [bytes], and of a process in addition [GiB].
+
+Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000.
+"""
 SLOW_OBJECTS = 40
-"""Objects of a layout from which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
+"""Number of objects per layout above which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
 FRAME_BYTES = 8192
-"""Least room on the disk of a frame: an image and a label, a block each."""
-_CELLS = 24  # of a region along each axis, in which is looked for room
+"""Minimum disk space of a frame [bytes]: one block for the image, one for the label."""
+_CELLS = 24  # per axis of a region, in the search for free volume
 
 
 def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
-    """Refuse a scene for the first of its faults.
+    """Raise an error for the first fault of a scene, if there is one.
 
     Raises:
-        InputError: If there is one.
-        MissingResourceError: If it is that of the machine.
+        InputError: If there is a fault.
+        MissingResourceError: If the first fault is a lack of memory or disk space.
     """
     for fault in faults:
         kind = MissingResourceError if fault.name in ("memory", "disk") else InputError
@@ -71,14 +73,14 @@ def run_faults(
     workers: int | None = None,
     elsewhere: bool = False,
 ) -> Iterator[Finding]:
-    """Everything that stands against making a dataset.
+    """Find all faults that prevent the rendering of a dataset.
 
     Args:
-        scene: What to render.
-        frames: Which of its frames; all if None.
-        out: Where to write them; here if None.
-        workers: Processes that make them.
-        elsewhere: Whether they are made on other machines.
+        scene: Scene to render.
+        frames: Indices of the frames to render; all frames if None.
+        out: Output folder; the current folder if None.
+        workers: Number of processes that render frames.
+        elsewhere: True if frames are rendered on other machines, whose memory is not checked.
     """
     yield from count_faults(scene)
     yield from layout_faults(scene)
@@ -90,7 +92,7 @@ def run_faults(
 
 
 def count_faults(scene: Scene) -> Iterator[Finding]:
-    """More objects or images than have numbers."""
+    """Check that the numbers of objects and images do not exceed the range of their ids."""
     most = sum(entry.most for entry in scene.spec.objects)
     if most > MOST_OBJECTS:
         text = f"objects: a layout must have at most {MOST_OBJECTS} objects, as many as there are ids (got {most})"
@@ -101,7 +103,7 @@ def count_faults(scene: Scene) -> Iterator[Finding]:
 
 
 def layout_faults(scene: Scene) -> Iterator[Finding]:
-    """Why no layout can come to rest."""
+    """Find reasons why no layout can come to rest."""
     settle = scene.spec.settle
     if settle.max_time / settle.timestep > MOST_STEPS:
         yield Finding(
@@ -131,7 +133,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
 def _region_faults(
     scene: Scene, where: str, dropped: Sequence[int], region: Region, arrangement: Arrangement
 ) -> Iterator[Finding]:
-    """Why the entries ``dropped``, which go nowhere else, cannot come to rest in a region."""
+    """Find reasons why the entries ``dropped``, which use only this region, cannot come to rest in it."""
     low, high = np.array(region.min), np.array(region.max)
     supports = [mesh.bounds for name, mesh in _colliders(scene) if not name.startswith(ENCLOSURE)]
     if supports and not any(
@@ -148,7 +150,7 @@ def _region_faults(
 def _room_faults(
     scene: Scene, where: str, dropped: Sequence[int], low: Float64Array, high: Float64Array
 ) -> Iterator[Finding]:
-    """Whether there is room for the objects in a region: of what is in the way, and of their number."""
+    """Check that a region has enough volume outside of colliders for the objects dropped into it."""
     pools = [[mesh for asset in scene.pools[i] if (mesh := scene.assets[asset].mesh) is not None] for i in dropped]
     meshes = [mesh for pool in pools for mesh in pool]
     finest = min(float(mesh.extents.min()) for mesh in meshes) / 2
@@ -181,7 +183,7 @@ def _room_faults(
 
 
 def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
-    """Images, or workers that make them, that this machine has no memory for."""
+    """Check that this machine has enough memory for one image, and for one image per worker."""
     output, free = scene.spec.output, unused_memory()
     need = PROCESS_GIB + output.width * output.height * PIXEL_BYTES / 2**30
     size = f"an image of {output.width}x{output.height} px"
@@ -194,7 +196,7 @@ def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
 
 
 def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
-    """More images than the disk can hold, beside those that are there."""
+    """Check that the disk has space for the images that are not there yet."""
     place = (out or Path.cwd()).absolute()
     while not place.is_dir():
         place = place.parent
@@ -209,12 +211,15 @@ def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
 
 
 def _amount(size: int) -> str:
-    """Bytes as one reads them."""
+    """Format a number of bytes as MiB or GiB."""
     return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.3g} MiB"
 
 
 def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
-    """Why no image can have a label: cameras do not see where objects can be, or not as large as labels must be."""
+    """Find reasons why no image can have a label.
+
+    Either no camera sees the region that objects can reach, or objects appear smaller than ``labels.min_pixels``.
+    """
     spec, least = scene.spec, scene.spec.labels.min_pixels
     labelled = [scene.assets[i] for i in range(len(scene.assets)) if scene.class_index(i) is not None]
     meshes = [asset.mesh for asset in labelled if asset.mesh is not None]
@@ -251,7 +256,10 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
 
 
 def doubts(scene: Scene) -> Iterator[Finding]:
-    """What a run survives but was hardly meant: some views from inside of solids, lights inside of them, small bins."""
+    """Find probable mistakes that do not stop a run.
+
+    Examples are views or lights inside of solids, bins that are too small, and high cost in memory or time.
+    """
     spec = scene.spec
     plans = _plans(scene, range(min(scene.num_frames, MOST_FRAMES)))
     cameras = [plan.camera for plan in plans]
@@ -287,7 +295,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
 
 
 def _cost_doubts(scene: Scene) -> Iterator[Finding]:
-    """Warn of frames that may exceed the memory, and of layouts that settle for minutes."""
+    """Warn of frames that may exceed the memory, and of layouts that take minutes to settle."""
     output, free = scene.spec.output, unused_memory()
     need = worker_memory(scene).own / 2**30
     if need > free:
@@ -301,12 +309,12 @@ def _cost_doubts(scene: Scene) -> Iterator[Finding]:
 
 
 def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
-    """Views and lights from behind a backdrop's walls."""
+    """Warn of views and lights behind a wall of the backdrop."""
     walls = backdrop_walls(scene.spec)
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
 
     def behind(point: Iterable[float]) -> bool:
-        """Whether a wall's middle plane parts a point from the middle of the region."""
+        """Return True if the middle plane of a wall separates a point from the centre of the region."""
         for box in walls:
             axis = int(np.argmin(box.size))
             turn = stated_pose(box)[:3, :3].T
@@ -325,9 +333,9 @@ def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Findi
 
 
 def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
-    """Whether a camera sees anything of a box, as far as nothing is in the way.
+    """Return True if a camera sees any part of a box; occluders are ignored.
 
-    A box that is small in the image is met by points of it, one that is large by rays: one of both is dense.
+    A grid of points in the box detects boxes that are small in the image. A grid of camera rays detects large ones.
     """
     grid = np.stack(np.meshgrid(*([np.linspace(0, 1, 9)] * 3), indexing="ij"), axis=-1).reshape(-1, 3)
     pixels, depth = camera.project(low + grid * (high - low))
@@ -337,7 +345,7 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
         return True
     across = np.stack(np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)), axis=-1)
     slopes = camera.ray_slopes(across.reshape(-1, 2))
-    # Rays of depth 1 for every unit of length, so that their parameter is the depth.
+    # The directions have depth 1, so the ray parameter is the depth.
     rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(low - camera.centre) / rays, (high - camera.centre) / rays])
@@ -346,7 +354,7 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
 
 
 def _blind(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> Finding:
-    """Why no camera sees a box."""
+    """Return the reason why no camera sees a box."""
     touching = [replace(camera, near=1e-9) for camera in cameras]
     if any(sees(camera, low, high) for camera in touching):
         far = max(_depths(camera, low, high)[1] for camera in touching)
@@ -359,18 +367,18 @@ def _blind(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> 
 
 
 def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:
-    """Cameras of some of the frames."""
+    """Return the cameras of up to :data:`VIEWS` of the frames."""
     return [plan.camera for plan in _plans(scene, frames)]
 
 
 def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
-    """Plans of some of the frames."""
+    """Plan up to :data:`VIEWS` of the frames, evenly spread."""
     chosen = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
     return [plan_frame(scene, frames[position]) for position in sorted(chosen)]
 
 
 def _light_inside(scene: Scene, light: LocalLight) -> str:
-    """Name of a visible shape that a light is in and the region is not, or empty."""
+    """Return the name of a visible shape that contains a light but not the region, or an empty string."""
     return solid_around(scene, np.array(light.position))
 
 
@@ -383,7 +391,10 @@ def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
 
 
 def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
-    """Corners of a box [m] that no point of any object leaves before its layout is drawn again."""
+    """Return the corners of a box [m] that contains every point that objects can reach.
+
+    An object that leaves the box causes its layout to be drawn again.
+    """
     region = scene.spec.region
     colliders = list(_colliders(scene))
     boxes = [np.asarray(mesh.bounds) for _, mesh in colliders] or [np.array([region.min, region.max])]
@@ -409,16 +420,18 @@ def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
 
 
 def _depths(camera: Camera, low: Float64Array, high: Float64Array) -> tuple[float, float]:
-    """Least and largest depth of a box that a camera shows [m]."""
+    """Return the smallest and largest depth of a box in a camera [m], limited by the near plane."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
     depth = (corners - camera.centre) @ camera.world_from_camera[:3, 2]
     return max(camera.near, float(depth.min())), max(camera.near, float(depth.max()))
 
 
 def _most_pixels(camera: Camera, size: float, depth: float) -> float:
-    """Most pixels that an object of a size [m] covers from a depth on [m], towards the corners of the image too.
+    """Return an upper bound of the pixels that an object of a size [m] covers at a depth [m] or beyond.
 
-    The disc of a small ball is stretched by 1 / cos^3 of its angle to the axis; distortion may stretch it further.
+    Perspective stretches the disc of a small sphere by 1 / cos^3 of its angle to the optical axis, which is largest in
+    the
+    corners of the image. Lens distortion may stretch it further.
     """
     corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=np.float64)
     steepest = float(np.linalg.norm(camera.ray_slopes(corners), axis=1).max())

@@ -1,9 +1,9 @@
-"""One frame made again, from the scene and its index alone, and compared with a dataset that has it.
+"""Re-rendering of one frame from the scene and its index alone, and comparison with a dataset that contains it.
 
 ::
 
-    frame.json        its line of the manifest, files and their SHA-256 included
-    layouts/0001.json where its objects came to rest
+    frame.json        manifest record of the frame, with its files and their SHA-256
+    layouts/0001.json resting poses of its objects
     images/train/000007.png, ...   its files, named as in a dataset
 """
 
@@ -35,15 +35,16 @@ FRAME = "frame.json"
 
 @dataclass(frozen=True)
 class RemadeFrame:
-    """A frame that was made again.
+    """Frame that was rendered again.
 
     Attributes:
-        path: The folder of its files.
-        record: Its line of the manifest.
-        compared: How many files the dataset's frame has; 0 if there is no dataset, or not this frame in it.
-        differing: Files whose bytes are not the same, or that only one of both has: the frame's, its layout's, and
-            ``manifest.jsonl`` for its line.
-        cause: The first difference of what both were made from; empty if there is none.
+        path: Folder of its files.
+        record: Manifest record of the frame.
+        compared: Number of files of the dataset's frame; 0 if there is no dataset, or the dataset lacks this frame.
+        differing: Files with different bytes, and files that only one of both has. They are files of the frame, the
+            file
+            of its layout, and ``manifest.jsonl`` if the record differs.
+        cause: First difference of the inputs of both; empty if there is none.
     """
 
     path: Path
@@ -63,20 +64,20 @@ def remake_frame(
     render: Render = render_frame,
     settle: Settle = settle_layout,
 ) -> RemadeFrame:
-    """Make one frame again, byte for byte as a dataset has it, from the scene and the frame's index alone.
+    """Render one frame again from the scene and the frame's index alone, byte for byte as in the dataset.
 
     Args:
-        scene: Its formats say which files there are.
-        index: Of the frame; the dataset may have been made with fewer.
-        out: Folder of its files: absent, empty, or of a frame that was made again, whose files are replaced.
-        dataset: Folder to compare with; what is no dataset, or one without this frame, is not compared.
-        device: As in :func:`mitsplat.write_dataset`, of this process.
-        render: As there.
-        settle: As there.
+        scene: Scene; its formats determine the files that are written.
+        index: Index of the frame; it may exceed the number of frames of the dataset.
+        out: Output folder. It must be absent, empty, or hold a frame of an earlier call, whose files are replaced.
+        dataset: Dataset folder to compare with. The comparison is skipped if it is no dataset or lacks this frame.
+        device: Device of this process, as in :func:`mitsplat.write_dataset`.
+        render: As in :func:`mitsplat.write_dataset`.
+        settle: As in :func:`mitsplat.write_dataset`.
 
     Raises:
-        InputError: If there is no such frame, the scene can come to nothing, or the folder holds something else.
-        MissingResourceError: As there.
+        InputError: If there is no such frame, a preflight check fails, or the folder holds other files.
+        MissingResourceError: If the device is not available, or memory does not suffice for one frame.
     """
     out, index = Path(out), whole(index, "frame")
     layout = layout_of(scene, index)
@@ -110,7 +111,7 @@ def remake_frame(
 
 
 def _remove_frame(out: Path) -> None:
-    """Remove the files of a frame that was made before."""
+    """Remove the files of a frame from an earlier call."""
     try:
         names = list(map(str, read_json(out / FRAME)["files"]))
     except (OSError, ValueError, KeyError, TypeError):
@@ -121,10 +122,10 @@ def _remove_frame(out: Path) -> None:
 
 
 def _frame_of(dataset: Path, index: int) -> Record | None:
-    """A frame's line in the manifest of a dataset, which another process may be writing.
+    """Read the record of a frame from the manifest of a dataset, which another process may be writing.
 
     Raises:
-        InputError: If it is not as it was written.
+        InputError: If the line is damaged.
     """
     if not (dataset / CONTENT).is_file() or not (dataset / MANIFEST).is_file():
         return None
@@ -133,7 +134,7 @@ def _frame_of(dataset: Path, index: int) -> Record | None:
     with open_regular(dataset / MANIFEST) as file:
         for line in read_lines(file):
             if line.startswith(start) and line.endswith(b"\n"):
-                found = line  # of two, the later counts
+                found = line  # the last of several lines counts
     try:
         if found is None:
             return None

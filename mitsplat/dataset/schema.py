@@ -1,6 +1,6 @@
-"""What a dataset says about itself, read back: ``dataset.json``, and the lines of ``manifest.jsonl``.
+"""Validation of ``dataset.json`` and of the lines of ``manifest.jsonl``.
 
-Nothing that a file states is trusted before it is checked, so that what works on it can rely on types, sizes and masks.
+All content is checked when it is read, so that other code can rely on types, sizes and masks.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class _Light(_Stored):
 
 
 class _Predicted(_Stored):
-    """What a view was chosen by: labelled objects in view, partly hidden and cut by the border, as was predicted."""
+    """Predicted numbers of labelled objects in view, partly hidden, and cut by the border, used for view selection."""
 
     in_view: Count
     hidden: Count
@@ -157,7 +157,7 @@ class _Motion(_Stored):
 
 
 class _Viewpoint(_Stored):
-    """How a camera was drawn: see :class:`mitsplat.scene.planning.viewpoints.Viewpoint`, whose units these are."""
+    """Drawn values of a camera, in the units of :class:`mitsplat.scene.planning.viewpoints.Viewpoint`."""
 
     camera: Count = 0
     side: Literal["left", "right"] | None = None
@@ -242,10 +242,10 @@ class _Record(_Stored):
 
 
 def read_content(root: Path) -> dict[str, Any]:
-    """What decides a dataset's bytes, ``dataset.json``.
+    """Read ``dataset.json``, which contains everything that determines the bytes of a dataset.
 
     Raises:
-        InputError: If the folder is no dataset of mitsplat, one of a version before labels were audited, or of a newer
+        InputError: If the folder is no dataset of mitsplat, or one of a version without label audit or of a newer
             version.
     """
     try:
@@ -273,10 +273,10 @@ def read_content(root: Path) -> dict[str, Any]:
 
 
 class Records:
-    """The frames' records that can be read, by ascending index; where the lines are takes 24 bytes of memory a frame.
+    """Readable records of a dataset's frames, by ascending index; memory use is 24 bytes per frame.
 
     Attributes:
-        violations: What is wrong with the other lines, once they were read.
+        violations: File and description for each unreadable line, filled by iteration.
     """
 
     def __init__(self, root: Path, content: dict[str, Any]) -> None:
@@ -301,12 +301,12 @@ class Records:
         yield from self._read(self._order)
 
     def some(self, count: int) -> Iterator[Record]:
-        """Up to ``count`` of them, evenly spread; fewer, if lines among those cannot be read."""
+        """Iterate over up to ``count`` evenly spread records; unreadable lines among them are skipped."""
         places = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
         yield from self._read(self._order[places])
 
     def of_frame(self, index: int) -> Iterator[Record]:
-        """The records of a frame: one, if its line can be read."""
+        """Iterate over the readable records of one frame index."""
         yield from self._read(self._order[self._indices[self._order] == index])
 
     def _read(self, numbers: npt.NDArray[np.intp]) -> Iterator[Record]:
@@ -331,12 +331,12 @@ class Records:
 
 
 def check_record(line: bytes, record: Record, content: Mapping[str, Any]) -> None:
-    """Refuse a line whose record has other keys and types than a frame's, but for its masks.
+    """Refuse a record whose keys, types or values are not those of a frame; masks are not checked.
 
     Args:
-        line: Of the manifest.
-        record: What it says.
-        content: Of ``dataset.json``.
+        line: Line of the manifest.
+        record: Parsed record of the line.
+        content: Content of ``dataset.json``.
 
     Raises:
         ValueError: With the reason.
@@ -353,7 +353,7 @@ def check_record(line: bytes, record: Record, content: Mapping[str, Any]) -> Non
     if record["split"] not in splits_of(content["scene"]["output"]):
         raise ValueError(f"split must be among the dataset's (got {record['split']})")
     camera = record["camera"]
-    Camera.from_json(camera)  # refuses what is none
+    Camera.from_json(camera)  # raises if it is no camera
     if record["labels"]["size"] != [camera["width"], camera["height"]]:
         raise ValueError(f"labels.size must be the camera's (got {record['labels']['size']})")
     if record.get("environment", ()) is None:
@@ -385,7 +385,7 @@ def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
     if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
         raise ValueError(f"its box must lie in the image (got {box})")
     mask = decode_rle({"size": [height, width], "counts": code})
-    # Decoding leaves what no run covers as the memory was; only a whole code is what its mask encodes to.
+    # The decoder leaves pixels without a run uninitialised; only a complete code equals the encoding of its mask.
     if not mask[y0:y1, x0:x1].any() or coco_mask.encode(mask)["counts"].decode() != code:
         raise ValueError(f"must be the code of a mask in its box (got {code[:20]!r} for {box})")
 

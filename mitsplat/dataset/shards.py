@@ -1,4 +1,4 @@
-"""Shards of a dataset, made apart, joined into the dataset that one run would have made."""
+"""Merging of separately rendered shards into the dataset that a single run would have written."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from mitsplat.storage.files import Record, file_inside, link_file, open_regular,
 def merge_shards(
     shards: Sequence[str | Path], out: str | Path, *, overwrite: bool = False, progress: Progress | None = None
 ) -> DatasetSummary:
-    """Join datasets that differ only in their frames; every file is checked against its SHA-256 on the way.
+    """Merge datasets that differ only in their frames, and compare every file with its SHA-256.
 
-    Files become further names of the shards' own where both are on one file system. Runs again where it stopped.
+    Files become hard links to the shards' files if both are on one file system. An interrupted call can be repeated.
 
     Args:
         shards: Folders of finished datasets, in any order: all shards of one dataset.
-        out: Folder of the whole, made if missing.
-        overwrite: Remove a dataset that is there first.
-        progress: Hears of every frame.
+        out: Folder of the merged dataset; it is created if missing.
+        overwrite: Remove a dataset that is already in the folder.
+        progress: Callback that is called for every frame.
 
     Raises:
         InputError: If the shards are not of one dataset, one is missing, unfinished or damaged, or two hold the same
-            frame; nothing is written then, but for files whose content turns out not to be what was written.
+            frame. Nothing is written then, except if the content of a file does not match its SHA-256.
     """
     folders, out = [Path(shard) for shard in shards], Path(out)
     if len({folder.resolve() for folder in folders}) < len(folders):
@@ -60,7 +60,7 @@ def merge_shards(
         catalogue = Catalogue(content["classes"], content["keypoints"], content["assets"], (), splits=splits)
         scene_file = _scene_file(folders[0])
         _check_layouts(folders)
-        if overwrite:  # before what is there goes
+        if overwrite:  # check all files before the old dataset is removed
             for folder, part in manifests.items():
                 for record in part:
                     _check_files(folder, record)
@@ -87,10 +87,10 @@ def merge_shards(
 
 
 def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
-    """What decides the bytes of all shards, which must be the same."""
+    """Return the content of ``dataset.json``, which must be equal in all shards."""
     contents: list[dict[str, Any]] = []
     for folder in folders:
-        read_content(folder)  # checks what the file itself, read next, says
+        read_content(folder)  # validates the file; the raw content is read next
         contents.append({**IMPLIED, **read_json(folder / CONTENT)})
         if difference := first_difference(contents[0], contents[-1]):
             key, one, other = difference
@@ -103,7 +103,9 @@ def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
 
 
 def _check_complete(folders: Sequence[Path]) -> int | None:
-    """Frames of the whole dataset as its shards have it, None where all are whole datasets."""
+    """Return the number of frames of the whole dataset as stated by its shards, or None if all folders are whole
+    datasets.
+    """
     said = {folder: read_shard(folder) for folder in folders}
     parts = {folder: part for folder, part in said.items() if part is not None}
     if not parts:
@@ -127,7 +129,7 @@ def _named(part: dict[str, int]) -> str:
 
 
 def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int:
-    """How many frames all shards have together, of which none may be missing, nor be in two."""
+    """Return the number of frames of all shards together; refuse missing frames and frames in two shards."""
     found = [((index, folder) for index in manifest.indices) for folder, manifest in manifests.items()]
     last, place = -1, Path()
     missing, first = 0, 0
@@ -150,7 +152,7 @@ def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int
 
 
 def _join_lines(files: Sequence[Path], whole: Path) -> None:
-    """Write the lines of several files that may be missing, and may end in a torn line."""
+    """Concatenate the lines of several files; a file may be missing or end in an incomplete line."""
     with whole.open("wb") as out:
         for file in files:
             with suppress(FileNotFoundError), open_regular(file) as lines:
@@ -158,7 +160,7 @@ def _join_lines(files: Sequence[Path], whole: Path) -> None:
 
 
 def _check_layouts(folders: Sequence[Path]) -> None:
-    """A layout that two shards show must be the same in both."""
+    """Check that a layout that is in two shards is the same in both."""
     seen: dict[str, Path] = {}
     for folder in folders:
         for layout in _layouts(folder):
@@ -168,19 +170,19 @@ def _check_layouts(folders: Sequence[Path]) -> None:
 
 
 def _layouts(folder: Path) -> list[Path]:
-    """The files of a shard's layouts."""
+    """Return the layout files of a shard."""
     return [_inside(folder, path) for path in sorted((folder / "layouts").glob("[0-9]*.json"))]
 
 
 def _models(folder: Path, content: Mapping[str, Any]) -> list[Path]:
-    """The files of BOP's models."""
+    """Return the files of the BOP models."""
     numbers = sorted(set(range(1, len(content["assets"]) + 1)) - {one + 1 for one in content.get("distractors", ())})
     names = ["models_info.json", *(f"obj_{number:06d}.ply" for number in numbers)]
     return [_inside(folder, folder / "bop/models" / name) for name in names]
 
 
 def _scene_file(folder: Path) -> Path:
-    """The scene that a dataset keeps."""
+    """Return the path of the scene file that a dataset contains."""
     names = sorted((folder / "scene").glob("[!.]*"))
     if len(names) != 1:
         raise InputError(f"{folder / 'scene'}: must hold the scene file alone (got {len(names)} files)")
@@ -188,7 +190,7 @@ def _scene_file(folder: Path) -> Path:
 
 
 def _inside(folder: Path, path: Path) -> Path:
-    """A file of a shard, which must not be elsewhere."""
+    """Return a file of a shard, and refuse it if it lies outside of the shard."""
     try:
         return file_inside(folder, str(path.relative_to(folder)))
     except InputError as error:
@@ -211,9 +213,9 @@ def _take_files(folder: Path, out: Path, record: Record) -> None:
 
 
 def _source(folder: Path, file: str, record: Record) -> Path:
-    """A file of a shard's frame."""
+    """Return a file of a shard's frame."""
     try:
-        if ".." in Path(file).parts:  # inside one folder may be outside of the other
+        if ".." in Path(file).parts:  # the path may leave the other dataset's folder
             raise InputError(f"files must not be named by .. (got {file})")
         return file_inside(folder, file)
     except InputError as error:

@@ -1,20 +1,20 @@
-"""A dataset folder: written frame by frame, never half, resumable.
+"""Writing of a dataset folder frame by frame; an interrupted run can be resumed.
 
 ::
 
     images/train/000000.png     labels/train/000000.txt     layers/train/000000.exr      (and the same for val)
     annotations/instances_train.json, instances_val.json    data.yaml    contact_sheet.jpg
     manifest.jsonl    one line per frame: files and their SHA-256, camera, draws, labels with masks and poses
-    timings.jsonl     seconds per stage; apart, so that equal datasets have equal manifests
-    runs.jsonl        the command of every run that made frames, and its device
-    dataset.json      what decides the content: effective scene, hashes of its inputs, kind of device, version
-    shard.json        which part of the dataset this is, if it is one of several
-    scene/            the scene file as it was given
-    layouts/0000.json where the objects came to rest
+    timings.jsonl     seconds per stage; separate, so that equal datasets have equal manifests
+    runs.jsonl        command and device of every run that made frames
+    dataset.json      everything that determines the content: scene, hashes of its inputs, kind of device, version
+    shard.json        part of the dataset in this folder, if it is one of several
+    scene/            copy of the scene file
+    layouts/0000.json resting poses of the objects
 
-A file gets its name when it is complete and on disk, and a frame its line in the manifest when all its files are.
-Shards are datasets of their own that share everything but their frames; :mod:`mitsplat.dataset.shards` joins them.
-``data.yaml`` is the only YAML file at the top, because Ultralytics, given the folder, takes the one it finds there.
+A file gets its final name when it is complete and on disk. A frame gets its line in the manifest when all its files
+are complete. Shards are datasets of their own that share everything except their frames; :mod:`mitsplat.dataset.shards`
+merges them. ``data.yaml`` is the only YAML file at the top level, because Ultralytics takes the first one of a folder.
 """
 
 from __future__ import annotations
@@ -51,20 +51,21 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DatasetSummary:
-    """What a call of :func:`write_dataset` left behind.
+    """Summary of a call of :func:`write_dataset`.
 
     Attributes:
-        path: The dataset's folder.
-        frames: Frames in it.
-        rendered: Frames that this call made; the others were there before.
-        images: Images by split.
-        instances: Labelled instances by class.
-        dropped: What was not labelled, by the reasons of :class:`mitsplat.labels.labels.Labels`.
-        marked: Labelled instances below a threshold, by the marks of :class:`mitsplat.labels.labels.InstanceLabel`.
+        path: Dataset folder.
+        frames: Number of frames in the dataset.
+        rendered: Number of frames that this call rendered; the others existed before.
+        images: Number of images by split.
+        instances: Number of labelled instances by class.
+        dropped: Number of unlabelled instances by the reasons of :class:`mitsplat.labels.labels.Labels`.
+        marked: Number of labelled instances below a threshold, by the marks of
+            :class:`mitsplat.labels.labels.InstanceLabel`.
         contact_sheet: Picture of some frames with their labels drawn.
-        incomplete: Layouts that lack objects, because no draw with them came to rest.
-        left_out: Those objects by name.
-        unlabelled: Whether there are objects, but no image has a label.
+        incomplete: Number of layouts that lack objects, because no draw with these objects came to rest.
+        left_out: Number of these objects by name.
+        unlabelled: True if there are objects, but no image has a label.
     """
 
     path: Path
@@ -98,35 +99,37 @@ def write_dataset(
 ) -> DatasetSummary:
     """Render the first ``frames`` frames of a scene (default: all) into the dataset folder ``out``.
 
-    Frames that are already there are kept if ``resume`` is set and they come from the same scene. The bytes of images,
-    labels and manifest do not depend on ``workers``, ``cluster`` or interruptions, and those of all shards merged not
-    on their number. They do on the kind of the device: pictures of a GPU differ a little from those of a CPU.
+    Existing frames are reused if ``resume`` is set and they come from the same scene. The bytes of images, labels and
+    manifest do not depend on ``workers``, ``cluster`` or interruptions. The bytes of merged shards do not depend on the
+    number of shards. The bytes depend on the kind of device: pictures of a GPU differ a little from those of a CPU.
 
     Args:
-        scene: What to render; sizes, formats and the seed are in ``scene.spec``.
-        out: Folder, made if missing. It must be empty or a dataset.
-        frames: How many frames the dataset should have, all its shards together.
-        shard: Which part of it to make here; all of it if None.
-        workers: Processes that make frames, see :func:`mitsplat.engine.pool.run_frames`; None is as many as pay, or as
-            fit into the cluster.
-        cluster: Where frames are made, if not in processes of this machine.
-        resume: Continue a dataset that is there; otherwise its presence is an error.
-        overwrite: Remove a dataset that is there first.
-        progress: Hears of every finished frame and of slow steps.
-        render: What to use instead of :func:`mitsplat.frames.frame.render_frame`.
-        settle: What to use instead of :func:`mitsplat.physics.settle.settle_layout`.
-        device: What frames are rendered on, as :mod:`mitsplat.runtime.device` names them; layouts are settled on CPUs.
-        That of
-            this process if None, see :func:`mitsplat.use_device`, and on a cluster what its resources say.
-        any_device: Continue a dataset that was begun on the other kind of device.
+        scene: Scene to render; image size, formats and the seed are in ``scene.spec``.
+        out: Folder; it is created if missing. It must be empty or a dataset.
+        frames: Number of frames of the dataset, all its shards together.
+        shard: Part of the dataset to render here; all frames if None.
+        workers: Number of processes that render frames, see :func:`mitsplat.engine.pool.run_frames`. None selects the
+            number that is worthwhile on this machine, or that fits into the cluster.
+        cluster: Cluster that renders the frames; processes of this machine if None.
+        resume: Continue an existing dataset; if False, an existing dataset is an error.
+        overwrite: Remove a dataset that is already in the folder.
+        progress: Callback that is called after every finished frame and during slow steps.
+        render: Replacement of :func:`mitsplat.frames.frame.render_frame`.
+        settle: Replacement of :func:`mitsplat.physics.settle.settle_layout`.
+        device: Device that renders frames, by the names of :mod:`mitsplat.runtime.device`; layouts are settled on CPUs.
+            None selects the device of this process (see :func:`mitsplat.use_device`), or, on a cluster, the device
+            given by its resources.
+        any_device: Continue a dataset that was started on the other kind of device.
 
     Raises:
-        InputError: If ``frames`` or a format is not available, the scene can come to nothing (see
-            :mod:`mitsplat.dataset.preflight`), the folder cannot be written, is in use, holds something else, or holds
-            a dataset of another scene; nothing is rendered then. Later, if what is in it is changed by someone else, or
-            more layouts lack objects than ``settle.incomplete`` says.
-        MissingResourceError: If the disk is full, the device is not here, or memory does not suffice for one frame.
-        PartialResultError: If workers were lost, or finished files removed, faster than frames could be made again.
+        InputError: If ``frames`` or a format is not available, a preflight check fails (see
+            :mod:`mitsplat.dataset.preflight`), the folder cannot be written, is in use, holds other files, or holds a
+            dataset of another scene; nothing is rendered then. Later, if another process changes the folder, or if more
+            layouts lack objects than ``settle.incomplete`` allows.
+        MissingResourceError: If the disk is full, the device is not available, or memory does not suffice for one
+            frame.
+        PartialResultError: If workers were lost, or finished files were removed, faster than frames could be made
+            again.
     """
     out = Path(out)
     count = scene.num_frames if frames is None else frames
@@ -193,7 +196,7 @@ def _results(
     device: Device,
     note: Note,
 ) -> Generator[tuple[Record, dict[str, float]]]:
-    """Records of frames whose files are in the folder, and the seconds of their stages."""
+    """Yield the record and the seconds of the stages of each frame, after its files were written to the folder."""
     if cluster is None:
         memory = TYPICAL if workers is not None else worker_memory(make.scene)
         with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory, device=device)) as made:
@@ -206,11 +209,11 @@ def _results(
 
 
 class Shortfall:
-    """Refuses a dataset of which more layouts lack objects than the scene bears.
+    """Limit of the number of layouts that lack objects.
 
     Args:
-        scene: With its ``settle.incomplete``.
-        layouts: Of the whole dataset, all its shards together.
+        scene: Scene with the limit ``settle.incomplete``.
+        layouts: Number of layouts of the whole dataset, all its shards together.
     """
 
     def __init__(self, scene: Scene, layouts: int) -> None:
@@ -218,17 +221,17 @@ class Shortfall:
         self._lacking: dict[int, Sequence[tuple[str, str]]] = {}
 
     def read(self, path: Path) -> None:
-        """Count a layout that an earlier run settled, if it did."""
+        """Count a layout that an earlier run settled, if its file exists."""
         with suppress(FileNotFoundError):
             with layout_errors(path):
                 layout = Layout.from_json(read_json(path))
             self.add(layout.index, [(self._scene.assets[one.asset].name, one.reason) for one in layout.left_out])
 
     def add(self, layout: int, left_out: Sequence[tuple[str, str]]) -> None:
-        """Count a layout that lacks objects of these names, for these reasons.
+        """Count a layout that lacks objects, given by name and reason.
 
         Raises:
-            InputError: If too many do.
+            InputError: If too many layouts lack objects.
         """
         if not left_out:
             return
@@ -246,7 +249,7 @@ class Shortfall:
 
 @dataclass
 class FrameCounts:
-    """What is counted while a dataset's records are read once."""
+    """Statistics of a dataset, counted in one pass over its records."""
 
     images: Counter[str] = field(default_factory=Counter)
     instances: Counter[str] = field(default_factory=Counter)
@@ -267,7 +270,7 @@ class FrameCounts:
             self.left_out[record["layout"]] = Counter(one["name"] for one in record["left_out"])
 
     def summary(self, out: Path, rendered: int) -> DatasetSummary:
-        """What is in a finished dataset, ``rendered`` frames of it new."""
+        """Return the summary of a finished dataset, of which ``rendered`` frames are new."""
         return DatasetSummary(
             path=out,
             frames=self.images.total(),

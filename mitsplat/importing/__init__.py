@@ -1,7 +1,7 @@
-"""Splats that were made elsewhere to an asset, without photographs.
+"""Import of splats from other programs as assets, without photographs.
 
-In: a file of splats, and what is known of its units and axes. Out: an :class:`~mitsplat.asset.Asset` that stands
-upright, without what is invisible or loose, with a closed mesh and pieces, and a page to look at it by.
+In: a splat file, and its units and axes if known. Out: an upright :class:`~mitsplat.asset.Asset` without invisible or
+loose splats, with a closed mesh and convex pieces, and an HTML page for visual inspection.
 """
 
 from __future__ import annotations

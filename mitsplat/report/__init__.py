@@ -1,6 +1,6 @@
-"""A page to look at a dataset by: samples with their labels, draws and what is missing, statistics, audit, origin.
+"""HTML report of a dataset: labelled samples, draws, missing variety, statistics, audit and provenance.
 
-In: a dataset's folder. Out: one HTML file that needs no network, and warnings of what a detector cannot learn.
+In: a dataset folder. Out: one HTML file that needs no network, and warnings about gaps that a detector cannot learn.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""What datasets are for: detectors of Ultralytics trained on them, alone or mixed with photographs, and judged.
+"""Training and evaluation of Ultralytics detectors.
 
-In: datasets of mitsplat, YOLO or COCO folders, and a network's name. Out: the folder of a run with its weights, and
-that of an evaluation: average precision by COCO's rules, every detection, and a page. Nothing here needs Mitsuba.
-Training and predicting need the extra ``train``; judging detections that are kept needs nothing more.
+Input: mitsplat datasets, YOLO folders or COCO folders, and the name of a network. Photographs can be mixed in.
+Output: a run folder with the weights, and an evaluation folder with the average precision by COCO's rules, all
+detections and an HTML page.
+The package does not need Mitsuba. Training and prediction need the extra ``train``; the evaluation of stored detections
+needs no extra.
 """
 
 from __future__ import annotations

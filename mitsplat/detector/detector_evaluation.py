@@ -1,12 +1,12 @@
-"""A trained detector judged on labelled images: what it finds in them, how well that is, and a page to look at it by.
+"""Evaluation of a trained detector on labelled images.
 
-The folder of an evaluation::
+The evaluation folder::
 
-    results.json      average precision of boxes and masks, by class, and what each kind of error costs; the confusion
-                      matrix; what they were made of
-    detections.json   everything that was found, in COCO's results format
-    truth.json        what is labelled, as a COCO dataset with the ids of detections.json
-    report.html       the page
+    results.json      average precision of boxes and masks, in total and by class; cost of each kind of error; confusion
+                      matrix; provenance (run, weights, versions, data)
+    detections.json   all detections, in COCO's results format
+    truth.json        the labels as a COCO dataset, with the image and category ids of detections.json
+    report.html       the report page
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import storage_errors, write_text
 
 LEAST_SCORE, NMS_IOU = 0.001, 0.7
-"""Detections that are kept, and the overlap of boxes of a class beyond which the lower score is dropped."""
+"""Least score of stored detections, and IoU threshold of the non-maximum suppression within a class."""
 
 _OWN = frozenset(("truth.json", "detections.json", "results.json", REPORT_FILE))
-"""Files of an evaluation."""
+"""Names of the files of an evaluation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What was found out about a detector.
+    """Result of a detector evaluation.
 
     Attributes:
         path: Folder of the evaluation.
-        results: What ``results.json`` says.
+        results: Content of ``results.json``.
     """
 
     path: Path
@@ -72,7 +72,7 @@ class Evaluation:
 
     @property
     def page(self) -> Path:
-        """The page to look at."""
+        """Path of the HTML report."""
         return self.path / REPORT_FILE
 
 
@@ -86,21 +86,22 @@ def evaluate_detector(
     device: str = "auto",
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Predict on labelled images with the weights of a run, and write how well that went.
+    """Predict on labelled images with the weights of a run, and write the evaluation.
 
     Args:
         run: Folder of a finished training.
-        data: A dataset of mitsplat, a YOLO folder or a COCO folder.
-        out: Folder to write; ``evaluation/<name of data>-<split>`` in the run by default. An evaluation that is there
-            is replaced.
-        split: Which of the images.
-        size: Longer side that images are scaled to [px], that of the training by default.
-        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, as PyTorch counts GPUs.
-        progress: Told of each image.
+        data: A mitsplat dataset, a YOLO folder or a COCO folder.
+        out: Output folder; ``evaluation/<name of data>-<split>`` in the run by default. An existing evaluation is
+            replaced.
+        split: Split of the images to evaluate.
+        size: Longer side to which images are scaled [px]; the size of the training by default.
+        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, with PyTorch's GPU numbers.
+        progress: Called after each image.
 
     Raises:
-        InputError: If the run is not finished, or images are not as :func:`mitsplat.detector.read_set` wants them, have
-            other classes, or boxes alone where the detector predicts masks; or the folder holds them or something else.
+        InputError: If the run is not finished, the images do not satisfy :func:`mitsplat.detector.read_set`, the
+            classes differ, or the detector predicts masks and the labels are only boxes. Also if ``out`` contains the
+            images or unrelated files.
         MissingResourceError: If Ultralytics or the GPU is missing.
     """
     trained, root = open_run(run), Path(data)
@@ -145,9 +146,10 @@ def detect(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> list[Detection]:
-    """What weights of Ultralytics find in images, in COCO's results format; ids of images count from 1.
+    """Return the detections of Ultralytics weights in images, in COCO's results format.
 
-    One image at a time, so that none depends on which others there are. Masks are as large as the image.
+    Image ids count from 1. Images are predicted one at a time, so the result of an image does not depend on the others.
+    Masks have the size of the image.
     """
     from ultralytics import YOLO  # optional
 
@@ -187,7 +189,7 @@ def detect(
 
 
 def truth_of(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
-    """What is labelled, as a COCO dataset; ids of images, annotations and categories count from 1."""
+    """Return the labels as a COCO dataset; ids of images, annotations and categories count from 1."""
     annotations: list[dict[str, Any]] = []
     for number, sample in enumerate(found.samples, start=1):
         for instance in sample.instances:
@@ -216,14 +218,14 @@ def truth_of(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
 def write_evaluation(
     found: LabelledSet, detections: Sequence[Detection], out: str | Path, *, masks: bool, about: dict[str, Any]
 ) -> Evaluation:
-    """Judge detections, and write the folder of the evaluation; nothing of it needs Ultralytics.
+    """Compare stored detections with the labels, and write the evaluation folder; Ultralytics is not needed.
 
     Args:
         found: The labelled images.
-        detections: What was found in them, in COCO's results format, their ids counted as by :func:`truth_of`.
-        out: The folder.
-        masks: Whether masks are judged too, or boxes alone.
-        about: What else ``results.json`` is to say: how the detections came to be.
+        detections: Detections in COCO's results format, with ids as in :func:`truth_of`.
+        out: Output folder.
+        masks: True to evaluate masks as well as boxes.
+        about: Further entries of ``results.json``, for example how the detections were made.
     """
     out, truth = Path(out), truth_of(found, masks=masks)
     scores = {"box": DetectionMatches(truth, detections, "bbox").average_precision()}

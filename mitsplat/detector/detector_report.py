@@ -1,4 +1,4 @@
-"""The page of an evaluation: average precision, where it is lost, and the images that went worst."""
+"""HTML report of an evaluation: average precision, cost of the kinds of errors, and the worst images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mitsplat.pages.html import inline_image, make_page, mask_path
 from mitsplat.pages.svg_charts import bars, curves
 
 WORST = 8
-"""Images that are shown, those with the least share of things that were found right."""
+"""Number of images in the report; those with the lowest share of correct detections."""
 _THUMBNAIL = 560
 _WORDS = {"box": "boxes", "mask": "masks"}
 
@@ -32,7 +32,7 @@ def make_report(
     confusion: Confusion,
     results: Mapping[str, Any],
 ) -> str:
-    """The page, one HTML file that needs no network."""
+    """Return the report as one self-contained HTML page."""
     title = f"{found.root.resolve().name}, {found.split}: evaluation of a detector"
     parts = [
         f"<h1>{html.escape(title)}</h1>",
@@ -157,7 +157,7 @@ def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[De
 
 
 def worst_images(confusion: Confusion) -> list[int]:
-    """Ids of images with an error, those with the least share of things found right first."""
+    """Return the ids of images with errors, in ascending order of their share of correct detections."""
     shares = {
         image: (right / (right + sum(wrong)), -sum(wrong), image)
         for image, (right, *wrong) in confusion.errors.items()

@@ -1,7 +1,7 @@
-"""Ultralytics' trainer with a fixed number of steps, and images that a plan names. Needs the extra ``train``.
+"""Ultralytics trainer with a fixed number of steps and a fixed image plan; needs the extra ``train``.
 
-Its epoch is here no walk through the images but :data:`EPOCH` steps: what Ultralytics does by epochs (the learning
-rate, checkpoints, the end of mosaics) is the same for any number of images. A step is one batch and one update of the
+An epoch here is :data:`EPOCH` steps, not one pass through the images. The schedule by epochs (learning rate,
+checkpoints, end of the mosaics) is then the same for any number of images. A step is one batch and one update of the
 weights.
 """
 
@@ -33,29 +33,32 @@ from mitsplat.detector.libraries import UNREADABLE, under_another_name
 from mitsplat.errors import InputError, MissingResourceError
 
 EPOCH = 50
-"""Steps after which a checkpoint is kept, from which an interrupted training goes on."""
+"""Steps between checkpoints; an interrupted training resumes from the last checkpoint."""
 _WARM_UP = 100
-"""Most steps until the learning rate is whole; a tenth of shorter trainings."""
+"""Most steps of the learning-rate warm-up; shorter trainings use a tenth of their steps."""
 _MANY = 10_000
-"""Steps beyond which Ultralytics takes MuSGD, and AdamW up to it; it counts them by images, here they are known."""
+"""Largest number of steps for AdamW; longer trainings use MuSGD.
+
+Ultralytics' ``auto`` has the same rule, but derives the number of steps from the number of images.
+"""
 _OUTLINE = 1000
-"""Points that Ultralytics gives every outline that has no more."""
+"""Number of points to which Ultralytics resamples every outline with no more points."""
 
 LAST = "weights/last.pt"
-"""The checkpoint that a training goes on from, below the folder of its run."""
+"""Path of the last checkpoint, relative to the run folder."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to train.
+    """Inputs of a training.
 
     Attributes:
         run: Folder of the run.
-        images: File that lists the images; what the plan counts.
-        class_names: Classes.
-        plan: Indices of images, shape (steps, batch).
-        masks: Whether masks are learnt, or boxes alone.
-        step: Told how many steps are done, and the loss.
+        images: File that lists the images; the plan refers to its lines.
+        class_names: Names of the classes.
+        plan: Image indices, shape (steps, batch).
+        masks: True to train masks, False to train only boxes.
+        step: Callback with the number of finished steps and the loss.
     """
 
     run: Path
@@ -67,20 +70,20 @@ class Job:
 
     @property
     def epochs(self) -> int:
-        """How often a checkpoint is kept."""
+        """Number of epochs, which is also the number of checkpoints."""
         return -(-len(self.plan) // EPOCH)
 
 
 @dataclass(frozen=True)
 class TrainingOutcome:
-    """How a training went.
+    """Result of a training.
 
     Attributes:
         weights: File of the final weights, averaged over the last steps.
-        updates: Times that the weights were changed, in all.
-        resumed_at: Step at which it went on, 0 if it began.
-        losses: The last ones, by their names.
-        optimizer: What changed the weights.
+        updates: Total number of weight updates.
+        resumed_at: Step at which the training resumed; 0 for a new training.
+        losses: Last losses by name.
+        optimizer: Name of the optimiser.
     """
 
     weights: Path
@@ -93,17 +96,17 @@ class TrainingOutcome:
 def train_job(
     job: Job, *, network: str, weights: Path | None, size: int, mirror: bool, seed: int, device: str, workers: int
 ) -> TrainingOutcome:
-    """Train, from the run's checkpoint if it has one.
+    """Train a detector; resume from the checkpoint of the run if there is one.
 
     Args:
-        job: What to train.
+        job: Inputs of the training.
         network: Name of the network's YAML file.
-        weights: What to start from, or None for random weights.
-        size: Longer side of images [px].
-        mirror: Whether half of them are mirrored left to right.
-        seed: Decides everything that is random.
-        device: As Ultralytics names it.
-        workers: Processes that read images; none on the CPU.
+        weights: File of initial weights, or None for random weights.
+        size: Longer side of the images [px].
+        mirror: True to mirror half of the images left to right.
+        seed: Seed of all random numbers.
+        device: Device name of Ultralytics.
+        workers: Number of processes that read images; 0 on the CPU.
     """
     epochs, batch = job.epochs, job.plan.shape[1]
     settings: dict[str, Any] = {
@@ -111,7 +114,7 @@ def train_job(
         "model": network,
         "epochs": epochs,
         "batch": batch,
-        "nbs": batch,  # one update of the weights for each batch
+        "nbs": batch,  # one update of the weights per batch
         "imgsz": size,
         "fliplr": 0.5 if mirror else 0.0,
         "seed": seed,
@@ -127,7 +130,7 @@ def train_job(
         "save_dir": str(job.run),
         "exist_ok": True,
         "verbose": False,
-        # As Ultralytics' "auto" for as many updates.
+        # Same choice as Ultralytics' "auto" for this number of updates.
         "optimizer": "MuSGD" if len(job.plan) > _MANY else "AdamW",
         "lr0": 0.01 if len(job.plan) > _MANY else round(0.01 / (4 + len(job.class_names)), 6),
         "momentum": 0.9,
@@ -147,19 +150,19 @@ def train_job(
 
 
 def finish_checkpoint(run: Path) -> Path:
-    """The final weights of a run, made of its last checkpoint."""
+    """Write the final weights of a run from its last checkpoint, and return their path."""
     final, part = run / "weights.pt", run / ".weights.pt.part"
-    part.unlink(missing_ok=True)  # a link of this name would be followed
+    part.unlink(missing_ok=True)  # an existing link of this name would be followed
     strip_optimizer(run / LAST, str(part))
     part.replace(final)
     return final
 
 
 def epochs_done(run: Path) -> int:
-    """Epochs after which the checkpoint of a run was kept.
+    """Return the number of finished epochs in the checkpoint of a run.
 
     Raises:
-        InputError: If it cannot be read.
+        InputError: If the checkpoint cannot be read.
     """
     try:
         with under_another_name(run / LAST) as name:
@@ -171,7 +174,7 @@ def epochs_done(run: Path) -> int:
 
 
 class _Plan(Sampler[int]):
-    """Indices of the images of all steps from the ``first`` on; as long as an epoch."""
+    """Sampler of the image indices of all steps from ``first`` on; its length is that of one epoch."""
 
     def __init__(self, plan: Int64Array) -> None:
         self._plan, self.first = plan, 0
@@ -184,32 +187,38 @@ class _Plan(Sampler[int]):
 
 
 class _FixedSteps:
-    """What both trainers have in common."""
+    """Common part of the box and the mask trainer."""
 
     def __init__(self, job: Job, settings: dict[str, Any], callbacks: dict[str, Any]) -> None:
         self.job, self.order, self.taken, self.updates = job, _Plan(job.plan), 0, 0
         super().__init__(overrides=settings, _callbacks=callbacks)  # type: ignore[call-arg]
 
     def get_dataset(self) -> dict[str, Any]:
-        """What Ultralytics would read from ``data.yaml``, for which it would also fetch a font."""
+        """Return the content of a ``data.yaml``.
+
+        Ultralytics' own method would read the file, and would download a font for it.
+        """
         names = dict(enumerate(self.job.class_names))
         return {"train": str(self.job.images), "val": "", "names": names, "nc": len(names), "channels": 3}
 
     def get_dataloader(self: Any, dataset_path: str, batch_size: int = 16, rank: int = 0, mode: str = "train") -> Any:
-        """Batches in the order of the plan. There is no validation: its loader is only looked at."""
+        """Return a loader of batches in the order of the plan.
+
+        There is no validation. Ultralytics only inspects the validation loader, so it gets the training loader.
+        """
         if mode != "train":
             return self.train_loader
-        if hasattr(self, "train_loader"):  # Ultralytics would go on with half of the batch
+        if hasattr(self, "train_loader"):  # Ultralytics would continue with half of the batch
             raise MissingResourceError(
                 f"the GPU's memory has run out with {self.job.plan.shape[1]} images of {self.args.imgsz} px a step: "
                 "give a smaller --batch or --size"
             )
-        with redirect_stdout(io.StringIO()):  # a bar that its silence does not reach
+        with redirect_stdout(io.StringIO()):  # "verbose" does not silence this progress bar
             dataset = self.build_dataset(dataset_path, mode, batch_size)
         images = self.job.images.read_text().splitlines()
         if dataset.im_files != images:
             raise InputError(f"{self.job.images}: Ultralytics read {len(dataset.im_files)} of {len(images)} images")
-        for label in dataset.labels:  # once, not anew in every mosaic: a fifth of all augmentation
+        for label in dataset.labels:  # resampling here and not in every mosaic saves a fifth of all augmentation
             if max(map(len, label["segments"]), default=_OUTLINE) <= _OUTLINE:
                 resample_segments(label["segments"], n=_OUTLINE)
         if dataset.cache == "ram":
@@ -229,16 +238,16 @@ class _FixedSteps:
         )
 
     def get_validator(self) -> SimpleNamespace:
-        """None: all that is asked of it are the names of its metrics."""
+        """Return a placeholder; Ultralytics only reads the names of its metrics."""
         return SimpleNamespace(metrics=SimpleNamespace(keys=[]))
 
     def begin_epoch(self: Any) -> None:
-        """Know where in the plan a loader that begins now is."""
+        """Set the start of the sampler in the plan to this epoch."""
         self.order.first = self.epoch * EPOCH
         self.taken = self.order.first
 
     def end_step(self: Any) -> None:
-        """Count a step, and end after the last."""
+        """Count a step, and stop after the last step."""
         self.taken += 1
         self.job.step(self.taken, float(self.loss.detach()))
         self.stop = self.stop or self.taken == len(self.job.plan)
@@ -249,11 +258,11 @@ class _FixedSteps:
         super().optimizer_step()  # type: ignore[misc]
 
     def validate(self: Any) -> tuple[dict[str, float], None]:
-        """Nothing: it costs as much as training, and the last weights are taken."""
+        """Return no metrics: validation costs as much as training, and the last weights are used anyway."""
         return {}, None
 
     def save_model(self: Any) -> bool:
-        """Keep a checkpoint, which gets its name when it is complete."""
+        """Write a checkpoint; the file gets its final name after it is complete."""
         last = self.last
         self.last = self.best = last.with_suffix(".part")
         try:
@@ -264,15 +273,15 @@ class _FixedSteps:
         return True
 
     def save_metrics(self: Any, metrics: dict[str, float]) -> None:
-        """Keep losses and learning rates, but no metrics of a validation that there is not."""
+        """Write losses and learning rates without the validation metrics, which do not exist here."""
         super().save_metrics({name: v for name, v in metrics.items() if not name.startswith(("val/", "metrics/"))})  # type: ignore[misc]
 
     def final_eval(self) -> None:
-        """Make the final weights, and judge them not."""
+        """Write the final weights without an evaluation."""
         finish_checkpoint(self.job.run)
 
     def outcome(self: Any) -> TrainingOutcome:
-        """How it went."""
+        """Return the result of the training."""
         resumed_at = min(self.start_epoch * EPOCH, len(self.job.plan))
         return TrainingOutcome(
             self.job.run / "weights.pt",
@@ -284,7 +293,7 @@ class _FixedSteps:
 
 
 def _mix_mosaics(transforms: Any, indices: list[int]) -> None:
-    """Have mosaics take their other images from those of the plan, among which real ones have their share."""
+    """Draw the other images of mosaics from the plan, so that real images keep their share."""
     for transform in transforms.transforms:
         if isinstance(transform, Mosaic):
             transform.get_indexes = partial(random.choices, indices, k=transform.n - 1)

@@ -1,6 +1,6 @@
-"""Ultralytics and PyTorch, as far as they are there: imported so that they neither download nor tell anyone anything.
+"""Import of Ultralytics and PyTorch without downloads and without telemetry.
 
-They are imported inside of their functions, because they are optional and take seconds.
+Both libraries are optional and take seconds to import. They are therefore imported inside functions.
 """
 
 from __future__ import annotations
@@ -24,40 +24,41 @@ UNREADABLE = (
     *(OSError, EOFError, UnpicklingError, RuntimeError),
     *(ValueError, LookupError, TypeError, AttributeError),
 )
-"""What reading a damaged file of weights raises."""
+"""Exceptions that a damaged weights file can raise."""
 
 OLDEST_TORCH = "2.6"
-"""First release of PyTorch that lists the classes of a file before it reads it, as the safe loader needs."""
+"""First PyTorch release that lists the classes of a file before it loads it; the safe loader needs this."""
 
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,2})?")
 
 
 def check_device(device: str) -> None:
-    """Refuse what is no device.
+    """Check the syntax of a device name.
 
     Raises:
-        InputError: If it is none.
+        InputError: If the name is no device.
     """
     if not _DEVICE.fullmatch(device):
         raise InputError(f"device must be auto, cpu, cuda or cuda:N (got {device})")
 
 
 def load_libraries() -> None:
-    """Import Ultralytics: offline, silent, and with its settings in a folder that ends with this process.
+    """Import Ultralytics offline and silent, with its settings in a folder that is removed at the end of this process.
 
-    ``YOLO_CONFIG_DIR`` and ``YOLO_VERBOSE`` keep the values that a user has given them.
+    ``YOLO_CONFIG_DIR`` and ``YOLO_VERBOSE`` keep values that the user has set.
 
-    Weights are pickles, which the safe loader of Ultralytics reads as classes that it knows. It cannot be turned off.
+    Weights files are pickles. The safe loader of Ultralytics accepts only known classes, and it cannot be turned off
+    here.
 
     Raises:
-        MissingResourceError: If it is not installed, or PyTorch is too old for the safe loader.
+        MissingResourceError: If a library is not installed, or PyTorch is too old for the safe loader.
     """
     missing = [name for name in ("torch", "torchvision", "ultralytics") if find_spec(name) is None]
     if missing:
         raise MissingResourceError(f"detectors need {' and '.join(missing)}: pip install 'mitsplat[train]'")
     import torch
 
-    # Without it Ultralytics silently falls back to a loader that executes code.
+    # Without this function, Ultralytics silently uses a loader that executes code.
     if not hasattr(torch.serialization, "get_unsafe_globals_in_checkpoint"):
         raise MissingResourceError(
             f"detectors need PyTorch {OLDEST_TORCH} or newer, which reads weights without executing code from them "
@@ -74,16 +75,16 @@ def load_libraries() -> None:
     from ultralytics.nn import tasks
     from ultralytics.utils.events import events
 
-    # Ultralytics reads the variables when it is imported, which may have been before.
+    # Ultralytics reads these variables at import, which may have happened before this call.
     tasks.SAFE_LOAD = True
     events.enabled = False
 
 
 def check_torchvision() -> None:
-    """Refuse a torchvision that cannot be imported: prediction takes its suppression of overlapping boxes.
+    """Check that torchvision can be imported; prediction uses its non-maximum suppression.
 
     Raises:
-        MissingResourceError: If it was built for another PyTorch.
+        MissingResourceError: If torchvision was built for another PyTorch.
     """
     try:
         import torchvision  # noqa: F401
@@ -95,12 +96,12 @@ def check_torchvision() -> None:
 
 
 def _remove(folder: str, process: int) -> None:
-    if os.getpid() == process:  # and not in the workers that it forks
+    if os.getpid() == process:  # not in forked workers
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def versions() -> dict[str, str]:
-    """Releases of what decides a training's result."""
+    """Return the versions of the libraries that affect the result of a training."""
     names = ("mitsplat", "torch", "torchvision", "numpy")
     found = {name: importlib.metadata.version(name) for name in names if _is_installed(name)}
     import ultralytics
@@ -117,11 +118,11 @@ def _is_installed(name: str) -> bool:
 
 
 def torch_device(device: str) -> tuple[str, str]:
-    """A device as Ultralytics names it, and as its maker does.
+    """Return the device name of Ultralytics and the product name of the device.
 
     Raises:
-        InputError: If there is no such GPU.
-        MissingResourceError: If there is none at all.
+        InputError: If the GPU number does not exist.
+        MissingResourceError: If PyTorch finds no GPU.
     """
     import torch
 
@@ -138,10 +139,10 @@ def torch_device(device: str) -> tuple[str, str]:
 
 
 def read_network(model: str) -> tuple[str, bool]:
-    """The name of a network's YAML file for Ultralytics, and whether the network predicts masks.
+    """Return the name of a network's YAML file for Ultralytics, and True if the network predicts masks.
 
     Args:
-        model: ``yolo11n-seg.yaml``, without its suffix, or the path of such a file.
+        model: ``yolo11n-seg.yaml``, the same without suffix, or the path of such a file.
 
     Raises:
         InputError: If there is no such network, or it predicts neither boxes nor masks.
@@ -163,16 +164,16 @@ def read_network(model: str) -> tuple[str, bool]:
 
 
 def check_weights(weights: Path, network: str, *, masks: bool, classes: int | None = None) -> None:
-    """Refuse weights that are not of a network.
+    """Check that a weights file fits a network.
 
     Args:
         weights: The file.
         network: Name of the network's YAML file.
-        masks: Whether the network predicts masks.
-        classes: How many it must tell apart; any number if None.
+        masks: True if the network predicts masks.
+        classes: Required number of classes; any number if None.
 
     Raises:
-        InputError: If they cannot be read, or their tensors are others.
+        InputError: If the file cannot be read, or its tensors have other names or shapes.
     """
     from ultralytics.nn.tasks import DetectionModel, SegmentationModel
 
@@ -181,7 +182,7 @@ def check_weights(weights: Path, network: str, *, masks: bool, classes: int | No
     if classes not in (None, len(found.names)):
         raise InputError(f"{weights}: must tell {classes} classes apart (got {len(found.names)})")
     model = kind(network, nc=len(found.names), verbose=False)
-    # The branch that tells classes is as wide as that of the weights a network began with, of any number of classes.
+    # The width of the class branch depends on the initial weights, whose number of classes may differ.
     model.load(found, verbose=False)
     expected, own = model.state_dict(), found.state_dict()
     for name in sorted(expected.keys() | own.keys()):
@@ -195,10 +196,10 @@ def check_weights(weights: Path, network: str, *, masks: bool, classes: int | No
 
 @contextmanager
 def under_another_name(path: Path) -> Iterator[str]:
-    """A link to a file of weights, by which Ultralytics reads it as it is.
+    """Yield the path of a temporary link to a weights file, by which Ultralytics reads the file unchanged.
 
-    By some names it takes files for its own, which it downloads where they look torn, and removes; of others it leaves
-    out letters.
+    Ultralytics treats some file names as its own releases: it downloads these files again and removes them if they look
+    damaged. It drops characters from other names.
     """
     with tempfile.TemporaryDirectory(prefix="mitsplat-weights-") as folder:
         link = Path(folder) / "given.pt"
@@ -207,10 +208,10 @@ def under_another_name(path: Path) -> Iterator[str]:
 
 
 def load_weights(path: Path) -> Any:
-    """The network of a file of weights.
+    """Load the network of a weights file.
 
     Raises:
-        InputError: If it is none of Ultralytics.
+        InputError: If the file is missing, unreadable or not from Ultralytics.
     """
     from ultralytics.nn.tasks import load_checkpoint
 

@@ -1,9 +1,11 @@
-"""How far labelled photographs lie outside of rendered images: brightness, colours and size of objects, noise.
+"""Comparison of rendered images with labelled photographs: brightness, colour and size of objects, and noise.
 
-A detector fails where photographs show what it was never shown. Means of whole pictures hide that: objects are small,
-and a camera that meters the picture makes them dark where what lies around is bright. So objects are measured within
-their labels, image by image at the size that a detector is given, and photographs are told by the share of them that
-lies beyond the middle nine tenths of the rendered ones: a tenth would where both are drawn from the same.
+A detector fails where photographs differ from its training images. Image means do not show these differences: objects
+are small, and auto-exposure makes them dark in front of a bright background. Objects are therefore measured inside
+their labels, image by image, at the input size of the detector.
+
+The result is the share of photographs outside the middle 90 % of the rendered values. For two samples of one
+distribution this share is 10 %.
 """
 
 from __future__ import annotations
@@ -26,29 +28,29 @@ from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress
 
 FEWEST, FEWEST_RENDERED = 5, 20
-"""Objects of a class, on photographs and rendered, from which it is judged."""
+"""Least numbers of photographed and of rendered objects of a class that are compared."""
 CHANCE = 0.01
-"""Of so many outside of the rendered range by chance; what is less likely is advised on."""
+"""Significance level: advice is given if chance explains the share outside the range with a lower probability."""
 _DRAWS = 299
-"""Times that images are dealt anew to both sides, which tells what chance does."""
+"""Number of random permutations of the images between the two sides."""
 _TAIL = 0.05
 _SMALLEST = 64
-"""Area within a label from which its colour is measured [px]."""
+"""Least area inside a label for a colour measurement [px]."""
 _FLAT_QUANTILE = 0.4
-"""Share of an image whose smoothed gradient is least: there the Laplacian is noise."""
+"""Share of the pixels with the smallest smoothed gradient; there the Laplacian measures noise."""
 _DARK = 40
-"""Bytes below which a sensor clips its noise."""
+"""Byte value below which a sensor clips its noise."""
 
 BRIGHTNESS, SIZE = "brightness of objects", "size of objects"
 _WHOLE = "size of objects that no border cuts"
 _HUES = 120
-"""Bins of a turn of hues."""
+"""Number of hue bins over 360 degrees."""
 _FARTHEST = 15
-"""Bins by which hues are looked for on either side."""
+"""Largest hue shift in the search, in bins to either side."""
 _COLOURED = 25
-"""Bytes by which channels differ in what has a hue."""
+"""Least difference between the channels of a pixel with a hue, in bytes."""
 _TURNED = 8.0
-"""Degrees by which hues differ in half of the classes where a camera shows colours in its own way."""
+"""Median hue shift over the classes from which a colour shift of the camera is reported [degrees]."""
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
         "of 255",
@@ -62,27 +64,27 @@ _TRAITS: dict[str, tuple[str, str, str]] = {
     "brightness of images": ("of 255", "darken the backdrop", "brighten the backdrop"),
     "noise of images": ("of 255", "lower randomise.iso, or expose more", "raise randomise.iso"),
 }
-"""Unit, and what to change if photographs have less, or more."""
+"""Unit of each trait, and the advice if photographs have lower or higher values."""
 
 _Values: TypeAlias = dict[tuple[str, int | None], list[tuple[int, float]]]
-"""Values of a trait, each with its image's number: of all objects or images, and of those of a class by its index."""
+"""Pairs of image number and value, by trait and class index; the class index None stands for all classes."""
 
 _Hues: TypeAlias = dict[int, Float64Array]
-"""Sums over the objects of a class, by its index, of what :func:`_hues_of` tells of each."""
+"""Sums of :func:`_hues_of` over the objects of a class, by class index."""
 
 
 @dataclass(frozen=True)
 class Trait:
-    """One trait of rendered images and of photographs.
+    """Distribution of one trait in rendered images and in photographs.
 
     Attributes:
-        name: What is measured.
-        unit: In which unit.
-        rendered: Quantiles 0.05, 0.5 and 0.95 of rendered images, or of objects in them.
-        real: Those of photographs.
-        below: Share of photographs, or of objects in them, that have less than 95 % of the rendered ones.
-        above: That have more than 95 % of them.
-        advice: What to change, if more lie outside on a side than would by chance; empty otherwise.
+        name: Name of the trait.
+        unit: Unit of the values.
+        rendered: Quantiles 0.05, 0.5 and 0.95 of the rendered images, or of the objects in them.
+        real: The same quantiles of the photographs.
+        below: Share of photographs, or of objects in them, below the rendered quantile 0.05.
+        above: Share of photographs, or of objects in them, above the rendered quantile 0.95.
+        advice: Suggested change, if significantly more values than expected lie outside on one side; empty otherwise.
     """
 
     name: str
@@ -96,18 +98,18 @@ class Trait:
 
 @dataclass(frozen=True)
 class Likeness:
-    """How rendered images and photographs differ.
+    """Differences between rendered images and photographs.
 
     Attributes:
-        images: How many rendered images were measured.
-        photographs: How many photographs.
-        same_size: Longer side of photographs, a multiple of 32, at which their objects are about as large as those of
-            rendered images [px]: by the median over classes of the ratio of upper quartiles, as what is hidden looks
-            smaller, of objects that no border cuts. None if no class is shown often enough by both.
-        traits: Of all of them.
-        classes: Brightness and saturation of each class that both show often enough.
-        hues: By how much photographs show its colours turned, towards green from red, of each such class of which that
-            can be told [degrees].
+        images: Number of rendered images that were measured.
+        photographs: Number of photographs that were measured.
+        same_size: Longer side of photographs [px], a multiple of 32, at which their objects have the size of rendered
+            ones. This is the median over classes of the ratio of upper quartiles, of objects that no border cuts; upper
+            quartiles, because partly hidden objects look smaller. None if no class is frequent enough on both sides.
+        traits: Traits over all classes.
+        classes: Brightness and saturation of each class that is frequent enough on both sides.
+        hues: Hue shift of the photographs from red towards green [degrees], for each of these classes where it can be
+            measured.
     """
 
     images: int
@@ -119,7 +121,7 @@ class Likeness:
 
     @property
     def hue_advice(self) -> str:
-        """What to change, if photographs show the colours of classes turned; empty otherwise."""
+        """Suggested change if photographs show shifted hues; empty otherwise."""
         turned = list(self.hues.values())
         if not turned or np.median(np.abs(turned)) < _TURNED:
             return ""
@@ -135,20 +137,20 @@ def compare_with_photographs(
     most: int = 400,
     progress: Progress | None = None,
 ) -> Likeness:
-    """Measure rendered images beside labelled photographs.
+    """Compare rendered images with labelled photographs.
 
-    Colours are those of pixels within masks, and within the middle half of boxes where there is no mask.
+    Colours are measured at pixels inside masks, or in the middle half of boxes without masks.
 
     Args:
-        rendered: Datasets, or YOLO or COCO folders, with the same classes.
-        photographs: Likewise, of which all count; classes may come in another order.
-        split: Which rendered images.
-        size: Longer side that images are scaled to before they are measured [px].
-        most: Images of each side, evenly drawn from what there is.
-        progress: Told of each image.
+        rendered: mitsplat datasets, YOLO folders or COCO folders with the same classes.
+        photographs: A folder of the same kinds; all splits are used. The order of its classes may differ.
+        split: Split of the rendered images.
+        size: Longer side to which images are scaled before measurement [px].
+        most: Largest number of images of each side, drawn at equal intervals.
+        progress: Called after each image.
 
     Raises:
-        InputError: If there is nothing to compare, or something cannot be read.
+        InputError: If there is nothing to compare, or a file cannot be read.
     """
     if size < 32:
         raise InputError(f"size must be 32 px or more (got {size})")
@@ -192,7 +194,10 @@ def _no_hues() -> Float64Array:
 
 
 def _hues_of(pixels: ByteImage) -> Float64Array:
-    """How far from grey pixels (N, 3), BGR, are by their hues, of all of them [bytes], shape (_HUES,)."""
+    """Return the sum of the chroma [bytes] by hue, divided by the number of pixels, shape (_HUES,).
+
+    ``pixels`` has shape (N, 3), BGR. Pixels without a hue count as zero.
+    """
     hue = cv2.cvtColor(pixels[None].astype(np.float32) / 255, cv2.COLOR_BGR2HSV)[0, :, 0]
     chroma = np.ptp(pixels.astype(float), axis=1)
     places = (hue * (_HUES / 360)).astype(np.intp) % _HUES
@@ -201,7 +206,10 @@ def _hues_of(pixels: ByteImage) -> Float64Array:
 
 
 def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
-    """Degrees by which hues must be turned so that they overlap most with others; None if none are there or near."""
+    """Return the hue shift with the largest overlap of two hue histograms [degrees].
+
+    None if a histogram is empty, or if the best shift lies at the end of the search range.
+    """
     if not (ours.any() and theirs.any()):
         return None
     smooth, wanted = (gaussian_filter1d(side / side.sum(), 2.0, mode="wrap") for side in (ours, theirs))
@@ -212,7 +220,7 @@ def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
 
 
 def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:
-    """How much larger rendered objects are than photographed ones, None if no class is shown often enough by both."""
+    """Return the size ratio of rendered to photographed objects, or None if no class is frequent enough on both sides."""
     ratios = []
     for index in range(classes):
         ours, theirs = (side.get((_WHOLE, index), []) for side in sides)
@@ -228,7 +236,7 @@ def _evenly(samples: list[Sample], most: int) -> list[Sample]:
 
 
 def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hues) -> None:
-    """Add what an image of a number shows at a longer side of ``size`` pixels."""
+    """Add the measurements of an image, scaled to a longer side of ``size`` pixels, to ``values`` and ``hues``."""
     stored = read_picture(sample.path)
     scale = size / max(sample.width, sample.height)
     width, height = (max(round(scale * side), 1) for side in (sample.width, sample.height))
@@ -262,7 +270,7 @@ def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hue
 
 
 def _inside(instance: LabelledObject, sample: Sample, width: int, height: int) -> BoolArray:
-    """Pixels (height, width) of an object in the scaled image."""
+    """Return the pixels of an object in the scaled image, shape (height, width)."""
     factor = np.array([width / sample.width, height / sample.height])
     if instance.has_mask:
         return fill_polygon(instance.outlined() * factor, width, height)
@@ -277,7 +285,7 @@ def _inside(instance: LabelledObject, sample: Sample, width: int, height: int) -
 
 
 def _noise(green: ByteImage, bright: ByteImage) -> float | None:
-    """Median of the Laplacian's size where an image is flat, in bytes; None where hardly anything is to be seen."""
+    """Return the median absolute Laplacian in flat areas [bytes], or None if the image is almost black or clipped."""
     values = green.astype(np.float32)
     smooth = cv2.GaussianBlur(values, (0, 0), 2)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
@@ -306,7 +314,7 @@ def _trait(name: str, rendered: Sequence[tuple[int, float]], real: Sequence[tupl
 
 
 def _outside(values: Float64Array, photographed: BoolArray) -> Float64Array:
-    """Shares of photographs' values below and above the middle nine tenths of the others, shape (2,)."""
+    """Return the shares of photograph values below and above the middle 90 % of the rendered values, shape (2,)."""
     low, high = np.quantile(values[~photographed], [_TAIL, 1 - _TAIL])
     real = values[photographed]
     return np.array([np.mean(real < low), np.mean(real > high)])
@@ -315,9 +323,11 @@ def _outside(values: Float64Array, photographed: BoolArray) -> Float64Array:
 def _unlikely(
     outside: Float64Array, images: Float64Array, values: Float64Array, photographed: BoolArray
 ) -> tuple[bool, bool]:
-    """Whether as much lies outside on a side in less than :data:`CHANCE` of deals of all images to the two sides.
+    """Return for each side True if the share outside is significant in a permutation test.
 
-    What one image shows stays together: its objects share its light. Of too few objects nothing is said.
+    The test deals all images to the two sides at random. A share is significant if fewer than :data:`CHANCE` of the
+    permutations reach it. The objects of an image stay together because they share its light. The result is False for
+    too few objects.
     """
     if (~photographed).sum() < FEWEST_RENDERED or photographed.sum() < FEWEST:
         return False, False

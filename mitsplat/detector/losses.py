@@ -1,7 +1,7 @@
-"""Which errors of a detector cost it most: what its average precision would be without each kind of them.
+"""Loss of average precision by kind of error.
 
-After Bolya et al. 2020, "TIDE: A General Toolbox for Identifying Object Detection Errors": each kind is mended as an
-oracle would, everything else is left, and average precision is measured again. Gains do not add up.
+Method of Bolya et al. 2020, "TIDE: A General Toolbox for Identifying Object Detection Errors": an oracle corrects one
+kind of error, and average precision is computed again. The gains of the kinds do not add up.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from mitsplat.detector.scores import IOU, AveragePrecision, Detection, DetectionMatches, overlaps
 
 NEAR = 0.1
-"""Overlap of boxes from which a detection is one of a label of its class that fits badly."""
+"""Least IoU of a badly placed box with a label of its class."""
 
 KINDS = {
     "another_class": "taken for another class",
@@ -23,19 +23,19 @@ KINDS = {
     "place": "boxes that do not fit",
     "missed": "missed",
 }
-"""Of errors, and in words."""
+"""Kinds of errors and their descriptions."""
 
 
 def gains(truth: Mapping[str, Any], detections: Sequence[Detection], before: AveragePrecision) -> dict[str, float]:
-    """How much the average precision of boxes (mAP50-95) would rise if one kind of error (:data:`KINDS`) were mended.
+    """Return the gain in box mAP50-95 if one kind of error (:data:`KINDS`) is corrected.
 
     Args:
-        truth: What is labelled.
-        detections: What was found.
-        before: Their average precision.
+        truth: The labels.
+        detections: The detections.
+        before: Average precision of the detections.
 
     Returns:
-        Gains by kind; none if nothing is labelled.
+        Gains by kind; empty if nothing is labelled.
     """
     if not before.classes:
         return {}
@@ -63,10 +63,10 @@ def _by_image(entries: Sequence[Mapping[str, Any]]) -> dict[int, list[Any]]:
 
 
 def _judge(seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: set[int]) -> dict[str, list[Detection]]:
-    """The detections of an image by falling score, with each kind of error mended; labels that are found go to ``hit``.
+    """Return the detections of an image with each kind of error corrected, and add the detected labels to ``hit``.
 
-    The class of one that is taken for another becomes right, unless what is labelled was found as well. What fits badly
-    gets the label's box.
+    ``seen`` is sorted by descending score. A detection of the wrong class gets the right class, or is removed if the
+    label was detected already. A badly placed box gets the box of its label.
     """
     mended: dict[str, list[Detection]] = {kind: [] for kind in KINDS if kind != "missed"}
     crowds = [bool(one.get("iscrowd")) for one in labels]
@@ -84,7 +84,7 @@ def _judge(seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: 
                 hit.add(int(labels[label]["id"]))
                 kept["place"] = {**detection, "bbox": labels[label]["bbox"]}
         elif own.max(initial=0.0) >= IOU:
-            pass  # another one of it, which may fit better than the first
+            pass  # a duplicate, which may fit better than the first detection
         elif row.max(initial=0.0) >= IOU:
             label = int(row.argmax())
             if label in taken or crowds[label]:

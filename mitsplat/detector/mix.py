@@ -1,4 +1,4 @@
-"""Which images a training takes at each of its steps."""
+"""Image plan of a training: the images of each step."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from mitsplat.errors import InputError
 
 
 def plan_images(rendered: int, real: int, *, share: float, steps: int, batch: int, seed: int) -> Int64Array:
-    """Indices of the images of every step, shape (steps, batch): rendered ones from 0, then real ones.
+    """Return the image indices of all steps, shape (steps, batch): rendered images from 0, then real images.
 
-    Real images are spread as evenly as can be: of the first n images taken, floor(n share) are real. Either kind is
-    shuffled anew each time that all of it was taken, so that none is taken twice before another one was taken once.
+    Real images are distributed evenly: of the first n images, floor(n * share) are real. Each kind is shuffled again
+    after all of its images were used, so no image is used twice before every other one was used once.
 
     Args:
-        rendered: How many images are rendered.
-        real: How many are real; if none, ``share`` has no meaning.
-        share: Of real ones among those taken, in (0, 1).
-        steps: How many.
-        batch: Images of a step.
-        seed: Decides the order.
+        rendered: Number of rendered images.
+        real: Number of real images; ``share`` is ignored if this is 0.
+        share: Share of real images, in (0, 1).
+        steps: Number of steps.
+        batch: Images per step.
+        seed: Seed of the order.
 
     Raises:
         InputError: If the share is out of range.
@@ -38,7 +38,7 @@ def plan_images(rendered: int, real: int, *, share: float, steps: int, batch: in
 
 
 def _shuffled(total: int, count: int, seed: int, purpose: str) -> Int64Array:
-    """``count`` indices below ``total``, each as often as any other but for once."""
+    """Return ``count`` indices below ``total``; the counts of any two indices differ by at most one."""
     rng = np.random.default_rng([seed, zlib.crc32(purpose.encode())])
     rounds = [rng.permutation(total) for _ in range(-(-count // total))] if count else []
     return np.concatenate([np.empty(0, dtype=np.int64), *rounds])[:count]

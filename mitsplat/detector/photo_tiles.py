@@ -1,6 +1,6 @@
-"""Photographs cut to tiles, in which things are as large at the size of a training as where they will be sought.
+"""Tiles of photographs that match the object size of a detector's later input.
 
-A photograph that is scaled to the size of a training shows things smaller than one that is searched at a larger size.
+A photograph scaled to the training size shows objects smaller than the same photograph at a larger prediction size.
 """
 
 from __future__ import annotations
@@ -19,21 +19,22 @@ from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.polygons import outline
 
 LEAST_SEEN = 0.15
-"""Share of what a photograph shows of an object from which it is labelled in a tile."""
+"""Least visible share of an object, relative to the whole photograph, for a label in a tile."""
 _OVERLAP = 1 / 3
-"""Least overlap of tiles, as a share of their sides: a thing of this size is whole in one of them."""
+"""Least overlap of tiles as a share of their sides; an object up to this size is whole in at least one tile."""
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
-"""As good as what a camera stores: noise is to stay."""
+"""JPEG quality similar to that of cameras, which preserves the noise."""
 
 
 def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder: Path) -> LabelledSet:
-    """Overlapping tiles that at ``size`` show things as large as whole photographs at ``real_size``.
+    """Cut photographs to overlapping tiles; a tile at ``size`` shows objects as large as a whole photograph at
+    ``real_size``.
 
     Args:
         photographs: Labelled photographs.
-        real_size: Longer side of a whole photograph [px], more than ``size``.
-        size: Longer side that a tile is scaled to [px].
-        folder: Where tiles are written, as JPEG files.
+        real_size: Longer side of a whole photograph [px], larger than ``size``.
+        size: Longer side to which a tile is scaled [px].
+        folder: Output folder of the tiles, which are JPEG files.
 
     Raises:
         InputError: If a photograph cannot be read, or its tiles are too small.
@@ -66,7 +67,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
 
 
 def _starts(side: int, tile: int) -> list[int]:
-    """Where tiles begin along a side, the first and the last at its ends."""
+    """Return the tile positions along a side; the first and the last tile touch its ends."""
     step = (1 - _OVERLAP) * tile
     return [round(start) for start in np.linspace(0, side - tile, int(np.ceil((side - tile) / step)) + 1)]
 
@@ -74,7 +75,7 @@ def _starts(side: int, tile: int) -> list[int]:
 def _within(
     instance: LabelledObject, mask: BoolArray | None, left: int, top: int, width: int, height: int
 ) -> LabelledObject | None:
-    """What a tile shows of an object, which has a mask or a box in the photograph; None if that is too little."""
+    """Return the part of a labelled object in a tile, or None if too little of it is visible."""
     if mask is not None:
         seen = mask[top : top + height, left : left + width]
         if seen.sum() < max(LEAST_SEEN * mask.sum(), 1):

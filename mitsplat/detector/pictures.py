@@ -1,4 +1,4 @@
-"""Files of images, which must be whole before a detector learns from them or is judged by them."""
+"""Image files, which must be complete before training or evaluation."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import IMAGE_ERRORS, files_below
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-"""Images that Ultralytics reads as well."""
+"""Suffixes of images that Ultralytics also reads."""
 _WHOLE, _DECODED = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "TIFF")
-"""Formats of which Pillow tells whether a file is torn, and those of which only decoding it does."""
+"""Formats that Pillow checks for truncation, and formats that must be decoded for this check."""
 SMALLEST = 10
-"""Sides of images that Ultralytics takes [px]."""
+"""Least side of an image that Ultralytics accepts [px]."""
 _JPEG_ENDS = b"\xff\xd9"
 _ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
-"""The EXIF tag by which OpenCV turns images as it reads them, and its values that swap width and height."""
+"""EXIF orientation tag, which OpenCV applies when it reads an image, and its values that swap width and height."""
 
 
 def images_below(folder: Path) -> list[Path]:
-    """Images anywhere in a folder, and in folders that it links to, by name."""
+    """Return all images in a folder and its subfolders, including linked folders, sorted by name."""
     return [path for path in files_below(folder) if path.suffix.lower() in SUFFIXES]
 
 
 def read_picture(path: Path) -> ByteImage:
-    """An image as it is shown, turned by its EXIF orientation: shape (H, W, 3), BGR.
+    """Read an image with its EXIF orientation applied: shape (H, W, 3), BGR.
 
     Raises:
-        InputError: If it cannot be read.
+        InputError: If the image cannot be read.
     """
-    return _decoded(_content(path), path)  # not by OpenCV, which takes names in UTF-8 alone
+    return _decoded(_content(path), path)  # cv2.imread only accepts file names in UTF-8
 
 
 def _content(path: Path) -> bytes:
@@ -49,7 +49,7 @@ def _content(path: Path) -> bytes:
 def _decoded(data: bytes, path: Path) -> ByteImage:
     try:
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # of no bytes
+    except cv2.error:  # empty data
         picture = None
     if picture is None:
         raise InputError(f"{path}: cannot be read as an image")
@@ -57,10 +57,10 @@ def _decoded(data: bytes, path: Path) -> ByteImage:
 
 
 def look_at_image(path: Path) -> tuple[int, int, ContentHash]:
-    """Width and height of an image as it is shown [px], and the hash of its content, which must be whole.
+    """Check that an image is complete; return its width and height after EXIF orientation [px] and its content hash.
 
     Raises:
-        InputError: If it cannot be read, is torn or of another format, or is too small.
+        InputError: If the image cannot be read, is truncated, has an unknown format or is too small.
     """
     data = _content(path)
     try:
@@ -87,7 +87,7 @@ def look_at_image(path: Path) -> tuple[int, int, ContentHash]:
 
 
 def _ends(jpeg: bytes) -> str:
-    """What is wrong with a JPEG file that does not end with its end marker, which Ultralytics would write anew."""
+    """Return an error text for a JPEG file without its end marker at the end; Ultralytics would rewrite such a file."""
     ends = jpeg.rfind(_JPEG_ENDS)
     try:
         with Image.open(io.BytesIO(jpeg[:ends] + _JPEG_ENDS)) as image:

@@ -1,8 +1,8 @@
-"""How well detections match what is labelled, by COCO's rules, from what was stored of both.
+"""Detection scores by COCO's rules, from stored labels and detections.
 
-``truth`` is a COCO dataset of instances: ``images``, ``annotations``, numbered from 1, and ``categories``.
+``truth`` is a COCO dataset of instances: ``images`` and ``annotations``, numbered from 1, and ``categories``.
 ``detections`` is a list in COCO's results format: ``image_id``, ``category_id``, ``bbox`` (x, y, width, height in px),
-``score``, and ``segmentation`` (compressed run lengths) where there are masks.
+``score``, and ``segmentation`` (compressed run lengths) if there are masks.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ IouType = Literal["bbox", "segm"]
 Detection = dict[str, Any]
 
 MOST_DETECTIONS = 300
-"""Detections of all classes that count in an image, with the highest scores; COCO's own summary takes 100 of each."""
+"""Largest number of detections per image over all classes, by score. COCO's own summary uses 100 per class."""
 CONFIDENCE, IOU = 0.25, 0.5
-"""Least score, and least overlap of boxes, of what counts as found in the confusion matrix."""
+"""Least score and least box IoU of a detection in the confusion matrix."""
 
 
 @dataclass(frozen=True, eq=False)
 class AveragePrecision:
-    """Average precision, of the mean over classes that are labelled in the images, and of each.
+    """Average precision, as a mean over the labelled classes and by class.
 
     Attributes:
-        map50_95: Mean over IoU thresholds 0.5 to 0.95 in steps of 0.05; NaN if nothing is labelled.
-        map50: At the threshold 0.5.
-        classes: Both by class; without classes that are not labelled in the images.
+        map50_95: Mean over the IoU thresholds 0.5 to 0.95 in steps of 0.05; NaN if nothing is labelled.
+        map50: Average precision at the IoU threshold 0.5.
+        classes: Both values by class, without classes that have no labels.
         curves: Precision at IoU 0.5 over recall 0, 0.01, ..., 1, by class, shape (101,) each.
     """
 
@@ -50,15 +50,15 @@ class AveragePrecision:
 
 
 class DetectionMatches:
-    """Detections matched to what is labelled in each image, once; any sample of the images is judged from it.
+    """Matches of detections with labels in each image, computed once for the scores of any sample of the images.
 
     Args:
-        truth: What is labelled.
-        detections: What was found.
-        iou_type: Whether boxes or masks must overlap.
+        truth: The labels.
+        detections: The detections.
+        iou_type: Overlap of boxes or of masks.
 
     Raises:
-        InputError: If a detection is of an image or a class that is not in ``truth``.
+        InputError: If a detection has an image or a class that is not in ``truth``.
     """
 
     def __init__(self, truth: Mapping[str, Any], detections: Sequence[Detection], iou_type: IouType = "bbox") -> None:
@@ -71,7 +71,7 @@ class DetectionMatches:
                     "detections must be of images and classes that are labelled (got image "
                     f"{detection['image_id']}, class {detection['category_id']})"
                 )
-        with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints what it does
+        with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints progress messages
             labelled = _coco(truth)
             found = labelled.loadRes([dict(detection) for detection in detections]) if detections else _nothing(truth)
             self._eval = COCOeval(labelled, found, iou_type)
@@ -81,10 +81,11 @@ class DetectionMatches:
         self._place = {image: i for i, image in enumerate(self._eval.params.imgIds)}
 
     def average_precision(self, images: Sequence[int] | None = None) -> AveragePrecision:
-        """Average precision on images, all if None; an image that is named twice counts twice, as in a bootstrap.
+        """Compute the average precision on some images, or on all if None; a repeated image counts again, as in a
+        bootstrap.
 
         Raises:
-            InputError: If there is no image, or no such image.
+            InputError: If the list is empty or contains an unknown image.
         """
         chosen = self.images if images is None else list(images)
         if not chosen or not self._place.keys() >= set(chosen):
@@ -114,24 +115,24 @@ def average_precision(
     images: Sequence[int] | None = None,
     iou_type: IouType = "bbox",
 ) -> AveragePrecision:
-    """Average precision of stored detections on some of the images; for many such draws :class:`DetectionMatches`.
+    """Compute the average precision of stored detections; use :class:`DetectionMatches` for many samples of images.
 
     Args:
-        truth: What is labelled.
-        detections: What was found.
-        images: Ids of images, which may be named twice; all if None.
-        iou_type: Whether boxes or masks must overlap.
+        truth: The labels.
+        detections: The detections.
+        images: Image ids, which may repeat; all images if None.
+        iou_type: Overlap of boxes or of masks.
     """
     return DetectionMatches(truth, detections, iou_type).average_precision(images)
 
 
 @dataclass(frozen=True, eq=False)
 class Confusion:
-    """What was taken for what, where boxes overlap by :data:`IOU` and scores are at least :data:`CONFIDENCE`.
+    """Confusion matrix of detections with a score of at least :data:`CONFIDENCE` and a box IoU of at least :data:`IOU`.
 
     Attributes:
-        matrix: Counts by class that is labelled (rows) and that was found (columns), the last one nothing.
-        errors: For each image, by id: how many were right, missed, taken for another class, and found where is nothing.
+        matrix: Counts by labelled class (rows) and detected class (columns); the last row and column stand for nothing.
+        errors: Numbers of correct, missed, wrongly classified and false detections, by image id.
     """
 
     matrix: Int64Array
@@ -139,7 +140,7 @@ class Confusion:
 
 
 def confuse(truth: Mapping[str, Any], detections: Sequence[Detection]) -> Confusion:
-    """Compare classes of detections and labels that overlap; the highest scores choose first, by overlap."""
+    """Compare the classes of overlapping detections and labels; detections with higher scores are matched first."""
     index = {category["id"]: i for i, category in enumerate(truth["categories"])}
     nothing = len(index)
     matrix = np.zeros((nothing + 1, nothing + 1), dtype=np.int64)
@@ -170,7 +171,11 @@ def confuse(truth: Mapping[str, Any], detections: Sequence[Detection]) -> Confus
 
 
 def match_boxes(found: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]]) -> dict[int, int]:
-    """Positions of boxes that were found, in their order, to those of the free labelled box that each overlaps most."""
+    """Match each detected box, in the given order, with the unmatched labelled box of largest IoU.
+
+    Returns:
+        Indices of labelled boxes by index of the detected box, for pairs with an IoU of at least :data:`IOU`.
+    """
     pairs: dict[int, int] = {}
     if not labelled:
         return pairs
@@ -184,7 +189,7 @@ def match_boxes(found: Sequence[Sequence[float]], labelled: Sequence[Sequence[fl
 def overlaps(
     found: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]], crowds: Sequence[bool] | None = None
 ) -> Float64Array:
-    """IoU of boxes that were found (rows) with labelled ones (columns), none of which are crowds by default."""
+    """Compute the IoU of detected boxes (rows) with labelled boxes (columns); by default no label is a crowd."""
     if not found or not labelled:
         return np.zeros((len(found), len(labelled)))
     boxes = (np.array(those, dtype=np.float64) for those in (found, labelled))

@@ -1,15 +1,15 @@
-"""Labelled images that a detector learns from or is judged by, as they lie in a folder.
+"""Labelled images for training and evaluation, read from a folder.
 
 ======== ===============================================================================================================
-kind     what makes a folder one
+kind     content of the folder
 ======== ===============================================================================================================
 mitsplat ``dataset.json``, and files of the format ``yolo``
-yolo     ``data.yaml``, which names folders or lists of images; labels lie where Ultralytics looks for them
+yolo     ``data.yaml`` with folders or lists of images; labels lie at the paths that Ultralytics expects
 coco     JSON files of ``images``, ``annotations`` and ``categories``, images beside them or anywhere in the folder
 ======== ===============================================================================================================
 
-Everything is read and checked before anything is done with it: an image or a label that is torn is found now, and not
-left out by whoever reads it later.
+All images and labels are read and checked first. A truncated image or label is therefore an error, and later readers
+cannot skip it silently.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from mitsplat.storage.files import SPLITS, is_inside, read_json
 Split = Literal["train", "val", "test", "all"]
 
 STRIDE = 32
-"""What Ultralytics' networks divide the sides of images by [px]."""
+"""Divisor of the image sides in Ultralytics' networks [px]."""
 
 _MOST = 1 << 32
-"""Largest file of COCO that is read; that of its 118,287 images for training has 0.45e9 bytes."""
+"""Largest COCO file that is read [bytes]; the file of COCO's 118,287 training images has 0.45e9 bytes."""
 _BEYOND = 0.01
-"""How far positions may lie outside of the image, as a share of its sides; they are cut off there."""
+"""Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +51,11 @@ class LabelledObject:
     """One labelled object.
 
     Attributes:
-        class_index: Position of its class among those of its set.
+        class_index: Index of the class in the class list of the set.
         box: x0, y0, x1, y1 [px].
-        polygon: Closed outline [px], shape (M, 2), if that is how it is labelled.
-        rle: COCO's compressed run-length code of its mask, if that is how it is labelled.
-        crowd: Whether it is a crowd of COCO, which no detector has to find.
+        polygon: Closed outline [px], shape (M, 2), or None.
+        rle: COCO's compressed run-length code of the mask, or None.
+        crowd: True for a COCO crowd, which a detector does not have to find.
     """
 
     class_index: int
@@ -66,11 +66,13 @@ class LabelledObject:
 
     @property
     def has_mask(self) -> bool:
-        """Whether more is known of it than a box."""
+        """True if the label has an outline or a mask, not only a box."""
         return self.polygon is not None or self.rle is not None
 
     def encoded(self, width: int, height: int) -> dict[str, Any]:
-        """Its mask in an image [px] as COCO's compressed run-length code; that of its box, if it is all there is."""
+        """Return the mask in an image of this size [px] as COCO's compressed run-length code; a label without a mask
+        gives its box.
+        """
         if self.rle is not None:
             return self.rle
         if self.polygon is not None:
@@ -81,7 +83,7 @@ class LabelledObject:
         return _text(coco_mask.merge(coco_mask.frPyObjects(corners, height, width)))
 
     def outlined(self) -> Float64Array:
-        """Its outline [px], shape (M, 2)."""
+        """Return the outline [px], shape (M, 2)."""
         if self.polygon is not None:
             return self.polygon
         return outline(np.asarray(decode_rle(self.rle), dtype=bool))
@@ -89,14 +91,14 @@ class LabelledObject:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """An image and what it shows.
+    """An image and its labels.
 
     Attributes:
-        path: Of the image.
-        name: Of the image, below its set.
-        width: As it is shown, turned by its EXIF orientation [px].
-        height: Likewise.
-        instances: What is labelled in it.
+        path: Path of the image.
+        name: Path of the image relative to its set.
+        width: Width after EXIF orientation [px].
+        height: Height after EXIF orientation [px].
+        instances: Labelled objects.
         digest: SHA-256 of the image and its label.
     """
 
@@ -113,10 +115,10 @@ class LabelledSet:
     """Labelled images, at least one.
 
     Attributes:
-        root: The folder that was named.
-        kind: How they are labelled.
-        split: Which of them were asked for.
-        class_names: Their classes.
+        root: The folder that was read.
+        kind: Kind of the labels.
+        split: Split that was read.
+        class_names: Names of the classes.
         samples: The images.
     """
 
@@ -127,7 +129,7 @@ class LabelledSet:
     samples: tuple[Sample, ...]
 
     def described(self) -> dict[str, Any]:
-        """What a record says of it; its digest is that of images, labels and classes."""
+        """Return the record of the set; its digest covers images, labels and classes."""
         sha = ContentHash()
         sha.add_json([self.class_names, [(sample.name, sample.digest) for sample in self.samples]])
         counts = Counter(i.class_index for sample in self.samples for i in sample.instances if not i.crowd)
@@ -145,12 +147,14 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
     """Read labelled images.
 
     Args:
-        path: A dataset of mitsplat, a YOLO folder, or a COCO folder.
-        split: Which images. Of COCO's files that with the split in its name, and if there is but one file, all of it.
-        progress: Told of each image.
+        path: A mitsplat dataset, a YOLO folder, or a COCO folder.
+        split: Split to read. For COCO, this is the file with the split in its name; a single file is always read
+            completely.
+        progress: Called after each image.
 
     Raises:
-        InputError: If it is none, has no image in the split, or an image or a label is missing, torn or out of range.
+        InputError: If the folder is of none of these kinds or has no image in the split. Also if an image or a label is
+            missing, truncated or out of range.
     """
     root = Path(path)
     if not root.is_dir():
@@ -175,10 +179,10 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
 
 
 def in_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> LabelledSet:
-    """The set with its classes in another order, which is that of ``owner``.
+    """Return the set with its classes in the order of ``class_names``, the classes of ``owner``.
 
     Raises:
-        InputError: If it has not the same classes.
+        InputError: If the set has other classes.
     """
     own, wanted = set(found.class_names), set(class_names)
     if own != wanted:
@@ -196,10 +200,10 @@ def in_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> La
 
 
 def check_masks(found: LabelledSet) -> None:
-    """Refuse a set of which something is labelled by a box alone.
+    """Check that all labels of a set have masks.
 
     Raises:
-        InputError: With the first image that does.
+        InputError: If a label is only a box; the error names the first such image.
     """
     for sample in found.samples:
         if not all(instance.has_mask for instance in sample.instances):
@@ -268,7 +272,11 @@ def _yolo(
 
 
 def _entry(root: Path, base: str, entry: str) -> str:
-    """Where images of a split are said to be; from below ``data.yaml`` if not beside its folder, as exports have it."""
+    """Return the image folder or list of a split, relative to ``root``.
+
+    Some exports write ``../`` paths that are correct only from a folder below ``data.yaml``. If the path does not
+    exist, the ``../`` is removed.
+    """
     place, inner = str(Path(base, entry)), entry.removeprefix("../")
     return str(Path(base, inner)) if inner != entry and not (root / place).exists() else place
 
@@ -283,7 +291,7 @@ def _has(counts: dict[str, int]) -> str:
 
 
 def _images(root: Path, entry: str) -> list[Path]:
-    """Images of a folder or of a list, by name; none if it is missing."""
+    """Return the images of a folder or of a list file, by name; none if it is missing."""
     place = root / entry
     if place.is_dir():
         return images_below(place)
@@ -297,7 +305,7 @@ def _images(root: Path, entry: str) -> list[Path]:
 
 
 def _label_of(image: Path) -> Path:
-    """The label of an image, for which Ultralytics takes ``labels`` for the last ``images`` of its path."""
+    """Return the label file of an image; Ultralytics replaces the last ``images`` of the path with ``labels``."""
     before, found, after = f"/{image}".rpartition("/images/")
     return Path(f"{before}/labels/{after}"[1:] if found else image).with_suffix(".txt")
 
@@ -331,7 +339,11 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
 
 
 def _clipped(points: Float64Array, size: tuple[int, int], place: str) -> Float64Array:
-    """Points [px] as far as they are in the image, or almost."""
+    """Return points [px] clipped to the image.
+
+    Raises:
+        InputError: If a point lies farther than ``_BEYOND`` outside the image.
+    """
     shares = points / size
     if not (np.isfinite(shares).all() and shares.min() >= -_BEYOND and shares.max() <= 1 + _BEYOND):
         worst = shares.ravel()[np.abs(np.nan_to_num(shares.ravel(), nan=np.inf) - 0.5).argmax()]
@@ -350,7 +362,7 @@ def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
 
 
 def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], progress: Progress | None) -> LabelledSet:
-    """The images of one file of a folder."""
+    """Return the labelled images of one COCO file."""
     try:
         categories = sorted(content["categories"], key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
@@ -389,7 +401,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
 
 
 def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
-    """The files of a folder that label a split, and what they say: one, or, for ``all``, all of them."""
+    """Return the COCO files of a split and their contents: one file, or all files for the split ``all``."""
     files = {path: _json(path) for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))}
     files = {
         path: content
@@ -421,7 +433,7 @@ def _json(path: Path) -> Any:
 
 
 def _finder(root: Path, listing: Path) -> Callable[[str], Path]:
-    """Finds the images that a file of annotations names."""
+    """Return a function that finds the images named in an annotation file."""
     below: dict[str, list[Path]] = {}
     for path in images_below(root):
         below.setdefault(path.name, []).append(path)
@@ -466,7 +478,7 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                 raise InputError(f"{place}: segmentation must be of {height} x {width} px (got {given['size']})")
             else:
                 lengths = given["counts"] if isinstance(given["counts"], list) else _run_lengths(str(given["counts"]))
-                if sum(lengths) != height * width or min(lengths) < 0:  # decoding would make up what is missing
+                if sum(lengths) != height * width or min(lengths) < 0:  # decoding would invent the missing pixels
                     raise InputError(
                         f"{place}: run lengths must be of {height} x {width} px, {height * width} (got {sum(lengths)})"
                     )
@@ -484,7 +496,10 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
 
 
 def _run_lengths(code: str) -> list[int]:
-    """What COCO's compressed code of a mask says: five bits a letter, from the third on differences to two before."""
+    """Return the run lengths of COCO's compressed mask code.
+
+    Each character has five value bits. From the third run on, the code stores the difference to the run two before.
+    """
     lengths: list[int] = []
     value = shift = 0
     for letter in code:

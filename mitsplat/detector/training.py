@@ -1,15 +1,14 @@
-"""From datasets to the weights of a detector, which Ultralytics trains.
+"""Training of an Ultralytics detector on datasets.
 
-The folder of a run::
+The run folder::
 
-    run.json          settings, versions, classes, images by digest; when it is finished, its steps, seconds and losses
-    weights.pt        the final weights, once it is finished
-    weights/last.pt   the last checkpoint, until then
-    data/             the images as links and their labels, until then
-    tiles/            what photographs are cut to, until then
-    results.csv       losses and learning rates of every epoch of 50 steps, by Ultralytics
-    args.yaml         all of Ultralytics' settings
-
+    run.json          settings, versions, classes, digests of the images; after the end also steps, seconds and losses
+    weights.pt        final weights, after the end
+    weights/last.pt   last checkpoint, until the end
+    data/             images as links and their labels, until the end
+    tiles/            tiles of the photographs, until the end
+    results.csv       losses and learning rates of each epoch of 50 steps, by Ultralytics
+    args.yaml         all settings of Ultralytics
 """
 
 from __future__ import annotations
@@ -45,29 +44,29 @@ RUN = "run.json"
 WEIGHTS = "weights.pt"
 _TILES = "tiles"
 _OWN = frozenset((RUN, WEIGHTS, "weights", "data", _TILES, "results.csv", "args.yaml", ".lock", "evaluation"))
-"""Names of what may lie in the folder of a run, beside temporary files and evaluations."""
+"""Names of files that a run folder may contain, in addition to temporary files."""
 _SETS = ("datasets", "real")
 _MOST_WORKERS = 8
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """What decides the weights of a detector, beside its images.
+    """Settings that, together with the images, determine the weights of a detector.
 
     Attributes:
-        model: The network's YAML file of Ultralytics; one of masks, such as ``yolo11n-seg``, or of boxes, ``yolo11n``.
-        weights: A file of weights to start from, random ones if None. Nothing is ever downloaded.
-        steps: Batches that are learnt from, each of which changes the weights once, however many images there are.
-        batch: Images of a step.
-        size: Longer side that images are scaled to [px], a multiple of 32.
-        share: Of real images among those of each step, where there are some.
-        real_size: Longer side at which photographs will be searched [px]. If it is more than ``size``, they are cut to
-            tiles that show things as large.
-        mirror: Whether half of the images are mirrored left to right: wrong of what is printed, and of left and right
-            parts that are told apart.
-        seed: Decides everything that is random.
-        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, as PyTorch counts GPUs.
-        workers: Processes that read images, beside this one; if None, up to 8, and none on the CPU.
+        model: YAML file of an Ultralytics network, with masks (``yolo11n-seg``) or only boxes (``yolo11n``).
+        weights: File of initial weights; random weights if None. Nothing is ever downloaded.
+        steps: Number of batches, each with one update of the weights, independent of the number of images.
+        batch: Images per step.
+        size: Longer side to which images are scaled [px], a multiple of 32.
+        share: Share of real images in the steps, if there are real images.
+        real_size: Longer side of photographs at prediction [px]. If it is larger than ``size``, photographs are cut to
+            tiles that show objects at this size.
+        mirror: True to mirror half of the images left to right. This is wrong for printed text and for classes that
+            differ only as left and right parts.
+        seed: Seed of all random numbers.
+        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, with PyTorch's GPU numbers.
+        workers: Number of additional processes that read images; if None, up to 8. There are none on the CPU.
     """
 
     model: str = "yolo11n-seg.yaml"
@@ -100,19 +99,19 @@ class TrainSettings:
             object.__setattr__(self, "weights", Path(self.weights))
 
     def decisive(self) -> dict[str, Any]:
-        """Those that decide what is learnt, not where."""
+        """Return the settings that affect the weights, without ``device`` and ``workers``."""
         settings = asdict(self) | {"weights": None if self.weights is None else file_hash(self.weights)}
         return {name: value for name, value in settings.items() if name not in ("device", "workers")}
 
 
 @dataclass(frozen=True)
 class Run:
-    """The folder of a training.
+    """A training run.
 
     Attributes:
-        path: The folder.
-        record: What ``run.json`` says.
-        was_finished: Whether there was nothing left to do.
+        path: Folder of the run.
+        record: Content of ``run.json``.
+        was_finished: True if the run was already finished, so no step was left.
     """
 
     path: Path
@@ -121,17 +120,17 @@ class Run:
 
     @property
     def weights(self) -> Path:
-        """The final weights."""
+        """Path of the final weights."""
         return self.path / WEIGHTS
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """What it tells apart."""
+        """Names of the classes."""
         return tuple(self.record["classes"])
 
     @property
     def has_masks(self) -> bool:
-        """Whether it predicts masks, or boxes alone."""
+        """True if the detector predicts masks."""
         return bool(self.record["masks"])
 
 
@@ -144,21 +143,22 @@ def train_detector(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Run:
-    """Train a detector on the training splits of datasets, or go on with the training in a folder.
+    """Train a detector on the training splits of datasets, or resume the training in a folder.
 
     Args:
-        datasets: Datasets of mitsplat with YOLO files, or any other that :func:`mitsplat.detector.read_set` takes.
-        out: Folder of the run. One that was interrupted goes on from its last checkpoint to the same number of steps.
-        settings: What decides the weights.
-        real: Labelled photographs, of which every step has ``settings.share``.
-        overwrite: Remove the run in the folder first.
-        progress: Told of images that are read, and of steps.
+        datasets: mitsplat datasets with YOLO files, or other folders that :func:`mitsplat.detector.read_set` accepts.
+        out: Folder of the run. An interrupted run resumes from its last checkpoint and ends at the same number of
+            steps.
+        settings: Training settings.
+        real: Labelled photographs, which make up ``settings.share`` of the images.
+        overwrite: Remove an existing run in the folder first.
+        progress: Called after each image that is read, and after each step.
 
     Raises:
-        InputError: If images or labels are missing, torn or out of range, classes differ, masks are to be learnt from
-            boxes, weights do not fit, ``real_size`` is of no photographs, or the folder holds something else or a run
-            with other settings.
-        MissingResourceError: If Ultralytics, the GPU or its memory is missing.
+        InputError: If images or labels are missing, truncated or out of range, the classes differ, or a mask model gets
+            box labels. Also if the weights do not fit, ``real_size`` is set without photographs, or the folder contains
+            other files or a run with other settings.
+        MissingResourceError: If Ultralytics or the GPU is missing, or the GPU memory is too small.
     """
     settings, out = settings or TrainSettings(), Path(out)
     if not datasets:
@@ -202,10 +202,10 @@ def train_detector(
 
 
 def open_run(path: str | Path) -> Run:
-    """The run in a folder, which must be finished.
+    """Open the finished run in a folder.
 
     Raises:
-        InputError: If there is none, or it is not finished.
+        InputError: If there is no run, or it is not finished.
     """
     path = Path(path)
     run = _read_run(path)
@@ -219,7 +219,7 @@ def open_run(path: str | Path) -> Run:
 def read_sets(
     datasets: Sequence[str | Path], real: str | Path | None, *, masks: bool, progress: Progress | None = None
 ) -> tuple[list[LabelledSet], LabelledSet | None]:
-    """The training splits of datasets and of photographs, with the classes in the order of the first.
+    """Read the training splits of datasets and of photographs, with the class order of the first dataset.
 
     Raises:
         InputError: As :func:`train_detector`.
@@ -238,12 +238,12 @@ def read_sets(
 
 
 def write_data(sets: Sequence[LabelledSet], folder: Path) -> Path:
-    """Write images, as links, and labels of sets as Ultralytics reads them, in a folder that is made anew.
+    """Write images (as links) and labels in Ultralytics' layout, in a folder that is emptied first.
 
-    Labels are polygons where all instances have masks, and boxes otherwise.
+    Labels are polygons if all instances have masks, and boxes otherwise.
 
     Returns:
-        The list of the images, in the order of the sets.
+        File that lists the images, in the order of the sets.
     """
     remove_folder(folder)
     (folder / "images").mkdir(parents=True)
@@ -281,7 +281,7 @@ def _train(
     device: str,
     progress: Progress | None,
 ) -> dict[str, Any]:
-    from mitsplat.detector import fixed_steps  # optional: it derives from Ultralytics
+    from mitsplat.detector import fixed_steps  # optional dependency: this module subclasses Ultralytics
 
     rendered = sum(len(found.samples) for found in sets)
     if photographs is not None and settings.real_size is not None and settings.real_size > settings.size:
@@ -311,7 +311,7 @@ def _train(
     }
     started = time.perf_counter()
     if (out / fixed_steps.LAST).is_file() and fixed_steps.epochs_done(out) in (0, job.epochs):
-        fixed_steps.finish_checkpoint(out)  # it was ended between its last step and its end
+        fixed_steps.finish_checkpoint(out)  # the process ended between the last step and the export of the weights
         return counted | {"seconds": 0.0, "resumed_at_step": settings.steps}
     outcome = fixed_steps.train_job(
         job,
@@ -345,7 +345,7 @@ def _read_run(path: Path) -> Run | None:
 
 
 def _kept(out: Path, record: dict[str, Any]) -> Run | None:
-    """The run in a folder, which must be of the same settings and images."""
+    """Return the run in a folder, which must have the same settings and images, or None."""
     kept = _read_run(out)
     if kept is None:
         return None
@@ -365,10 +365,10 @@ def _digests(described: Any) -> list[str]:
 
 
 def check_folder(out: Path, kind: str, own: Collection[str] = ()) -> None:
-    """Refuse a file, and a folder that holds something else than files of its ``own``; hidden ones do not count.
+    """Refuse a path that is a file, or a folder with visible files whose names are not in ``own``.
 
     Raises:
-        InputError: Which says what ``kind`` of folder is wanted.
+        InputError: If the path is refused; the message names the expected ``kind`` of folder.
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: must be a folder (got a file)")
@@ -378,7 +378,7 @@ def check_folder(out: Path, kind: str, own: Collection[str] = ()) -> None:
 
 
 def _check_apart(out: Path, found: LabelledSet) -> None:
-    """Refuse to learn from what lies in the folder of the run, which is removed from it."""
+    """Refuse a run folder that contains training images, because files of the run folder are removed."""
     folder = out.resolve()
     for path in (found.root, *(sample.path for sample in found.samples)):
         if path.resolve().is_relative_to(folder):

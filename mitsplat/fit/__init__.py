@@ -1,7 +1,8 @@
-"""Gaussians fitted to photographs.
+"""Fit of Gaussian splats to photographs.
 
-In: a :class:`~mitsplat.capture.capture.Capture`. Out: splats, and how well they show photos that took no part. The
-trainer starts from the capture's points, and a strategy (MCMC or classic) adds Gaussians where they are missing.
+Input: a :class:`~mitsplat.capture.capture.Capture`.
+Output: splats, and their image quality on held-out photos.
+The trainer starts from the points of the capture. A densification strategy (MCMC or classic) adds Gaussians.
 """
 
 from __future__ import annotations

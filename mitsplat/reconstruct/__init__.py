@@ -1,8 +1,9 @@
-"""Photographs and the splats fitted to them to an asset.
+"""Reconstruction of an asset from photographs and fitted splats.
 
-In: a capture and the splats fitted to it. Out: an :class:`~mitsplat.asset.Asset` of the object alone, with a closed
-mesh aligned with its splats, and a verdict by photos that took no part. :mod:`.pipeline` is the way from photographs
-to there.
+Input: a capture and the splats that were fitted to it.
+Output: an :class:`~mitsplat.asset.Asset` of the object alone, with a closed mesh aligned to its splats, and an
+evaluation on held-out photos.
+:mod:`.asset_from_photos` runs all steps from the photographs to the asset.
 """
 
 from __future__ import annotations

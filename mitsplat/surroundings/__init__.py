@@ -1,8 +1,9 @@
-"""A photographed workcell or room to an environment that things can be dropped into.
+"""Reconstruction of a photographed workcell or room as a scene environment.
 
-In: a :class:`~mitsplat.capture.capture.Capture` without masks, and splats fitted to the whole of it. Out: an asset
-whose floaters are gone and whose support, such as a table, lies level in z = 0; the flat surfaces as colliders, what
-photos hardly show of the support, and a scene file that drops things where it is free.
+Input: a :class:`~mitsplat.capture.capture.Capture` without masks, and splats that were fitted to the whole scene.
+Output: an environment asset without floaters, whose support surface (for example a table) lies level in z = 0.
+The package also writes colliders for the flat surfaces, the parts of the support that few photos show, and a scene file
+that drops objects onto the free area.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Light that reaches objects from their surroundings: what the surroundings' splats have captured, and visible meshes.
+"""Indirect light on objects: one bounce from captured splats and visible meshes.
 
-What a ray from an object meets, if it is not another object, shines with the colour that was captured there, which
-holds all earlier bounces. A grid of mean colours is enough, because irradiance blurs it over the hemisphere. A visible
-mesh shines with what its diffuse material reflects of the emitters' light that arrives there.
+A ray from an object that hits the surroundings takes the colour captured there, which contains all earlier bounces. A
+grid of mean colours is sufficient, because irradiance blurs it over the hemisphere. A visible mesh contributes the
+emitters' light that its diffuse material reflects.
 """
 
 from __future__ import annotations
@@ -31,21 +31,22 @@ BOUNCE_RAYS = 7
 """Rays per object pixel, before neighbours are averaged."""
 
 MESH_RAYS = 2
-"""The same per pixel of what is no object, such as a table, at one of four: neighbours on even surfaces count."""
+"""Rays per pixel on visible meshes such as a table, at one pixel of four; averages over even surfaces reduce the noise.
+"""
 
 LANES = 1 << 20
-"""Rays that are traced at once."""
+"""Number of rays that are traced at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class RadianceGrid:
-    """Mean linear colour of splats in the cells of a box; an empty cell has that of the nearest one with splats.
+    """Mean linear colour of splats in the cells of a box; an empty cell has the colour of the nearest filled cell.
 
     Attributes:
         colours: Linear RGB per cell, x fastest, flat.
         low: Lower corner [m].
         size: Edge of a cell [m].
-        cells: Cells along x, y and z.
+        cells: Number of cells along x, y and z.
     """
 
     colours: Any
@@ -55,7 +56,7 @@ class RadianceGrid:
 
     @classmethod
     def build(cls, splats: Splats, world_from_splats: np.ndarray) -> RadianceGrid | None:
-        """The grid of the opaque ones among ``splats``; None if there are none."""
+        """Build the grid from the splats with opacity above 0.5; return None if there are none."""
         opaque = splats.opacities > 0.5
         if not opaque.any():
             return None
@@ -83,18 +84,18 @@ class RadianceGrid:
         )
 
     def at(self, point: Any, active: Any) -> Any:
-        """Linear colour (Color3f) at points [m]."""
+        """Return the linear colour (Color3f) at points [m]."""
         i = dr.clip(mi.Point3i(dr.floor((point - self.low) / self.size)), 0, self.cells - 1)
         return dr.gather(mi.Color3f, self.colours, mi.UInt32((i.z * self.cells.y + i.y) * self.cells.x + i.x), active)
 
 
 @dataclass(frozen=True, eq=False)
 class Reflectors:
-    """What reflects light onto things.
+    """Surfaces that reflect light onto objects.
 
     Attributes:
         grid: Captured colours of the static proxies; None if there are none.
-        proxies: What rays meet, and what stands in the light of what they meet.
+        proxies: Surfaces that rays hit, and their occluders.
         emitters: Light on visible meshes.
         white: Irradiance (Color3f) of display white.
     """
@@ -106,20 +107,20 @@ class Reflectors:
 
     @property
     def any(self) -> bool:
-        """Whether there are any."""
+        """True if any surface reflects light."""
         return self.proxies.shows_meshes or (self.grid is not None and self.proxies.static is not None)
 
     def irradiance(
         self, origin: Any, normal: Any, start: Any, rays: int, sequence: Callable[[Any], tuple[Any, Any]]
     ) -> Any:
-        """What they send to points (Color3f) over the irradiance of display white.
+        """Compute the reflected irradiance at points (Color3f) over the irradiance of display white.
 
         Args:
-            origin: Where rays start [m].
+            origin: Ray origins [m].
             normal: Unit normal of the surface.
-            start: Number of the first ray of every point.
-            rays: From every point.
-            sequence: Two points of the unit square for rays by their numbers.
+            start: Sequence number of the first ray of every point.
+            rays: Number of rays per point.
+            sequence: Function that maps ray numbers to two points of the unit square.
         """
         count = dr.width(origin)
         together = max(1, min(rays, LANES // count))
@@ -139,7 +140,10 @@ class Reflectors:
         return total / rays
 
     def _colour(self, ray: Any, key: Any, light: Any) -> Any:
-        """That (Color3f) of what rays meet; each scene is traced by a kernel of its own, see ``Proxies.apart``."""
+        """Return the colour (Color3f) at the hits of rays.
+
+        Each scene is traced by a kernel of its own, see ``Proxies.apart``.
+        """
         static, dynamic = self.proxies.static, self.proxies.dynamic
         colour = mi.Color3f(dr.zeros(mi.Float, dr.width(key)))
         if static is not None:
@@ -149,7 +153,7 @@ class Reflectors:
         if dynamic is not None and self.proxies.shows_meshes:
             hit = dynamic.scene.ray_intersect_preliminary(ray)
             mesh = hit.is_valid() & dynamic.is_visible(hit)
-            if self.emitters.sky is not None:  # in a room it stands for what walls reflect
+            if self.emitters.sky is not None:  # indoors, the sky represents the light that walls reflect
                 mesh &= hit.t < self.emitters.sky_reach
             met &= ~hit.is_valid()
             dr.eval(hit, mesh)
@@ -166,7 +170,7 @@ class Reflectors:
         return colour
 
     def _lit_mesh(self, ray: Any, hit: Any, key: Any, light: Any) -> Any:
-        """Colour (Color3f) of visible meshes: what they reflect of one ray to an emitter."""
+        """Return the colour (Color3f) of visible meshes: reflected light of one ray to an emitter."""
         si = hit.compute_surface_interaction(ray)
         normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
         diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0

@@ -1,4 +1,4 @@
-"""Directions towards the light: which emitter, which point of it, and how much irradiance that stands for."""
+"""Sampling of emitters: emitter, point on it, and the irradiance of the sample."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ SURVEY_LATTICE = (233, 144)
 OPEN_LATTICE = (34, 21)
 LOBE_LATTICE = (21, 13)
 WHOLE_LATTICE = (4181, 2584)
-"""Points and generator of Fibonacci lattices: consecutive Fibonacci numbers give the best two-dimensional ones
-(Niederreiter 1992, section 5.3)."""
+"""Number of points and generator of Fibonacci lattices. Consecutive Fibonacci numbers give the best two-dimensional
+lattices (Niederreiter 1992, section 5.3).
+"""
 
 LEAST_CHANCE = 0.1
-"""Share of the rays that goes to all emitters alike, however little light they send to the reference point."""
+"""Share of the rays that is divided equally among all emitters, independent of their light at the reference point."""
 
 _ENDS = 4
-"""Numbers of emitters are rounded up to multiples of it."""
+"""Emitter counts are rounded up to multiples of this number, so that one kernel serves several counts."""
 
 
 def receiver(position: Any, normal: Any) -> Any:
-    """Surface interaction that light is sampled for."""
+    """Return a surface interaction to sample light for."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
     si.p = position
     si.n = mi.Normal3f(normal)
@@ -39,19 +40,19 @@ def receiver(position: Any, normal: Any) -> Any:
 
 
 def lattice_point(i: Any, lattice: tuple[int, int]) -> Any:
-    """Point ``i`` of a centred rank-1 lattice in the unit square."""
+    """Return point ``i`` of a centred rank-1 lattice in the unit square."""
     count, generator = lattice
     return mi.Point2f((mi.Float(i) + 0.5) / count, (mi.Float(i * generator % count) + 0.5) / count)
 
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """A direction that light may come from.
+    """Sampled direction towards light.
 
     Attributes:
         direction: Unit vector towards the light.
-        reach: How far away what stops the light may be [m]: to the emitter, or as far as a sky can be hidden.
-        irradiance: Estimate (Color3f) of the irradiance, were this the only ray and nothing in its way.
+        reach: Largest distance of an occluder [m]: the distance to the emitter, or the sky reach.
+        irradiance: Unoccluded irradiance estimate (Color3f) of this single sample.
     """
 
     direction: Any
@@ -60,16 +61,19 @@ class Beam:
 
 
 class Emitters:
-    """The emitters of a scene, sampled in proportion to the light that each sends to a reference point.
+    """Emitters of a scene, sampled in proportion to the light that each sends to a reference point.
 
-    A sky of one colour is sampled by the cosine to the normal, which leaves no noise but that of occlusion. An
-    environment map is sampled half so and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
+    A sky of one colour is sampled by the cosine to the normal, so that only occlusion causes noise. An environment map
+    is sampled half by the cosine and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
     """
 
     def __init__(self, scene: Any, reference: Sequence[float], sky_reach: float = np.inf) -> None:
-        """The emitters of ``scene``, of which there must be one or more; ``reference`` is a point [m].
+        """Collect the emitters of a scene.
 
-        What is farther than ``sky_reach`` [m] from a point does not hide the sky from it.
+        Args:
+            scene: Mitsuba scene with at least one emitter.
+            reference: Point at which the emitters are compared [m].
+            sky_reach: Distance beyond which nothing occludes the sky [m].
         """
         self.sky_reach = dr.opaque(mi.Float, sky_reach)
         emitters = scene.emitters()
@@ -77,7 +81,7 @@ class Emitters:
         skies = [i for i, e in enumerate(emitters) if _is_sky(e)]
         sky = skies[0] if skies else None
         self.even_sky = sky is not None and emitters[sky].class_name() == "ConstantBackgroundEmitter"
-        # Where it is among several emitters is no part of kernels: it changes with the number of lights.
+        # The sky's index is opaque: as a literal, it would change the kernel with the number of lights.
         self.sky = None if sky is None else mi.UInt32(0) if len(emitters) == 1 else dr.opaque(mi.UInt32, sky)
         point = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in reference])
         fluence = self._survey(len(emitters), point)
@@ -96,7 +100,7 @@ class Emitters:
         dr.make_opaque(self.infinite)
 
     def _survey(self, count: int, point: Any) -> Any:
-        """Mean radiance (count,) from each emitter around a point."""
+        """Return the mean radiance (count,) of each emitter around a point."""
         i = dr.arange(mi.UInt32, count * SURVEY_LATTICE[0])
         emitter = dr.gather(mi.EmitterPtr, self.pointers, i // SURVEY_LATTICE[0])
         sample = lattice_point(i % SURVEY_LATTICE[0], SURVEY_LATTICE)
@@ -104,7 +108,7 @@ class Emitters:
         return np.array(dr.sum(radiance)).reshape(count, -1).mean(axis=1)
 
     def sample(self, si: Any, point: Any, active: Any) -> Beam:
-        """A random direction from ``si`` for each point of the unit square."""
+        """Sample one random direction from ``si`` for each point of the unit square."""
         index, x, chance = self.choice.sample(point.x)
         is_sky = mi.Bool(False) if self.sky is None else index == self.sky
         emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
@@ -126,13 +130,13 @@ class Emitters:
                 towards.d = direction
                 density = 0.5 * (density + emitter.pdf_direction(si, towards, is_sky & active))
             irradiance = dr.select(is_sky, dr.select(density > 0, sky * (cosine / density), 0), irradiance)
-        # The distance to a light at infinity comes from the extent of visible meshes, which proxies are not part of.
+        # Mitsuba derives the distance of infinite lights from the extent of visible meshes, which excludes proxies.
         infinite = dr.gather(mi.UInt32, self.infinite, index, active) > 0
         reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, distance))
         return Beam(direction, reach, irradiance / chance)
 
     def _towards(self, si: Any, index: Any, point: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Where points of emitters are seen from ``si``: unit vector, distance [m], and radiance over their density."""
+        """Return unit vector and distance [m] from ``si`` to points of emitters, and radiance over sampling density."""
         if self.rectangles is None or not (self.sky is None or self.even_sky):
             emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
             sample, radiance = emitter.sample_direction(si, point, active)
@@ -147,9 +151,9 @@ class Emitters:
         return mi.Color3f(emitter.eval(outside, active))
 
     def open_light(self, si: Any, lobe: Lobe | None, active: Any) -> tuple[Any, Any]:
-        """Irradiance, and radiance that is mirrored (Color3f), without occluders, from the same directions for all.
+        """Compute unoccluded irradiance and mirrored radiance (Color3f) from one fixed set of directions.
 
-        Without a ``lobe``, where nothing is mirrored, this takes less time.
+        ``lobe`` is None where nothing is mirrored, which takes less time.
         """
         total, shine = mi.Color3f(0), mi.Color3f(0)
         if self.local_choice is not None:
@@ -191,12 +195,12 @@ class Emitters:
 
 
 class _Choice:
-    """One of a few things, with given chances."""
+    """Discrete distribution over a few items."""
 
     def __init__(self, share: Any) -> None:
-        """Chances in proportion to ``share`` (N,)."""
+        """Set the probabilities in proportion to ``share`` (N,)."""
         chance = share / share.sum()
-        # A kernel serves two to four things, five to eight and so on: nothing lies behind the ends at infinity.
+        # Padding with infinite limits lets one kernel serve two to four items, another five to eight, and so on.
         ends = np.cumsum(chance)[:-1]
         if len(chance) > 1:
             ends = np.concatenate([ends, np.full(-len(chance) % _ENDS, np.inf)])
@@ -206,7 +210,11 @@ class _Choice:
         dr.make_opaque(self.starts, self.chances)
 
     def sample(self, x: Any) -> tuple[Any, Any, Any]:
-        """Index for a number in [0, 1), what of the number is left, in [0, 1) too, and the chance of the index."""
+        """Sample an index from a number in [0, 1).
+
+        Returns:
+            Index, the remainder of the number rescaled to [0, 1), and the probability of the index.
+        """
         index = sum((dr.select(x >= end, mi.UInt32(1), mi.UInt32(0)) for end in self.ends), mi.UInt32(0))
         chance = dr.gather(mi.Float, self.chances, index)
         left = (x - dr.gather(mi.Float, self.starts, index)) / chance
@@ -220,16 +228,16 @@ def _is_sky(emitter: Any) -> bool:
 
 
 def sky_irradiance(emitter: Any) -> SkyIrradiance:
-    """Irradiance of an emitter at infinity on every orientation, from directions in proportion to its radiance."""
+    """Compute the irradiance of an infinite emitter for every orientation, sampled in proportion to its radiance."""
     point = lattice_point(dr.arange(mi.UInt32, WHOLE_LATTICE[0]), WHOLE_LATTICE)
     sample, radiance = emitter.sample_direction(receiver(mi.Point3f(0), mi.Vector3f(0, 0, 1)), point, True)
     return SkyIrradiance(sample.d, radiance)
 
 
 def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
-    """Unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
+    """Compute the unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
 
-    Where next to nothing reaches that element, it is the mean over all orientations, a quarter of the fluence.
+    Where almost no light reaches that element, the result is the mean over all orientations (a quarter of the fluence).
     """
     i = dr.arange(mi.UInt32, WHOLE_LATTICE[0])
     si = receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))

@@ -1,8 +1,9 @@
-"""Highlights: what surfaces mirror of lights, by GGX microfacets.
+"""Highlights: mirrored light of emitters, by GGX microfacets.
 
-The light that a lobe mirrors without anything in the way is summed over fixed directions, and has no noise. Shadow rays
-only say which share of it arrives (Heitz, Hill and McGuire 2018, "Combining Analytic Direct Illumination and Stochastic
-Shadows"): next to a share, radiance that differs much from pixel to pixel leaves noise, or is blurred by a filter.
+The unoccluded reflection of a lobe is integrated over fixed directions, so that it has no noise. Shadow rays only
+estimate the share of it that arrives (Heitz, Hill and McGuire 2018, "Combining Analytic Direct Illumination and
+Stochastic Shadows"). Mirrored radiance differs much between adjacent pixels: estimated by rays alone, it would be noisy
+or blurred by the filter.
 """
 
 from __future__ import annotations
@@ -16,16 +17,18 @@ import mitsuba as mi
 from mitsplat.renderer.light.lit_surface import LitSurface
 
 CAPTURED_SPECULAR = 0.08
-"""Reflectance up to which the light tent's mirror image counts as part of a captured colour, to be replaced by that of
-the scene's lights. Metals reflect more, and keep the rest as it was captured: it stands for what else they mirror."""
+"""Largest reflectance at which the mirror image of the light tent is replaced. Up to it, the image counts as part of
+the captured colour and the scene's lights take its place. Metals reflect more; the rest of their captured colour
+stays and represents other mirrored surroundings.
+"""
 
 LEAST_ROUGHNESS = 0.15
-"""Smoother surfaces would show the fixed directions one by one."""
+"""Smallest roughness. On smoother surfaces the fixed directions would be visible as single spots."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lobe:
-    """What points mirror towards the camera: GGX with height-correlated masking and Schlick's Fresnel term.
+    """Specular lobes towards the camera: GGX with height-correlated masking and Schlick's Fresnel term.
 
     See Walter et al. 2007, "Microfacet Models for Refraction", and Heitz 2014, "Understanding the Masking-Shadowing
     Function".
@@ -43,12 +46,12 @@ class Lobe:
 
     @classmethod
     def of(cls, surface: LitSurface) -> Lobe:
-        """The lobes of visible points."""
+        """Return the lobes of visible points."""
         alpha = dr.square(dr.maximum(surface.roughness, LEAST_ROUGHNESS))
         return cls(surface.normal, surface.to_camera, alpha, surface.specular)
 
     def reflectance(self, to_light: Any) -> Any:
-        """Radiance towards the camera over irradiance from unit vectors towards the light."""
+        """Return the radiance towards the camera per irradiance from unit vectors towards the light."""
         alpha2, cos_camera = dr.square(self.alpha), self._cos_camera()
         cos_light = dr.dot(self.normal, to_light)
         half = dr.normalize(to_light + self.to_camera)
@@ -60,9 +63,12 @@ class Lobe:
         return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
 
     def sample(self, point: Any) -> tuple[Any, Any]:
-        """Direction for a point of the unit square, and what of the radiance from there is mirrored.
+        """Sample a direction from a point of the unit square.
 
-        Of the normals that the camera sees (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
+        Uses the distribution of visible normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
+
+        Returns:
+            Unit vector towards the light, and the mirrored share of the radiance from there.
         """
         frame, alpha2, cos_camera = mi.Frame3f(self.normal), dr.square(self.alpha), self._cos_camera()
         seen = frame.to_local(self.to_camera)
@@ -90,10 +96,10 @@ class Lobe:
 
 
 def mirrored_tent(surface: LitSurface) -> Any:
-    """Part of the captured colour that is light of the tent, mirrored: the lobe's reflectance under even light.
+    """Return the specular part of the captured colour: the lobe's reflectance under even light.
 
-    Fit of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60 degrees: colours
-    of few SH bands do not show it, so that to take it away would blacken silhouettes.
+    The fit is that of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60
+    degrees. Colours with few SH bands do not contain this rise, and its removal would blacken silhouettes.
     """
     cosine = dr.maximum(dr.dot(surface.normal, surface.to_camera), 0.5)
     rough = surface.roughness

@@ -1,22 +1,22 @@
-"""Traced light on splats: irradiance with and without the dynamic occluders, and a highlight.
+"""Traced light on splats: irradiance with and without dynamic occluders, and a highlight.
 
-A splat stores what the camera saw, shadows included. Rendering it among new objects therefore needs no light transport
-from scratch but a factor per visible point x with normal n,
+A splat stores the radiance that the camera saw, shadows included. Rendering it among new objects therefore needs no
+full light transport, but one factor per visible point x with normal n:
 
     captured under the scene's light:   ratio = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
     captured under uniform light:       ratio = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
 
-with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first is exactly 1 where no dynamic
-object takes light away, so shadows that were captured are not applied twice. E_ref is the irradiance under which the
-colours of the surroundings are exposed: an object taken in a light tent keeps its colours there, and is darker where
-less light arrives. E_bounce is what the surroundings reflect, see :mod:`mitsplat.renderer.light.bounce`. The highlight
-is what
-the lights mirror, less what a light tent has mirrored into the captured colour: under even light it adds nothing.
+with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first ratio is exactly 1 where no
+dynamic object takes light away, so that captured shadows are not applied twice. E_ref is the irradiance for which the
+colours of the surroundings are exposed. An object captured in a light tent keeps its colours under E_ref, and is darker
+where less light arrives. E_bounce is the light that the surroundings reflect, see
+:mod:`mitsplat.renderer.light.bounce`. The highlight is the mirrored light of the emitters minus the tent light mirrored
+in the captured colour; under even light it adds nothing.
 
-Rays are spent where they are needed. One a pixel is all for captured surfaces of which objects take no more light than
-the wanted error, see :mod:`mitsplat.renderer.light.light_tiles`. All else gets as many as most need for that error, and
-more where light, as it looks in the picture, errs by more. Of visible planes in even light, one of four pixels gets
-them, see :mod:`mitsplat.renderer.light.light_planes`.
+Rays are spent adaptively. Captured surfaces get one ray per pixel where objects occlude less light than the wanted
+error, see :mod:`mitsplat.renderer.light.light_tiles`. All other points get the number of rays that most points need for
+that error. Points with a larger perceptual error get more. On visible planes in even light, one pixel of four is
+traced, see :mod:`mitsplat.renderer.light.light_planes`.
 """
 
 from __future__ import annotations
@@ -42,44 +42,46 @@ from mitsplat.renderer.splatting.sorting import stable_order
 
 ROBERTS = (3242174889, 2447445414)
 """Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
-effectiveness of quasirandom sequences"), of which the search for shadows takes a point for each pixel."""
+effectiveness of quasirandom sequences"). The shadow search takes one point of it per pixel.
+"""
 
 RECURRENCE = (1996816038, 1246200886)
-"""The same, of which a pixel takes every 64th point, and its 8 x 8 neighbours the others.
+"""Additive recurrence of the shadow rays: a pixel takes every 64th point, and its 8 x 8 neighbours take the others.
 
-Those of a pixel are Roberts', of whose own recurrence every 16th point is nearly the same. There are 4096 of the kind;
-of this one consecutive points are farthest apart.
+Every 64th point of this recurrence is a point of Roberts' recurrence, in whose own order every 16th point is nearly the
+same. There are 4096 recurrences of this kind; in this one consecutive points are farthest apart.
 """
 
 FIRST = 0.3
-"""Rays per point after which its error is first estimated, times the wanted one: as many as most points need.
+"""Rays per point before the first error estimate, times the wanted error: the number that most points need.
 
-With fewer, the estimates are so rough that they send rays to the wrong points, and take penumbras for even light.
+With fewer rays the estimates are so rough that rays go to the wrong points, and penumbras count as even light.
 """
 
 LEAST_FIRST = 4
-"""Least number of them."""
+"""Smallest number of these rays."""
 
 DENSE = 2
-"""Times as many from a point that stands for four pixels of a plane. With as many as elsewhere light there would err by
-a quarter more than if each pixel had its own; with these it errs no more."""
+"""Factor of the number of rays at a point that represents four pixels of a plane. With factor 1, its error would be a
+quarter larger than with rays at each pixel. With this factor the error is the same.
+"""
 
 LEVEL_BITS = 4
-"""Of how often that number is doubled: 2^15 times it is more than any setting."""
+"""Bits of the number of doublings; 2^15 times the first rays exceeds every setting."""
 
 WORD = 32
-"""Rays whose fate is kept as bits of one number."""
+"""Number of rays whose occlusion is stored as bits of one integer."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How many shadow rays are spent.
+    """Target error and limits of shadow rays.
 
     Attributes:
-        error: Standard error of light that is half of white for which rays are spent, and as much to the eye of all
-            other light; 0 spends ``most`` everywhere.
-        most: Most rays per pixel.
-        metered: Whether the picture is shown as bright on average as if half of its light arrived.
+        error: Target standard error of mid-grey irradiance, scaled perceptually elsewhere; 0 spends ``most``
+            everywhere.
+        most: Largest number of rays per pixel.
+        metered: True if automatic exposure normalises the mean brightness of the picture to mid-grey.
     """
 
     error: float
@@ -88,13 +90,13 @@ class Accuracy:
 
     @property
     def first(self) -> int:
-        """Rays per point after which its error is first estimated."""
+        """Rays per point before the first error estimate."""
         wanted = max(LEAST_FIRST, round(FIRST / self.error)) if self.error > 0 else self.most
         return min(wanted, self.most)
 
     @property
     def dense(self) -> int:
-        """The same per point that stands for four pixels of a plane."""
+        """Rays per point that represents four pixels of a plane, before the first error estimate."""
         return min(DENSE * self.first, self.most)
 
 
@@ -111,23 +113,23 @@ def light_factor(
     grid: RadianceGrid | None = None,
     bounce: bool = False,
 ) -> tuple[Any, Any]:
-    """Light factor and highlight (Color3f) of every visible point, see the module docstring.
+    """Compute light factor and highlight (Color3f) of every visible point, see the module docstring.
 
-    Sums over rays are averaged over neighbours before they are divided, so that points with little light do not turn
-    black by chance. A relit point takes its irradiance without occluders from one fixed set of directions, which has no
-    noise, and only the share that arrives from its rays.
+    Sums over rays are averaged over neighbours before the division, so that points with little light do not turn black
+    by chance. A relit point takes its unoccluded irradiance from one fixed, noise-free set of directions. Its rays only
+    estimate the share that arrives.
 
     Args:
-        scene: Mitsuba scene whose emitters give the light.
-        proxies: What can stand in its way.
-        visible: Where the camera's pixels, which are counted row by row, show something.
-        accuracy: How many rays to spend.
+        scene: Mitsuba scene with the emitters.
+        proxies: Occluders.
+        visible: Surface points of the camera's pixels, row by row.
+        accuracy: Target error and limits of shadow rays.
         seed: Offset into the low-discrepancy sequence.
-        point: Where in the scene rays are shared out among emitters by how much light they send [m].
-        reference: Irradiance (Color3f) that a uniformly captured object's colours stand for.
-        sky_reach: What is farther than this from a point does not hide the sky from it [m].
+        point: Point at which emitters are compared to distribute the rays among them [m].
+        reference: Irradiance (Color3f) at which a uniformly captured object keeps its colours.
+        sky_reach: Distance beyond which nothing occludes the sky [m].
         grid: Captured colours of the surroundings; None if there are none.
-        bounce: Whether objects get the light that surroundings and visible meshes reflect to them.
+        bounce: True if objects receive the light that surroundings and visible meshes reflect.
     """
     emitters, view = Emitters(scene, point, sky_reach), visible.view
     everything = visible.at(dr.arange(mi.UInt32, view.width * view.height))
@@ -190,7 +192,8 @@ def light_factor(
         more = dr.gather(mi.Float, wanted, order) > mi.Float(dr.gather(mi.UInt32, spent, order))
         rows = points.rows(dr.gather(mi.UInt32, order, dr.compress(more)))
         if dr.width(rows):
-            # Doubled until enough; pixels with the same number of rays go together, so that no lane waits for another.
+            # The number of rays is doubled until sufficient. Pixels with equal numbers are traced together, so that no
+            # lane idles.
             owner = dr.gather(mi.UInt32, points.owner, rows)
             level, extra = _doublings(dr.gather(mi.Float, wanted, owner), first, accuracy.most)
             extra += dr.opaque(mi.UInt32, first) - dr.gather(mi.UInt32, spent, owner)
@@ -206,15 +209,15 @@ def light_factor(
         own, pixels = gathered(here, special), dr.gather(mi.UInt32, index, special)
         part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
         dr.eval(own, part, shine, glare)
-        # Where no ray came from where the lobe is, as much of it arrives as of all light. (dr.mean would write the
-        # width of the array into the kernel.)
+        # If no ray came from the directions of the lobe, the arriving share of all light applies. (dr.mean would write
+        # the width of the array into the kernel.)
         mirrored *= dr.select(glare > 0, shine / glare, dr.sum(part) / 3) * (dr.pi / reference)
         relit = part * open_light / reference
         mirrored -= dr.select(own.relit, relit * tent, 0)
         dr.eval(relit, mirrored)
         if bounced is not None:
-            # After the mirror images were exchanged: what the tent's stands for of the surroundings is the nearest
-            # known.
+            # Added after the exchange of mirror images: the tent's mirror image also represents that of the
+            # surroundings.
             relit += dr.gather(mi.Color3f, bounced, special)
         dr.scatter(light, relit, pixels, own.relit)
         highlight = mi.Color3f(dr.zeros(mi.Float, dr.width(needed)))
@@ -226,7 +229,7 @@ def light_factor(
 
 
 def _open_light(emitters: Emitters, points: LightPoints, special: Any) -> tuple[Any, Any, Any]:
-    """Means over the points of pixels, without occluders: irradiance, mirrored light, and what the tent's takes."""
+    """Return unoccluded means over the points of pixels: irradiance, mirrored light, and mirrored tent."""
     rows = points.rows(special)
     own = gathered(points.surface, rows)
     dr.eval(own)
@@ -260,13 +263,13 @@ def _open_light(emitters: Emitters, points: LightPoints, special: Any) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class _CoarseLight:
-    """First rays of the pixels that stand for coarse tiles, see :mod:`mitsplat.renderer.light.light_planes`.
+    """First rays of the traced pixels of coarse tiles, see :mod:`mitsplat.renderer.light.light_planes`.
 
     Attributes:
-        coarse: Whether a pixel of the image is in such a tile.
-        lattice: Whether it is one of those that stand for them.
-        pixel: These.
-        estimate: What their rays say.
+        coarse: True for pixels in such a tile, by pixel of the image.
+        lattice: True for traced pixels of such tiles, by pixel of the image.
+        pixel: Numbers of these traced pixels.
+        estimate: Estimate at these pixels.
     """
 
     coarse: Any
@@ -278,7 +281,7 @@ class _CoarseLight:
     def of(
         cls, planes: Planes, visible: VisibleSurfaces, emitters: Emitters, seed: int, accuracy: Accuracy
     ) -> _CoarseLight | None:
-        """Those of some planes that are lit evenly; None if there are none."""
+        """Trace the samples of planes and keep the evenly lit tiles; return None if there are none."""
         if not planes.count:
             return None
         pixel, view = planes.samples(), visible.view
@@ -291,7 +294,8 @@ class _CoarseLight:
         rows, rounds = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, rays)
         estimate = tracer.trace(rows, Estimate.nothing(count), rounds, rays, turn, matt=True)
         coarse = planes.coarse(estimate)
-        # Where a tile is not coarse, its samples are not the points of the sequence that go with its other pixels'.
+        # In a tile that is not coarse, the samples took other points of the sequence than the rest of its pixels will
+        # take.
         lattice &= coarse
         dr.eval(coarse, lattice)
         kept = dr.compress(dr.gather(mi.Bool, lattice, pixel))
@@ -301,7 +305,7 @@ class _CoarseLight:
 
 
 def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
-    """How often ``rays`` is doubled until it is enough or ``most``, and how many more rays these are."""
+    """Return the number of doublings of ``rays`` up to ``wanted`` or ``most``, and the number of additional rays."""
     level, extra = (dr.zeros(mi.UInt32, dr.width(wanted)) for _ in range(2))
     while rays < most:
         more, step = wanted > dr.opaque(mi.Float, rays), min(rays, most - rays)
@@ -313,7 +317,7 @@ def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
 
 
 def _blockwise(place: Any, view: CameraView) -> Any:
-    """What an image ``place`` holds, less where it is NOWHERE, in the order of :func:`block_order`."""
+    """Return the values of an image ``place``, except NOWHERE, in the order of :func:`block_order`."""
     pixel, inside = block_order(view)
     ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), NOWHERE)
     return dr.gather(mi.UInt32, ordered, dr.compress(ordered != NOWHERE))
@@ -321,12 +325,12 @@ def _blockwise(place: Any, view: CameraView) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class _Tracer:
-    """Rays from visible points.
+    """Shadow rays from visible points.
 
     Attributes:
         surface: The points.
-        pixel: Which of the image's each of them is in.
-        lattice: Whether a pixel of the image is of those that stand for a plane; None if there are none.
+        pixel: Number of the image's pixel of each point.
+        lattice: True for traced pixels of coarse tiles, by pixel of the image; None if there are no coarse tiles.
     """
 
     emitters: Emitters
@@ -338,11 +342,11 @@ class _Tracer:
     lattice: Any = None
 
     def search(self, captured: Any) -> Tiles:
-        """What dynamic objects take of one ray of every captured point, by tiles. The points are those of all pixels.
+        """Estimate by tiles the light that dynamic objects occlude, with one ray per captured point of all pixels.
 
-        Each of 2 x 2 blocks has points of its own, else what is too small for those of one block is missed in all.
-        What static objects take is only a share to divide by, which a quarter of the rays says well enough: the others
-        need to know of them where a dynamic object is in the way as well.
+        The four blocks of a 2 x 2 group have different points; otherwise a shadow too small for the points of one block
+        would be missed in all of them. The light without dynamic objects is only a divisor, for which a quarter of the
+        rays is sufficient. The other rays test static occluders only if a dynamic object occludes them as well.
         """
         proxies, width = self.proxies, self.view.width
         pixel, inside = block_order(self.view)
@@ -371,10 +375,15 @@ class _Tracer:
     def trace(
         self, places: Any, before: Estimate, rays: Any, most: int, turn: tuple[Any, Any], *, matt: bool = False
     ) -> Estimate:
-        """What ``rays`` more rays, ``most`` at the most, add to an estimate at ``places``.
+        """Add ``rays`` more rays to an estimate at ``places``.
 
-        ``turn`` says which number of its pixel's sequence a place takes first, and how many come until its next one.
-        Where all points are ``matt``, what they would mirror is left out.
+        Args:
+            places: Indices of the points.
+            before: Estimate so far.
+            rays: Number of additional rays per point.
+            most: Upper limit of ``rays``.
+            turn: First number in the sequence of the pixel, and the step to the next number, by point.
+            matt: True if no point mirrors light, so that the highlight sums are skipped.
         """
         apart = self.proxies.apart
         if apart and most > WORD:
@@ -394,7 +403,7 @@ class _Tracer:
         known: list[Any] = []
 
         def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:
-            """Ray ``i`` of every point: where to, whether it counts, its number, and what is known to stop it."""
+            """Return ray ``i`` of every point: beam, active flag, sequence number, and known occlusion flags."""
             number = start + i * step
             beam = self.emitters.sample(si, _sequence(number), surface.valid)
             active = surface.valid & (dr.sum(beam.irradiance) > 0)
@@ -410,7 +419,7 @@ class _Tracer:
                 free = free & ~each
             return i + 1, word | dr.select(stop(stoppers[len(known)], beam, number, free), mi.UInt32(1) << i, 0)
 
-        if apart:  # a bit for each ray and scene but the last, each by a kernel of its own
+        if apart:  # one bit per ray and scene except the last, one kernel each
             for _ in stoppers[1:]:
                 nothing = dr.zeros(mi.UInt32, dr.width(places))
                 _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < rays, note, label="stopped")
@@ -441,17 +450,19 @@ class _Tracer:
         return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
 
     def bounce(self, reflectors: Reflectors) -> tuple[Any, Any]:
-        """Irradiance (Color3f) from the surroundings over that of display white, and where it is known (Float).
+        """Return the reflected irradiance (Color3f) over that of display white, and a flag (Float) where it is known.
 
-        It is that of relit points, by a few rays: their neighbours must be averaged. On meshes it is of one pixel in
-        each cell of 2 x 2, and a mean over many cells already: what is bright and small, as a wall is near a lamp, few
-        rays meet.
+        Relit points of objects use a few rays each, so that their neighbours must be averaged. On visible meshes, one
+        pixel in each cell of 2 x 2 is traced, and the result is already a mean over many cells. This mean is necessary,
+        because few rays hit small bright regions such as a wall near a lamp.
         """
         surface, view = self.surface, self.view
         cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
         x, y = self.pixel % view.width, self.pixel // view.width
         column, row = x >> 1, y >> 1
-        chosen = ((x & 1) == (row & 1)) & ((y & 1) == ((column + row) & 1))  # as often in each row, and in each column
+        chosen = ((x & 1) == (row & 1)) & (
+            (y & 1) == ((column + row) & 1)
+        )  # equally often in each row and in each column
         if self.lattice is not None:
             chosen |= dr.gather(mi.Bool, self.lattice, self.pixel)
         thing, count = surface.instance > 0, dr.width(self.pixel)
@@ -478,21 +489,22 @@ class _Tracer:
         start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
         x, y = pixel % self.view.width, pixel // self.view.width
         if self.lattice is not None:
-            # Neighbours lie two pixels apart there.
+            # Traced neighbours are two pixels apart there.
             apart = dr.select(dr.gather(mi.Bool, self.lattice, pixel), mi.UInt32(1), 0)
             x, y = x >> apart, y >> apart
         return start + _bayer(x, y)
 
 
 def _origin(surface: LitSurface) -> Any:
-    """Where shadow rays start: on the smooth surface that the proxy stands for, and off the triangle itself."""
+    """Return the origins of shadow rays: on the smooth surface of the proxy, and off the triangle itself."""
     return surface.position + surface.lift + surface.face * surface.offset
 
 
 def _packed_rays(surface: LitSurface, chosen: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
-    """Origins of shadow rays, normals, offsets and instances at pixels in any order, of the points of all of them.
+    """Return ray origins, normals, offsets and instances of pixels in any order, given the points of all pixels.
 
-    The offset is 0 where no point is ``chosen``. Together in memory, because fetching them takes half of the time.
+    The offset is 0 where ``chosen`` is False. The values are packed, because fetching them separately takes half of the
+    time.
     """
     offset = dr.select(chosen, surface.offset, 0)
     rows = packed([*_origin(surface), *surface.normal, offset, surface.instance])
@@ -507,7 +519,7 @@ def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
 
 
 def _sequence(i: Any, recurrence: tuple[int, int] = RECURRENCE) -> Any:
-    """Point ``i`` of a low-discrepancy sequence, to 24 bits however large ``i`` is."""
+    """Return point ``i`` of a low-discrepancy sequence with 24 bits of precision for every ``i``."""
     return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
 
 
@@ -516,7 +528,7 @@ def _two_points(i: Any) -> tuple[Any, Any]:
 
 
 def _bayer(x: Any, y: Any) -> Any:
-    """Rank of a pixel in an 8x8 ordered-dither matrix: neighbours take far-apart points of the sequence."""
+    """Return the rank of a pixel in an 8 x 8 ordered-dither matrix: neighbours take distant points of the sequence."""
     result = mi.UInt32(0)
     for bit in range(3):
         a, b = (x >> bit) & 1, (y >> bit) & 1

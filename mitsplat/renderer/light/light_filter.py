@@ -1,4 +1,4 @@
-"""Averages of traced light over neighbours on the same surface, and the error that they leave."""
+"""Edge-preserving average of traced light over neighbours on the same surface, and its remaining error."""
 
 from __future__ import annotations
 
@@ -11,38 +11,39 @@ import mitsuba as mi
 from mitsplat.renderer.rays.camera_rays import CameraView
 
 RADIUS = 4
-"""Of the filter [px]."""
+"""Radius of the filter [px]."""
 
 NOISE_LIMIT = 4.0
-"""Squared standard deviations within which two neighbours' shadows may be averaged."""
+"""Largest squared difference between the light shares of two neighbours that are averaged, in variances."""
 
 GUESS_WEIGHT = 1e-3
-"""How much a point counts that is not known to lie on a surface, beside ones that are."""
+"""Weight of a point that is not known to lie on a surface, relative to a known point."""
 
 SMALL = 64 / 9
-"""Pixels of equal weight that have the noise of a mean over 3 x 3 with halves at the ends."""
+"""Number of equally weighted pixels with the same noise as a mean over 3 x 3 pixels with half weights at the ends."""
 
 GAIN = 10.0
-"""By how much the filter, and rays that are spread more evenly than by chance, divide the variance of a mean over 3 x 3
-pixels. With this, ``python -m benchmarks.light.traced`` finds six tenths of a wanted error of 0.03 over all shadows."""
+"""Factor by which the full filter and stratified rays reduce the variance of a mean over 3 x 3 pixels. With this value,
+``python -m benchmarks.light.traced`` measures 0.6 of a wanted error of 0.03 over all shadows.
+"""
 
 HALF = 0.5
-"""Light, as a share of white, at which a wanted error is the standard error that is wanted of it."""
+"""Mid-grey irradiance as a share of white. The wanted standard error applies at this level."""
 
 DARKEST = 0.05
-"""Light below which none is looked at more closely."""
+"""Light level below which the tolerated error does not decrease further."""
 
 DISPLAY = 1 / 2.2
-"""Exponent that displayed light has, of which the eye and a file see even steps."""
+"""Exponent of displayed light. Displayed values are perceptually even, and files store them in even steps."""
 
 BRIGHTEST, DIMMEST = 64.0, 1 / 64
-"""What a camera that exposes by itself multiplies light by at the most and the least."""
+"""Largest and smallest factor of automatic exposure."""
 
 _STEPS = 4096
-"""Of displayed light, sums of which do not depend on the number of threads."""
+"""Number of integer steps of displayed light; integer sums do not depend on the number of threads."""
 
 NOWHERE = 0xFFFFFFFF
-"""Place of a pixel at which no light was traced."""
+"""Place of a pixel without traced light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +51,9 @@ class Estimate:
     """Sums over the shadow rays of every point.
 
     Attributes:
-        lit, base: Light that arrives and light to compare with (Color3f).
-        shine, glare: Light that is mirrored towards the camera, sum of its channels, and the same of all that is sent.
-        squares: Sum of the squares of what is added to ``base``.
+        lit, base: Arriving light and reference light (Color3f).
+        shine, glare: Arriving and unoccluded light that is mirrored towards the camera, summed over channels.
+        squares: Sum of the squares of the terms of ``base``.
         rays: Number of rays.
     """
 
@@ -65,22 +66,22 @@ class Estimate:
 
     @classmethod
     def nothing(cls, count: int) -> Estimate:
-        """No rays yet at ``count`` points."""
+        """Return an estimate without rays at ``count`` points."""
         colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 2), (mi.Float, 4)))
         return cls(*colours, *numbers)
 
     @property
     def sums(self) -> tuple[Any, ...]:
-        """All but the number of rays."""
+        """All fields except the number of rays."""
         return self.lit, self.base, self.shine, self.glare, self.squares
 
     def moved(self, places: Any, count: int) -> Estimate:
-        """The same at ``places`` of ``count`` points, with no rays yet at the others."""
+        """Return this estimate at ``places`` of ``count`` points, without rays at the others."""
         return Estimate.nothing(count).updated(places, *self.sums, self.rays)
 
     def updated(self, places: Any, *values: Any) -> Estimate:
-        """The estimate with new values at some points."""
-        dr.eval(values)  # else what they were made from would be copied before it is written to
+        """Write new values at some points in place and return the estimate."""
+        dr.eval(values)  # avoids a copy of the source arrays before the write
         for old, new in zip((*self.sums, self.rays), values, strict=True):
             dr.scatter(old, new, places)
         dr.eval(self.sums, self.rays)
@@ -88,33 +89,39 @@ class Estimate:
 
 
 class LightFilter:
-    """A separable filter that keeps edges, at those pixels of an image where light was traced.
+    """Separable edge-preserving filter at the pixels of an image where light was traced.
 
-    A neighbour counts where it belongs to the same instance, its normal agrees, it lies in the tangent plane, and its
-    share of light differs by no more than noise explains, so that a hard shadow keeps its edge while a penumbra becomes
-    smooth. A few rays per pixel say too little about that share; both are taken from 3 x 3 pixels. Their noise is that
-    of as many binary draws as equal weights would need for the same variance (Kish 1965, section 11.7). Equal sums stay
-    equal, so that the ratio of an unshadowed point is exactly 1.
+    A neighbour counts if it belongs to the same shape, its normal agrees, it lies in the tangent plane, and noise
+    explains the difference of its light share. A hard shadow therefore keeps its edge, while a penumbra becomes smooth.
+    A few rays per pixel estimate the share too roughly, so share and variance are taken from 3 x 3 pixels. The variance
+    is that of n binary draws, where n is the effective sample size of the weighted rays (Kish 1965, section 11.7).
+    Equal sums stay equal, so that the ratio of an unshadowed point is exactly 1.
 
-    At a silhouette a pixel may show one thing and its ray meet the proxy of another. Such a point has its light from
-    the known neighbours that show the same thing.
+    At a silhouette, a pixel may show one instance while its ray hits the proxy of another. Such a point takes its light
+    from known neighbours that show the same instance.
     """
 
     def __init__(self, here: Any, view: CameraView, index: Any, coarse: Any = None, stride: int = 1) -> None:
-        """A filter at the pixels ``index`` of an image, which show the points ``here``.
+        """Prepare the filter.
 
-        Neighbours are ``stride`` pixels apart. Where ``coarse`` is true of a pixel of the image, its neighbours are two
-        pixels apart, and it stands for four.
+        Args:
+            here: Visible points of the pixels.
+            view: Camera.
+            index: Pixels of the image where light was traced.
+            coarse: True for pixels of coarse tiles, by pixel of the image. Their neighbours are two pixels apart, and
+                each traced pixel represents four.
+            stride: Distance between neighbours elsewhere [px].
         """
         self.view, self.index, self.here = view, index, here
         self.stride = mi.Int32(stride)
         if coarse is not None:
             self.stride = dr.select(dr.gather(mi.Bool, coarse, index), mi.Int32(2), 1)
-        # What is gathered from neighbours lies together, and holds no more than the pixels in question.
+        # Neighbour data is stored compactly, for the traced pixels only.
         self.place = dr.full(mi.UInt32, NOWHERE, view.width * view.height)
         dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
         dr.eval(self.place)
-        # Whom neighbours see at a pixel: without those that stand for others, every other column would see fewer.
+        # Untraced pixels of coarse tiles map to the traced pixel of their 2 x 2 cell. Otherwise neighbours in every
+        # second column would find fewer samples.
         self.shown = self.place
         if coarse is not None:
             pixel = dr.arange(mi.UInt32, view.width * view.height)
@@ -124,32 +131,34 @@ class LightFilter:
             dr.eval(self.shown)
 
     def rays_for(self, estimate: Estimate, error: float, unshadowed: Any, metered: int = 0) -> Any:
-        """Rays per pixel of ``index`` after which light errs no more to the eye than by ``error`` at half of white.
+        """Compute the number of rays per pixel of ``index`` at which light reaches the wanted error.
 
-        Elsewhere the standard error may be as many steps of the display: less in the dark, more where it is bright.
+        The wanted error applies at mid-grey (HALF). At other levels the same perceptual error is tolerated: a smaller
+        standard error in the dark, a larger one where it is bright.
 
         Args:
-            estimate: From the rays so far.
-            error: Standard error of light that is HALF.
-            unshadowed: Light without occluders at each pixel, of which rays say what share arrives; 1 is white.
-            metered: Pixels of a picture that is exposed so that the mean of it looks HALF, those without a place here
-                being lit by 1; 0 if it is exposed for white.
+            estimate: Estimate from the rays so far.
+            error: Target standard error of mid-grey light.
+            unshadowed: Light without occluders at each pixel; 1 is white. Rays estimate the share of it that arrives.
+            metered: Number of pixels of the picture under automatic exposure, which makes the mean look like HALF.
+                Pixels without traced light count as lit by 1. The value 0 means exposure for white.
         """
         share, variance, shared = self._share(estimate)
-        # Where few of 3 x 3 pixels are alike, as good as none of those farther away are.
+        # If few of the 3 x 3 pixels are similar, almost none of the more distant pixels are.
         gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL - 1)), 1)
         light = unshadowed * share
         if metered:
             exposure = _metered(light, self.stride * self.stride, metered)
             light, unshadowed = light * exposure, unshadowed * exposure
-        # What a step of the display is of the share that arrives, for one of light that is HALF.
+        # The tolerated error follows the slope of the display curve, relative to HALF.
         allowed = error * dr.power(dr.clip(light, DARKEST, 1) / HALF, 1 - DISPLAY)
         return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
     def smooth(self, estimate: Estimate, beside: tuple[Any, Any] | None = None) -> tuple[Any, Any, Any, Any, Any]:
-        """The first four sums of the estimate per ray, averaged over neighbours, at the pixels of ``index``.
+        """Average the first four sums of the estimate, per ray, over neighbours of the pixels of ``index``.
 
-        And so other light ``beside`` it (Color3f), from where it is known (1, else 0); 0 where no neighbour knows it.
+        ``beside`` is additional light (Color3f) and the flag (Float) where it is known (1, otherwise 0). Its average is
+        0 where no neighbour knows it.
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.shine, estimate.glare)]
@@ -163,7 +172,7 @@ class LightFilter:
         return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], other
 
     def _share(self, estimate: Estimate) -> tuple[Any, Any, Any]:
-        """Share of light that arrives, over 3 x 3 pixels, its variance, and of how many pixels' rays that is."""
+        """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [dr.sum(estimate.lit) * weight, dr.sum(estimate.base) * weight, estimate.squares * weight]
         (lit, base, squares), shared = self._average(values, estimate.rays, 1)
@@ -175,15 +184,16 @@ class LightFilter:
         return share, variance, shared
 
     def average(self, values: list[Any]) -> list[Any]:
-        """Averages at the pixels of ``index`` of values there, all of as many rays."""
+        """Average values at the pixels of ``index`` that all have the same number of rays."""
         return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), RADIUS)[0]
 
     def _average(
         self, values: list[Any], rays: Any, radius: int, share: tuple[Any, Any] | None = None
     ) -> tuple[list[Any], Any]:
-        """The same, and of how many pixels of equal weight and as many rays an average has the noise.
+        """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
-        Given a ``share`` of light and its variance, only those neighbours count whose share noise explains.
+        If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
+        count.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
@@ -198,9 +208,9 @@ class LightFilter:
     def _average_along(
         self, values: list[Any], traits: Any, direction: tuple[int, int], radius: int, share: tuple[Any, Any] | None
     ) -> tuple[list[Any], Any]:
-        """Averages over the pixels up to ``radius`` away along a direction (x, y), of which the last ones count half.
+        """Average over pixels up to ``radius`` away along a direction (x, y); the outermost pixels have half weight.
 
-        A loop that is traced once, because a step takes the host as long as the device.
+        The loop is symbolic, because tracing a step on the host takes as long as its execution on the device.
         """
         here, view, width = self.here, self.view, dr.width(self.index)
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
@@ -225,12 +235,12 @@ class LightFilter:
             if share is not None:
                 near &= dr.square(other[9] - share[0]) <= NOISE_LIMIT * (share[1] + other[10])
             same &= (near & (known == here.known)) | (known & ~here.known)
-            # Halves at the ends: the filter spans one period of the dither, not one pixel more.
+            # With half weights at the ends, the filter spans exactly one period of the dither.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
             squares += dr.select(same, weight * weight * rays, 0)
             weight = dr.select(same, weight * rays, 0)
             theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))
-            # Differences from the middle, so that equal neighbours leave it bit for bit as it was.
+            # Sums of differences from the centre leave the value bit-identical if all neighbours are equal.
             changed = [
                 dr.fma(weight, their - own, total)
                 for their, own, total in zip(theirs[: len(values)], values, sums, strict=True)
@@ -247,11 +257,11 @@ class LightFilter:
 
 
 def _metered(light: Any, area: Any, pixels: int) -> Any:
-    """What light is multiplied by for the mean of a picture to look HALF.
+    """Return the exposure factor that makes the mean of a picture look like HALF.
 
-    It is the light of points that stand for ``area`` pixels each, and 1 at the others.
+    Each value of ``light`` represents ``area`` pixels. All other pixels count as 1.
     """
-    area = mi.UInt64(area + dr.zeros(mi.Int32, dr.width(light)))  # of one number, the sum would be that number
+    area = mi.UInt64(area + dr.zeros(mi.Int32, dr.width(light)))  # the sum of a scalar would be the scalar itself
     looks = dr.minimum(dr.power(dr.maximum(light, 0), DISPLAY), 4) * _STEPS
     looks = dr.sum(mi.UInt64(looks + 0.5) * area) - dr.sum(area) * _STEPS
     looks += dr.opaque(mi.UInt64, pixels * _STEPS)
@@ -268,7 +278,7 @@ def _padded(count: int) -> int:
 
 
 def packed(columns: list[Any]) -> Any:
-    """One row of floats per pixel, padded to packets of four."""
+    """Pack columns into one row of floats per pixel, padded to packets of four."""
     columns = [mi.Float(column) for column in columns]
     count, stride = max(dr.width(column) for column in columns), _padded(len(columns))
     rows = dr.empty(mi.Float, stride * count)

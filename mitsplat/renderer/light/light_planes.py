@@ -1,8 +1,9 @@
-"""Tiles of an image that show a plane in even light: one of four of their pixels stands for all.
+"""Coarse light on visible planes: in evenly lit tiles one pixel of four is traced.
 
-Light on a plane changes slowly but where a shadow begins. A tile of BLOCK x BLOCK pixels is coarse where it and those
-beside it are parts of planes, and its light is theirs, as far as the first rays from every second pixel of every second
-row tell. It is then traced and filtered at these pixels alone, and is linear between them.
+Light on a plane changes slowly, except at the edge of a shadow. A tile of BLOCK x BLOCK pixels is coarse under two
+conditions. The tile and its neighbours show one plane each. Their light is even, according to the first rays from every
+second pixel of every second row. Light in a coarse tile is traced and filtered at these pixels only, and interpolated
+linearly between them.
 """
 
 from __future__ import annotations
@@ -20,29 +21,34 @@ from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
 
 SAMPLES = (BLOCK // 2) ** 2
-"""Pixels that stand for a coarse tile."""
+"""Number of traced pixels in a coarse tile."""
 
 LEAST_ROWS = 128
-"""Rows of an image from which on planes are looked for. Lower ones, as bands of a rolling shutter are, gain little, and
-what lies beyond a band's rows would decide which of its tiles are coarse."""
+"""Smallest image height [px] at which planes are searched. Lower images, such as the bands of a rolling shutter, gain
+little. The rows beyond a band would also change which of its tiles are coarse.
+"""
 
 LEAST_STEP = 0.04
-"""Difference between the shares of light that arrive at tiles side by side up to which light is even."""
+"""Largest difference between the light shares of adjacent tiles that counts as even light."""
 
 NOISE = 1.0
-"""Squared standard deviations of that difference, were rays drawn one by one, which are not taken for a shadow. Those
-of a tile are spread more evenly, so that it has less noise."""
+"""Tolerated noise of that difference, in squared standard deviations of independent rays. The rays of a tile are
+stratified, so that their noise is lower.
+"""
 
 _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1)
-"""Odd numbers that mix the digits of what they are multiplied with (those of xxHash)."""
+"""Odd multipliers of the hash (those of xxHash)."""
 
 _NEEDED, _PLAIN = 0x80000000, 0x40000000
 
 
 def plane_codes(surface: LitSurface, eye: Any) -> Any:
-    """A number for the plane and the material at every pixel, 0 where light may not be even: on objects, or shiny.
+    """Return a hash (UInt32) of the plane and the material at every pixel.
 
-    Normals and the camera's distance to the plane are rounded, off the values that drawn planes have.
+    The hash is 0 on instances, shiny surfaces and unknown points.
+
+    The normal and the camera's distance to the plane are rounded. The rounding limits avoid the values that modelled
+    planes typically have.
     """
     normal = surface.normal
     away = dr.abs(dr.dot(normal, surface.position - eye))
@@ -62,8 +68,9 @@ class Planes:
     """Tiles that show a plane.
 
     Attributes:
-        number: Theirs, row by row of all tiles.
-        place: Of every tile among them; ``count`` where light is not needed, and ``count + 1`` where it is no plane.
+        number: Tile numbers, row by row over all tiles.
+        place: Index into ``number`` for every tile of the image. It is ``count`` where no light is needed, and ``count
+            + 1`` where the tile shows no plane.
         view: Camera.
     """
 
@@ -73,7 +80,10 @@ class Planes:
 
     @classmethod
     def of(cls, codes: Any, needed: Any, view: CameraView) -> Planes:
-        """The tiles of which light is needed and all pixels have one code, as those right of it and below have."""
+        """Find the tiles that need light and have one code in all pixels.
+
+        The code must also hold in the adjacent row below and in the adjacent column to the right.
+        """
         across, down = -(-view.width // BLOCK), -(-view.height // BLOCK)
         tile = dr.arange(mi.UInt32, across * down)
         x, y = tile % across * BLOCK, tile // across * BLOCK
@@ -87,12 +97,12 @@ class Planes:
             inside = (px < view.width) & (py < view.height)
             code = dr.gather(mi.UInt32, codes, py * view.width + px, inside)
             within = (i % side < BLOCK) & (i // side < BLOCK)
-            # Beyond the tile, only what is there counts, not whether light is needed.
+            # Beyond the tile, only the code is compared, not the flag for needed light.
             alike = dr.select(within, code, code | _NEEDED) == (first | dr.select(within, mi.UInt32(0), _NEEDED))
             return i + 1, same & (alike | ~inside), wanted | (inside & within & (code >= _NEEDED))
 
         state = dr.zeros(mi.UInt32, dr.width(tile)), whole & (first > _NEEDED), dr.full(mi.Bool, False, dr.width(tile))
-        # Neither can change any more where there is no plane but some need.
+        # The search of a tile ends as soon as neither result can change.
         _, flat, wanted = dr.while_loop(state, lambda i, s, w: (i < rounds) & (s | ~w), look, label="planes")
         dr.eval(flat, wanted)
         number = dr.compress(flat)
@@ -105,11 +115,11 @@ class Planes:
 
     @property
     def count(self) -> int:
-        """How many they are."""
+        """Number of tiles that show a plane."""
         return int(dr.width(self.number))
 
     def samples(self) -> Any:
-        """Pixels that stand for them, those of one place in all tiles side by side."""
+        """Return the traced pixels, ordered by their place in the tile and then by tile."""
         i, count, across = dr.arange(mi.UInt32, SAMPLES * self.count), dr.opaque(mi.UInt32, self.count), self._across
         within = i // count
         tile = dr.gather(mi.UInt32, self.number, i - within * count)
@@ -117,7 +127,7 @@ class Planes:
         return y * self.view.width + x
 
     def coarse(self, estimate: Estimate) -> Any:
-        """Whether pixels are of coarse tiles, by what rays from the :meth:`samples` say of them."""
+        """Return for every pixel (Bool) if it lies in a coarse tile, given the estimate at the :meth:`samples`."""
         count = dr.opaque(mi.UInt32, self.count)
         lane, rounds = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, SAMPLES)
 
@@ -138,7 +148,7 @@ class Planes:
         for beside in self._beside():
             plane = beside < count
             theirs = dr.gather(mi.Float, share, beside, plane), dr.gather(mi.Float, variance, beside, plane)
-            # Where light is not needed, next to all of it arrives.
+            # Where no light is needed, almost all light arrives.
             other, noise = (dr.select(plane, v, rest) for v, rest in zip(theirs, (mi.Float(1), 0), strict=True))
             allowed = dr.fma(NOISE, variance + noise, LEAST_STEP**2)
             even &= (beside <= count) & (dr.square(share - other) <= allowed)
@@ -150,7 +160,10 @@ class Planes:
         return dr.gather(mi.Bool, by_tile, tile)
 
     def _beside(self) -> Iterator[Any]:
-        """Places of the tiles beside each, all eight; outside of the image, its own."""
+        """Yield the places of the eight neighbours of each tile, and of the tile itself.
+
+        Coordinates are clamped to the image.
+        """
         x, y = mi.Int32(self.number % self._across), mi.Int32(self.number // self._across)
         down = -(-self.view.height // BLOCK)
         for dy in (-1, 0, 1):
@@ -164,7 +177,7 @@ class Planes:
 
 
 def between_samples(light: Any, coarse: Any, view: CameraView) -> Any:
-    """Light (Color3f), in coarse tiles linear between their samples."""
+    """Interpolate light (Color3f) linearly between the traced pixels of coarse tiles."""
     pixel = dr.arange(mi.UInt32, view.width * view.height)
     x, y = pixel % view.width, pixel // view.width
     odd_x, odd_y = x & 1, y & 1

@@ -1,9 +1,9 @@
-"""Points that light is traced at: one in the middle of a pixel, or several where the surface bends across it.
+"""Light sample points: the pixel centre, or several points where the surface bends across the pixel.
 
-A highlight on a bevel narrower than a pixel, or the dark bottom of a thread, belongs to a part of the pixel. Lit in its
-middle alone, one pixel of a row would have all of it and the next one nothing. Where a pixel's neighbours have another
-normal or show another thing, its light is therefore the mean over several points. They share its shadow rays, so that
-they cost no more than their light without shadows.
+A highlight on a bevel narrower than a pixel, or the dark root of a thread, covers a part of the pixel. With light at
+the pixel centre only, one pixel would show all of it and the next pixel nothing. A pixel whose neighbours have another
+normal or another instance therefore takes the mean over several points. The points share the shadow rays of the pixel,
+so that only their unoccluded light costs extra time.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated, gathered, wrapped
 
 OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
-"""Where in the pixel they lie [px]: a turned grid, of which no two share a row or a column."""
+"""Offsets of the points from the pixel centre [px]: a rotated grid without shared rows or columns."""
 
 EVEN = 0.95
-"""Cosine of the angle between the normals of neighbours up to which light is that of the pixel's middle."""
+"""Cosine between the normals of neighbours above which light is sampled at the pixel centre only."""
 
 
 @dataclass(frozen=True, eq=False)
 class LightPoints:
-    """The points of some pixels: in row i the middle of pixel i, then the first of those of bent ones, their second...
+    """Sample points of pixels.
+
+    The rows hold all pixel centres first, then the first points of all bent pixels, their second points, and so on.
 
     Attributes:
-        surface: The points.
-        owner: Place of its pixel among them, by row.
-        slot: By pixel, its place among bent ones, or ``NOWHERE``.
-        count, bent: Number of pixels, and of bent ones among them.
+        surface: The points, by row.
+        owner: Index of the pixel, by row.
+        slot: Index among bent pixels, by pixel; ``NOWHERE`` if the pixel is not bent.
+        count, bent: Number of pixels, and number of bent pixels among them.
     """
 
     surface: LitSurface
@@ -46,9 +48,14 @@ class LightPoints:
 
     @classmethod
     def of(cls, visible: VisibleSurfaces, here: LitSurface, index: Any, place: Any, order: Any) -> LightPoints:
-        """The points of the pixels ``index``, whose middles show ``here``.
+        """Place the points of pixels.
 
-        ``place`` says of all pixels where in ``index`` they are, ``order`` in which order to trace them.
+        Args:
+            visible: Surface points of the view.
+            here: Points at the centres of the pixels ``index``.
+            index: Pixels of the image.
+            place: Index into ``index`` by pixel of the image.
+            order: Tracing order of the pixels.
         """
         count = dr.width(index)
         bends = _bends(here, index, place, visible.view)
@@ -61,14 +68,13 @@ class LightPoints:
         dr.scatter(slot, dr.arange(mi.UInt32, bent), among, mode=dr.ReduceMode.Permute)
         owner = concatenated([among] * len(OFFSETS))
         number = dr.arange(mi.UInt32, bent * len(OFFSETS)) // dr.opaque(mi.UInt32, bent)
-        # Looked for in the order of the image: camera rays side by side meet the same triangles, which takes two fifths
-        # of the time.
+        # Traced in image order: adjacent camera rays hit the same triangles, which takes 40 % of the time.
         offset = dr.gather(mi.Point2f, wrapped(mi.Float, np.array(OFFSETS, np.float32)), number)
         around = visible.beside(dr.gather(mi.UInt32, index, concatenated([in_image] * len(OFFSETS))), offset)
         rank = dr.empty(mi.UInt32, count)
         dr.scatter(rank, dr.arange(mi.UInt32, bent), in_image, mode=dr.ReduceMode.Permute)
         around = gathered(around, dr.gather(mi.UInt32, rank, owner) + number * dr.opaque(mi.UInt32, bent))
-        # Where all of them miss what the middle shows, that is the only point.
+        # If all points of a pixel miss the instance at its centre, the centre is the only point.
         place_of, found = dr.gather(mi.UInt32, slot, owner), mi.Bool(False)
         for start in range(0, len(OFFSETS) * bent, bent):
             found |= dr.gather(mi.Bool, around.valid, place_of + dr.opaque(mi.UInt32, start))
@@ -81,30 +87,30 @@ class LightPoints:
         return cls(surface, owner, slot, count, bent)
 
     def rows(self, places: Any) -> Any:
-        """Rows of the points of some pixels, which may be none."""
+        """Return the rows of the points of some pixels (possibly none)."""
         if not dr.width(places):
             return places
         slot = dr.gather(mi.UInt32, self.slot, places)
         even = dr.gather(mi.UInt32, places, dr.compress(slot == NOWHERE))
         slot = dr.gather(mi.UInt32, slot, dr.compress(slot != NOWHERE))
-        dr.eval(even, slot)  # so that no kernel depends on which of them there are
+        dr.eval(even, slot)  # keeps the kernels independent of which kinds occur
         rows = concatenated([even, *[slot + start for start in self._starts()]]) if dr.width(slot) else even
         dr.eval(rows)
         return rows
 
     def shared(self, rays: Any, rows: Any) -> Any:
-        """How many of the ``rays`` (UInt32) of their pixels start from the points ``rows``: one or more."""
+        """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of their pixels."""
         return dr.select(rows < dr.opaque(mi.UInt32, self.count), rays, dr.maximum(rays // len(OFFSETS), 1))
 
     def turn(self, rows: Any) -> tuple[Any, Any]:
-        """Which of the rays of its pixel is the first of each point, and how many there are from one to the next."""
+        """Return the first ray number of each point in the sequence of its pixel, and the step to its next ray."""
         count = dr.opaque(mi.UInt32, self.count)
         number = (rows - count) // dr.opaque(mi.UInt32, max(self.bent, 1))
         middle = rows < count
         return dr.select(middle, 0, number), dr.select(middle, mi.UInt32(1), len(OFFSETS))
 
     def total(self, values: Any) -> Any:
-        """Sums by pixel of values by row, in a fixed order."""
+        """Sum values by row into values by pixel, in a fixed order."""
         slot = dr.gather(mi.UInt32, self.slot, dr.arange(mi.UInt32, self.count))
         several, total = slot != NOWHERE, type(values)(0)
         for start in self._starts():
@@ -112,7 +118,7 @@ class LightPoints:
         return dr.select(several, total, dr.gather(type(values), values, dr.arange(mi.UInt32, self.count)))
 
     def summed(self, estimate: Estimate) -> Estimate:
-        """The estimate by pixel of one by row."""
+        """Sum an estimate by row into an estimate by pixel."""
         if not self.bent:
             return estimate
         result = Estimate(*[self.total(getattr(estimate, f.name)) for f in fields(Estimate)])
@@ -124,7 +130,7 @@ class LightPoints:
 
 
 def _bends(here: LitSurface, index: Any, place: Any, view: CameraView) -> Any:
-    """Whether pixels border on others that show another thing, or, of objects, one in another direction."""
+    """Return for each pixel (Bool) if it borders on another shape or, on an instance, on another surface direction."""
     x, y = mi.Int32(index % view.width), mi.Int32(index // view.width)
     thing, bends = here.instance > 0, mi.Bool(False)
     for dx, dy in np.ndindex(3, 3):
@@ -135,7 +141,7 @@ def _bends(here: LitSurface, index: Any, place: Any, view: CameraView) -> Any:
         same = dr.gather(mi.Float, here.trait, other, lit) == here.trait
         even = dr.dot(dr.gather(mi.Vector3f, here.normal, other, lit), here.normal) > EVEN
         bends |= (lit & ~same) | (inside & thing & ~(lit & even))
-    # Of what does not move, only splats have proxies that further rays are sent to.
+    # Among static shapes, only splats have proxies for further rays.
     bends &= here.known & here.valid & (thing | ~here.relit)
     dr.eval(bends)
     return bends

@@ -1,4 +1,4 @@
-"""Tiles of an image in which next to no light changes, and what one ray a pixel says of them."""
+"""Image tiles with almost no change of light, detected with one ray per pixel."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ import mitsuba as mi
 from mitsplat.renderer.rays.camera_rays import CameraView
 
 BLOCK = 8
-"""Pixels of a BLOCK x BLOCK neighbourhood take consecutive points of one low-discrepancy sequence, so that the filter
-that follows averages a stratified set."""
+"""Edge of a pixel block. The pixels of a block take consecutive points of one low-discrepancy sequence, so that the
+filter averages a stratified set.
+"""
 
 STRIDE = BLOCK * BLOCK
-"""Numbers from one ray of a pixel to its next in that sequence; those between are of its neighbours."""
+"""Step in the sequence between two rays of a pixel; the points between belong to its neighbours."""
 
 TOGETHER = 3
-"""Rays that are stopped in a quarter of a tile from which on this is a shadow, and no chance."""
+"""Number of occluded rays in a quarter of a tile that indicates a shadow instead of noise."""
 
 
 def block_order(view: CameraView) -> tuple[Any, Any]:
-    """Pixels in an order for tracing, and whether they lie in the image.
+    """Return the pixels in tracing order, and a flag (Bool) for pixels inside the image.
 
-    Those that share their place in a block, in blocks of one :func:`parity`, take the same point of the low-discrepancy
-    sequence, hence similar rays, and are traced side by side (Keller and Heidrich 2001, "Interleaved Sampling"); but
-    only within squares of BLOCK x BLOCK blocks, so that what is known of their pixels stays in the processor's cache.
+    Pixels with the same place in blocks of one :func:`parity` take the same point of the low-discrepancy sequence.
+    Their rays are similar and are traced side by side (Keller and Heidrich 2001, "Interleaved Sampling"). This order
+    applies within squares of BLOCK x BLOCK blocks, so that the pixel data stays in the processor's cache.
     """
     square, half = BLOCK * BLOCK, BLOCK // 2
     squares_x, squares_y = -(-view.width // square), -(-view.height // square)
@@ -41,19 +42,19 @@ def block_order(view: CameraView) -> tuple[Any, Any]:
 
 
 def parity(block_x: Any, block_y: Any) -> Any:
-    """Which of the blocks of a group of 2 x 2 blocks one is."""
+    """Return the index (0 to 3) of a block in its group of 2 x 2 blocks."""
     return (block_x & 1) | (block_y & 1) << 1
 
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """What one ray a pixel says of tiles of BLOCK x BLOCK pixels.
+    """Light loss in tiles of BLOCK x BLOCK pixels, from one ray per pixel.
 
     Attributes:
-        taken: Share of light (Color3f) that dynamic objects take in each tile, row by row.
-        known: Whether any light arrives there that they could take.
-        around: Mean share that they take in a tile and those beside it.
-        uneven: Whether what they take lies together in one of these tiles.
+        taken: Share of light (Color3f) that dynamic objects occlude in each tile, row by row.
+        known: True if light arrives in the tile without dynamic objects.
+        around: Mean occluded share in a tile and its neighbours.
+        uneven: True if the occluded rays are concentrated in one of these tiles.
         view: Camera.
     """
 
@@ -65,9 +66,14 @@ class Tiles:
 
     @classmethod
     def of(cls, arriving: Any, lost: Any, view: CameraView) -> Tiles:
-        """Of light (Color3f) that arrives without dynamic objects, and that they take, in :func:`block_order`.
+        """Sum light by tile.
 
-        Sums are made in a fixed order, so that they do not depend on threads.
+        Sums have a fixed order, so that they do not depend on the number of threads.
+
+        Args:
+            arriving: Light (Color3f) without dynamic objects, in :func:`block_order`.
+            lost: Light (Color3f) that dynamic objects occlude, in the same order.
+            view: Camera.
         """
         width, height = -(-view.width // BLOCK), -(-view.height // BLOCK)
         squares_x = -(-view.width // BLOCK**2)
@@ -81,7 +87,7 @@ class Tiles:
         def add(i: Any, total: Any, away: Any, hits: Any) -> tuple[Any, Any, Any, Any]:
             place = start + i * BLOCK**2
             off = dr.gather(mi.Color3f, lost, place)
-            # A byte of counts for each quarter of the tile.
+            # Each byte counts the occluded rays of a quarter of the tile.
             quarter = (i // (BLOCK // 2) & 1) | (i // (BLOCK * BLOCK // 2) << 1)
             hit = dr.select(dr.sum(off) > 0, mi.UInt32(1) << (8 * quarter), 0)
             return i + 1, total + dr.gather(mi.Color3f, arriving, place), away + off, hits + hit
@@ -96,7 +102,7 @@ class Tiles:
                 nx, ny = mi.Int32(x) + dx, mi.Int32(y) + dy
                 inside = (nx >= 0) & (nx < width) & (ny >= 0) & (ny < height)
                 beside = mi.UInt32(ny * width + nx)
-                weight = (2 - abs(dx)) * (2 - abs(dy))  # of which the blocks of each parity have a quarter
+                weight = (2 - abs(dx)) * (2 - abs(dy))  # blocks of each parity sum to a quarter of the weight
                 here += weight * dr.gather(mi.Color3f, total, beside, inside)
                 gone += weight * dr.gather(mi.Color3f, away, beside, inside)
                 counts = dr.gather(mi.UInt32, hits, beside, inside)
@@ -108,13 +114,13 @@ class Tiles:
         return cls(taken, known, around, uneven, view)
 
     def differs(self, error: float) -> Any:
-        """Whether pixels lie where dynamic objects take more light than ``error``, or some of it in one place."""
+        """Return for each pixel (Bool) if dynamic objects occlude at least the share ``error``, or one place in it."""
         pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
         tile = pixel // self.view.width // BLOCK * -(-self.view.width // BLOCK) + pixel % self.view.width // BLOCK
         return dr.gather(mi.Bool, self.uneven | (self.around >= dr.opaque(mi.Float, error)), tile)
 
     def light(self) -> Any:
-        """Share of light (Color3f) that is left at every pixel, between the middles of tiles."""
+        """Return the remaining share of light (Color3f) at every pixel, interpolated between tile centres."""
         width, height = -(-self.view.width // BLOCK), -(-self.view.height // BLOCK)
         pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
         x = (mi.Float(pixel % self.view.width) + 0.5) / BLOCK - 0.5

@@ -1,4 +1,4 @@
-"""How the splats of a pixel are lit, by the shape that it shows."""
+"""Light parameters of splat shapes, by the shape that a pixel shows."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from mitsplat.renderer.splatting.projection import Placement
 
 @dataclass(frozen=True, eq=False)
 class Traits:
-    """Rows of what :mod:`mitsplat.renderer.light.light` needs to know of shapes.
+    """Table of the light parameters of shapes, read by :mod:`mitsplat.renderer.light.light`.
 
-    Row i is that of instance i; where the shapes of an instance differ, that of the one with the most splats, and the
-    others have rows of their own behind.
+    Row i belongs to instance i. If the shapes of an instance differ, row i holds the parameters of the shape with the
+    most splats. The other shapes have additional rows at the end of the table.
 
     Attributes:
-        relit: Whether colours were captured under uniform light, by row.
-        roughness, specular: Of the highlight, by row.
-        owner: Instance, by row.
-        placements: Those of the scene with rows in place of instances; None if every instance has but one row.
+        relit: True if the colours were captured under uniform light, by row.
+        roughness, specular: Parameters of the highlight, by row.
+        owner: Instance id, by row.
+        placements: Placements of the scene with row numbers instead of instance ids; None if every instance has one
+            row.
     """
 
     relit: Any
@@ -36,12 +37,12 @@ class Traits:
 
     @classmethod
     def of(cls, shapes: Sequence[Any], placements: Sequence[Placement]) -> Traits:
-        """The traits of ``splats`` shapes, placed so."""
+        """Build the table from ``splats`` shapes and their placements."""
         count = 1 + max([0, *(s.instance for s in shapes)])
         plain = False, 0.4, 0.0
         rows: dict[tuple[int, Any], int] = {}
         values, owners, placed = [plain] * count, list(range(count)), [p.instance for p in placements]
-        # A shape without splats is never what a pixel shows.
+        # A pixel never shows a shape without splats.
         order = [i for i in range(len(shapes)) if len(shapes[i].splats)]
         for i in sorted(order, key=lambda i: -len(shapes[i].splats)):
             shape = shapes[i]
@@ -64,7 +65,7 @@ class Traits:
         )
 
     def seen(self, row: Any | None, instance: Any) -> Any:
-        """Row of every pixel that shows ``instance``, given the row with the largest share of it."""
+        """Return the row of every pixel that shows ``instance``, given the row with the largest share of the pixel."""
         if row is None:
             return instance
         return dr.select(dr.gather(mi.UInt32, self.owner, row) == instance, row, instance)

@@ -1,4 +1,4 @@
-"""From what pixels show to the points that light is traced at: splats lend their place to the proxies under them."""
+"""Surface points for light: a splat takes position and normal from the proxy below it."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
 
 AGREEMENT = 0.02
-"""Share of the depth by which a splat may lie before its proxy and still be taken for its surface."""
+"""Largest distance of a splat in front of its proxy, as a share of the depth, at which the proxy's surface is used."""
 
 
 @dataclass(eq=False)
 class LitSurface:
-    """Visible points.
+    """Visible surface points.
 
     Attributes:
         position, normal: Point [m] and unit normal towards the camera.
         face: Unit normal of the proxy's triangle.
-        lift: Displacement [m] from the triangle to the smooth surface that it stands for.
+        lift: Displacement [m] from the triangle to the smooth surface that the proxy approximates.
         to_camera: Unit vector towards the camera.
-        offset: How far shadow rays start off the surface [m].
+        offset: Distance of shadow ray origins from the surface [m].
         instance: Instance id (Float).
-        trait: Row of the shape's traits (Float); light is not averaged across its borders.
-        relit: Whether the point is lit anew (uniform capture) rather than only shadowed.
+        trait: Row of the shape in :class:`Traits` (Float). Light is not averaged across rows.
+        relit: True if the point is relit (uniform capture), False if it is only shadowed.
         roughness, specular: GGX roughness and reflectance at normal incidence.
-        known: Whether the proxy of what is seen says so; else position and normal are a guess.
-        valid: Whether there is a point at all.
+        known: True if the point comes from the proxy of the visible instance; otherwise position and normal are a
+            guess.
+        valid: True if there is a point.
     """
 
     position: Any
@@ -52,13 +53,13 @@ class LitSurface:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What pixels show.
+    """Primary visibility of pixels.
 
     Attributes:
-        direction: Of their rays.
-        alpha, depth, instance: As in the layers.
-        trait: Row of what is shown in :class:`Traits`.
-        mesh: Whether it is a visible mesh.
+        direction: Ray direction.
+        alpha, depth, instance: Opacity, depth and instance id as in the layers.
+        trait: Row of the visible shape in :class:`Traits`.
+        mesh: True if the pixel shows a visible mesh.
     """
 
     direction: Any
@@ -71,16 +72,16 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class VisibleSurfaces:
-    """Where the pixels of a view show something that light falls on.
+    """Surface points of the pixels of a view.
 
     Attributes:
-        traits: How shapes are lit.
+        traits: Light parameters of shapes.
         view: The camera.
-        proxies: The surfaces that splats stand for.
-        eye: Where the camera's rays start.
-        seen: What all pixels show.
-        hit: What their rays meet first of the proxies.
-        static: What they meet first of those that do not move.
+        proxies: Surfaces that represent the splats.
+        eye: Origin of the camera rays.
+        seen: Primary visibility of all pixels.
+        hit: First proxy hit of the camera rays.
+        static: First hit of the camera rays on static proxies.
     """
 
     traits: Traits
@@ -92,11 +93,17 @@ class VisibleSurfaces:
     static: Hit
 
     def at(self, pixel: Any) -> LitSurface:
-        """Points in the middle of pixels: on the proxy where it agrees with what is seen, else at the seen depth."""
+        """Return the points at pixel centres.
+
+        They lie on the proxy where it agrees with the visible depth, and otherwise at that depth.
+        """
         return self._surface(gathered(self.seen, pixel), gathered(self.hit, pixel), gathered(self.static, pixel))
 
     def beside(self, pixel: Any, offset: Any) -> LitSurface:
-        """Points ``offset`` [px] (Point2f) off the middles of pixels, valid where a proxy of the same instance is."""
+        """Return the points at ``offset`` [px] (Point2f) from pixel centres.
+
+        A point is valid where the ray hits a proxy of the same instance.
+        """
         row = pixel // self.view.width
         x, y = mi.Float(pixel - row * self.view.width) + 0.5, mi.Float(row) + 0.5
         rays = self.view.rays_through(x + offset.x, y + offset.y)
@@ -112,13 +119,13 @@ class VisibleSurfaces:
         cosine = self.view.cosine(ray)
         met = hit.distance < dr.inf
         known = ~met | (hit.instance == instance)
-        # What shows through or beside a dynamic object's proxy lies on a static one.
+        # Splats that are visible through or beside the proxy of a dynamic object lie on a static proxy.
         behind = instance == 0
         same = dr.select(behind, static.distance < dr.inf, met & known)
         proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
         shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
         towards = mi.Normal3f(-ray.d)
-        # A splat that lies inside its own coarse proxy would be in the proxy's shadow: light it where the proxy starts.
+        # A splat inside its own coarse proxy would lie in the proxy's shadow, so it is lit at the surface of the proxy.
         on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
         z = dr.select(on_proxy, proxy_depth, depth)
         position = ray(z / cosine)

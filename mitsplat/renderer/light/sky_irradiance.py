@@ -1,7 +1,7 @@
-"""Irradiance from a sky on every orientation, in a table.
+"""Table of the irradiance of a sky for every orientation.
 
-What arrives from infinitely far away depends on the normal alone. One set of directions, taken in proportion to their
-radiance, serves all normals of the table, and a point costs four look-ups instead of a set of its own.
+Light from infinity depends on the normal only. One set of directions, sampled in proportion to their radiance, serves
+all normals of the table. A point then costs four look-ups instead of a set of directions of its own.
 """
 
 from __future__ import annotations
@@ -12,19 +12,20 @@ import drjit as dr
 import mitsuba as mi
 
 CELLS = 64
-"""Along each axis of the table. Between its normals, 1 to 3 degrees apart, the cosine of a sun is off by less than 0.01
-where it sets, and by less than 0.001 elsewhere."""
+"""Cells along each axis of the table. Its normals are 1 to 3 degrees apart. The interpolated cosine of a sun has an
+error below 0.01 at the horizon of the surface, and below 0.001 elsewhere.
+"""
 
 
 class SkyIrradiance:
-    """Irradiance by normal without occluders, interpolated on an octahedral map.
+    """Unoccluded irradiance by normal, interpolated on an octahedral map.
 
-    For the map see Cigolle et al. 2014, "A Survey of Efficient Representations for Independent Unit Vectors". Normals
-    are the corners of its cells, so that those on its border are known on both sides of the fold.
+    For the map see Cigolle et al. 2014, "A Survey of Efficient Representations for Independent Unit Vectors". The
+    normals are the corners of the cells, so that border normals are defined on both sides of the fold.
     """
 
     def __init__(self, direction: Any, radiance: Any) -> None:
-        """From N directions (Vector3f) that light comes from, and the radiance of each over its density (Color3f)."""
+        """Integrate N directions towards light (Vector3f) with their radiance over sampling density (Color3f)."""
         corner = dr.arange(mi.UInt32, (CELLS + 1) ** 2)
         normal = _unfolded(mi.Float(corner % (CELLS + 1)) / CELLS, mi.Float(corner // (CELLS + 1)) / CELLS)
         dr.eval(direction, radiance, normal)
@@ -40,7 +41,7 @@ class SkyIrradiance:
         dr.eval(self._table)
 
     def at(self, normal: Any, active: Any) -> Any:
-        """Irradiance (Color3f) on surfaces with unit normals (Vector3f)."""
+        """Return the irradiance (Color3f) on surfaces with unit normals (Vector3f)."""
         x, y = _folded(normal)
         column, row = (dr.minimum(mi.UInt32(dr.maximum(v * CELLS, 0)), CELLS - 1) for v in (x, y))
         right, down = x * CELLS - mi.Float(column), y * CELLS - mi.Float(row)
@@ -52,7 +53,7 @@ class SkyIrradiance:
 
 
 def _unfolded(x: Any, y: Any) -> Any:
-    """Unit vectors of points of the octahedral map, the unit square."""
+    """Return the unit vectors of points of the octahedral map (unit square)."""
     x, y = 2 * x - 1, 2 * y - 1
     z = 1 - abs(x) - abs(y)
     back = dr.maximum(-z, 0)
@@ -60,7 +61,7 @@ def _unfolded(x: Any, y: Any) -> Any:
 
 
 def _folded(vector: Any) -> tuple[Any, Any]:
-    """Points of the octahedral map, the unit square, of unit vectors."""
+    """Return the points of the octahedral map (unit square) of unit vectors."""
     length = abs(vector.x) + abs(vector.y) + abs(vector.z)
     x, y = vector.x / length, vector.y / length
     lower = vector.z < 0
